@@ -183,7 +183,9 @@ class Verdict(NamedTuple):
         """Return what the user must know, a sentence each."""
         differs = self.is_against and abs(self.deeper_m) > self.model_uncertainty.formal_m
         unsure = differs if self.is_given else not self.is_sure
-        poor = not self.is_sure and self.share > FITS
+        # of single maps the shares say little
+        by_shares = not _by_likelihood((self.chosen, self.runner_up)).any()
+        poor = by_shares and not self.is_sure and self.share > FITS
         absurd = self.share < min(MOST_BEYOND, -SURE * self.sigma)
         none_fits = not self.is_given and self.patches > 0 and (poor or absurd)
         return (*self.remarks, *[str(self)] * unsure, *[CAUSES] * none_fits)
@@ -218,7 +220,7 @@ class Verdict(NamedTuple):
             f"{points}: {self.chosen.words} ({how}). Next best: {self.runner_up.words}{fit}; the"
             f" bed would be {abs(self.deeper_m):.3f} m {way}."
         )
-        if not self.patches:
+        if not self.patches or self.share > 0.5:
             return text
         left, other = (100.0 * min(max(x, 0.0), 1.0) for x in (self.share, self.runner_up_share))
         return (
@@ -257,7 +259,10 @@ def type_given(batch: Batch) -> Reconstruction:
 
 
 class _Beds(NamedTuple):
-    """The points of patches as corrected for each type; see `pcfix.refract.patches.shares`."""
+    """The points of patches as corrected for each type; see `pcfix.refract.patches.shares`.
+
+    `errors` are the standard errors by which one type is better than another; infinite for itself.
+    """
 
     types: tuple[Reconstruction, ...]
     z: FloatArray
@@ -265,9 +270,7 @@ class _Beds(NamedTuple):
     patches: int
     share: FloatArray
     sigma: FloatArray
-    errors: (
-        FloatArray  # (h, h), standard errors by which one is better than another; inf for itself
-    )
+    errors: FloatArray
 
     def rank(self, among: list[int]) -> tuple[int, int]:
         """Return the best of some types, and the runner-up."""

@@ -67,7 +67,14 @@ SETTINGS = {
     "depth-maps": {**SHORE, "cloud": "depth-maps"},
 }
 """Names of `pcfix.simulate.settings.SceneSettings`; the rest is its default."""
-REAL = ("rendered_a", "rendered_c")
+REAL = {
+    "rendered_a": "rendered_a/cloud.las",
+    "rendered_c": "rendered_c/cloud.las",
+    "rendered_a_multi": "rendered_a_sgm/multi.laz",
+    "rendered_a_steepest": "rendered_a_sgm/steepest.laz",
+    "rendered_c_multi": "rendered_c_sgm/multi.laz",
+    "rendered_c_steepest": "rendered_c_sgm/steepest.laz",
+}
 COLUMNS = {
     "method": "", "cameras": "", "rays": ".1f", "Z bias": "+.2f", "Z RMSE": ".2f", "XY bias": ".2f",
     "XY RMSE": ".2f", "in 95 %": ".1%", "done": ".1%", "points/s": ",.0f",
@@ -177,18 +184,27 @@ def triangulated_again(scene: Any, rows: np.ndarray, rng: Any) -> np.ndarray:
 
 
 def rendered(name: str, points: int) -> Case | None:
-    """Return about so many points of the cloud that OpenMVS made; None without the data."""
-    folder, _ = needs(name)
-    if not folder.exists():
+    """Return about so many points of a cloud of rendered images; None without the data.
+
+    Of semi-global matching all points: its clouds have no view lists, and are detected as dense.
+    """
+    folder, cloud = needs(name[:10])[0], needs(REAL[name])[0]
+    if not cloud.exists():
         return None
     import laspy
 
     local = pcfix.read_cameras(folder / "colmap")
     cameras = replace(local, centres=local.centres + np.loadtxt(folder / "offset.txt"))
-    xyz = np.ascontiguousarray(laspy.read(folder / "cloud.las").xyz)
-    match = ViewMatch(read_views(folder / "dense.vis", cameras), cameras, points=len(xyz))
-    rows = np.arange(0, len(xyz), max(1, len(xyz) // points))
-    xyz, views = xyz[rows], match.views_of(xyz, 0)[0].take(rows)
+    xyz = np.ascontiguousarray(laspy.read(cloud).xyz)
+    known: dict[str, dict[str, Any]] = {}
+    mvs = {"camera_set": "mvs"}
+    if cloud.parent == folder:
+        match = ViewMatch(read_views(folder / "dense.vis", cameras), cameras, points=len(xyz))
+        rows = np.arange(0, len(xyz), max(1, len(xyz) // points))
+        xyz, views = xyz[rows], match.views_of(xyz, 0)[0].take(rows)
+        known["views"] = {"views": views}
+    else:
+        mvs["matcher"] = "single-map" if "multi" in name else "nearest-map"
     height, water, bed = true_surface(folder / "truth_dsm.tif"), pcfix.WaterPlane(0.37), xyz.copy()
     bed[:, 2] = height(xyz)
 
@@ -196,9 +212,9 @@ def rendered(name: str, points: int) -> Case | None:
         unknown = np.full(len(found), np.nan)
         return np.column_stack([unknown, unknown, found[:, 2] - height(found)])
 
-    known = {"views": {"views": views}, "mvs": {"camera_set": "mvs"}, "all": {"camera_set": "all"}}
+    known = {**known, "mvs": mvs, "all": {"camera_set": "all"}}
     measured = (bed[:, 2] < water.a - LEAST_DEPTH_M) & (xyz[:, 2] < water.a)
-    words = f"{len(xyz):,} points, {len(cameras)} rendered images, COLMAP and OpenMVS"
+    words = f"{len(xyz):,} points, {len(cameras)} rendered images, {cloud.parent.name}/{cloud.name}"
     return Case(words, xyz, cameras, water, 1.34, 0.05, measured, bed, error, known)
 
 
@@ -228,9 +244,10 @@ def rows_of(case: Case, seed: int) -> list[dict[str, Any]]:
         ("factor", "auto", {"depth_factor": "auto"}),
         ("regression", None, {"regression": regression_of(case, seed)}),
         ("auto", "auto", {}),
-        ("auto", "views", case.known["views"]),
         ("snell", "auto", {}),
     ]
+    if "views" in case.known:
+        runs.insert(4, ("auto", "views", case.known["views"]))
     runs += [
         (method, name, {**options, "max_angle": None})
         for method in METHODS

@@ -1,6 +1,6 @@
 """How often the reconstruction type of simulated clouds is detected, and how sure of it pcfix is.
 
-    python -m tests.benchmarks.detection [--seeds 1 2] [--points 40000]
+    python -m tests.benchmarks.detection [--seeds 1 2] [--points 80000]
 
 Clouds of every type over four blocks, as dense as those of matchers. Printed are the detected type
 of each cloud with its confidence and the error of the bed, the table of detected against true
@@ -27,14 +27,14 @@ from tests.utils.matchers import matched_scene
 TYPES = dict(
     zip(("tracks", "depth-maps", "pairs", "single-map", "nearest-map"), IN_FRAME, strict=True)
 )
-COARSE = {"sensor_px": (1824, 1216), "lidar_per_m2": 0.0}
+COARSE = {"sensor_px": (1824, 1216), "area_m": (80.0, 60.0), "lidar_per_m2": 0.0}
 BLOCKS = {
     "nadir": COARSE,
     "oblique": {**COARSE, "obliques_deg": 25.0},
     "river": {**COARSE, "bed": "river"},
     "wide": {**COARSE, "focal_mm": 6.0},
 }
-"""Images of large pixels, for which a cloud of few points is as dense as those of matchers."""
+"""Images of large pixels, for which few points are nearly as dense as those of matchers."""
 LEAST_DEPTH_M = 0.2
 CONFIDENCES = (0.5, 0.8, 0.95, 0.99)
 
@@ -60,7 +60,7 @@ def main(arguments: list[str]) -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--points", type=int, default=40_000)
+    parser.add_argument("--points", type=int, default=80_000)
     given = parser.parse_args(arguments)
     table, cases = Counter[tuple[str, str]](), []
     for block in BLOCKS:

@@ -154,13 +154,13 @@ def test_sources(tmp_path):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("Agisoft Metashape 2.1.0", "depth maps"),
+        ("Agisoft Metashape 2.1.0", "single depth maps"),
         ("PDAL 2.8 (OpenMVS)", "depth maps"),
         ("MicMac", "stereo pairs"),
     ],
 )
 def test_software(name, words):
-    assert hint_of(("LAStools", name)).words == words
+    assert words in hint_of(("LAStools", name)).words
     assert hint_of(("LAStools", "Pix4D")) is None
 
 
