@@ -254,8 +254,7 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
             " had been corrected before. Give the cloud as the matcher wrote it."
         )
         notes.append(PcfixWarning("cloud.corrected_before", sentence, ratio=ratio))
-    software = plan.options.software
-    hint = hint_of((software,) if software else (view.software, plan.cameras.source))
+    hint = hint_of((plan.options.software or view.software,))
     if views is None:
         survey, verdicts = learn_of_sample(sample, view.points, ties, hint, near)
         notes += _note_flat(sample, survey)

@@ -53,8 +53,7 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     or the median of stereo pairs (MicMac)."""
     software: Software | None = option(None, with_cameras=True)
     """Software that reconstructed the cloud: its usual reconstruction types are more likely, if the
-    cloud does not show clearly which it is. [default: as named in the header of the cloud or the
-    camera file]"""
+    cloud does not show clearly which it is. [default: as named in the header of the cloud]"""
     max_angle: float | str | None = option(
         "auto",
         with_cameras=True,

@@ -21,14 +21,14 @@ from pcfix.refract.likelihood import Candidates, log_likelihood, standard_errors
 from pcfix.refract.methods import correct, with_rays
 from pcfix.refract.patches import SMOOTH_GSD, Patches, scatter_m, shares
 
-SURE = 2.33
+SURE = 2.3264
 """Standard errors of a significant difference: 99 %."""
 SPACING_GSD, PRIOR_TRACKS = (3.0, 8.0), (-1.0, 4.0)
 """What the spacing of the points counts for tracks, in standard errors: dense matching has a point
 for every pixel or few, and tracks are sparser."""
 PRIOR_OF_SHARES, PRIOR_SOFTWARE = 0.25, 1.0
 """The share of it against discontinuities, which are clearer; what the software counts."""
-SHARE_ERROR, SHARE_WEIGHT = 0.12, 0.4
+SHARE_ERROR, SHARE_WEIGHT = 0.12, 0.3
 """Standard error of a share from what the models neglect, and what shares count beside likelihoods:
 less, as the maps of a point are chosen by a smooth bed."""
 WEAK = 3.0
@@ -156,8 +156,11 @@ class Verdict(NamedTuple):
 
     @property
     def confidence(self) -> float:
-        """Probability, 0 to 1, that the chosen type is right and not the runner-up."""
-        return 0.5 * (1.0 + math.erf(self.errors / math.sqrt(2.0)))
+        """Probability that the chosen type is right and not the runner-up.
+
+        At most 0.99, as no larger ones were tested (`tests.benchmarks.detection`).
+        """
+        return min(0.5 * (1.0 + math.erf(self.errors / math.sqrt(2.0))), 0.99)
 
     @property
     def is_fused(self) -> bool:

@@ -181,7 +181,7 @@ def summary_rows(s: Summary) -> Rows:
     fit, made, index = s.water_fit or {}, s.made, s.settings["index"]
     method = str(s.settings["method"])
     if made is not None and made.get("made_of", "") not in ("", method):
-        sure = "detected" if made["sure"] else "detected, not certain"
+        sure = f"detected, confidence {100.0 * made['confidence']:.0f} %"
         method = f"{made['method']}, {made['made_of']} ({sure})"
     elif made is not None and "made_of" not in made:
         method = f"{made['method']}. {made['because']}"

@@ -49,7 +49,7 @@ def test_simulated_cloud(name):
     assert verdict.share < verdict.runner_up_share
     # the single maps of images predict nearly the scatter of simulated fused maps
     assert verdict.is_sure or name in ("pairs", "depth-maps")
-    assert (verdict.confidence > 0.99) == verdict.is_sure
+    assert (verdict.confidence >= 0.99) == verdict.is_sure
     assert {one.words for one in IN_FRAME} == {verdict.chosen.words, *dict(verdict.candidates)}
     assert verdict.runner_up.words in str(verdict)
 
@@ -74,7 +74,7 @@ def test_software_is_a_prior():
     _, (against,) = learn_of_sample(batch, len(xyz), hint=hint_of(("micmac",)))
     _, (agreeing,) = learn_of_sample(batch, len(xyz), hint=hint_of(("SURE 5.0",)))
     assert free.chosen is against.chosen is agreeing.chosen is IN_FRAME[3]
-    assert against.errors < free.errors < agreeing.errors + 1e-9
+    assert against.errors <= free.errors <= agreeing.errors
 
 
 def test_no_limit_of_snell():
@@ -130,7 +130,7 @@ def test_real_cloud():
     local = pcfix.read_cameras(RENDERED / "colmap")
     cameras = replace(local, centres=local.centres + np.loadtxt(RENDERED / "offset.txt"))
     xyz = np.ascontiguousarray(laspy.read(RENDERED / "cloud.las").xyz)
-    _, verdict = told(xyz[::4], cameras, WaterPlane(0.37))
+    _, verdict = told(xyz[::2], cameras, WaterPlane(0.37))
     assert verdict.chosen is IN_FRAME[1] and verdict.is_sure
 
 
