@@ -176,11 +176,10 @@ def invert_depth_maps(batch: Batch) -> Intersection:
     result = np.zeros((len(batch), COLUMNS))
     _invert_all(batch, listed, given, result, np.zeros((0, 0), np.float32))
     few = np.flatnonzero(result[:, OUTCOME] == ONE_CAMERA)
-    if batch.survey.settings.matcher in SINGLE and len(few):
+    if batch.survey.settings.matcher in SINGLE and not listed and len(few):
         # no image shows the point with `LEAST_NEAR` others: at the edge of the block
-        again = np.zeros((len(few), COLUMNS))
-        given = given if listed else given[few]
-        _invert_all(batch.take(few), listed, given, again, np.zeros((0, 0), np.float32), least=1)
+        again, none = np.zeros((len(few), COLUMNS)), np.zeros((0, 0), np.float32)
+        _invert_all(batch.take(few), listed, given[few], again, none, least=1)
         result[few] = again
     outcome = result[:, OUTCOME].astype(np.uint8)
     found = batch.result(result[:, :3], outcome=outcome, ray_miss_m=result[:, _DISTANCE])
@@ -204,8 +203,9 @@ def likely_beds(batch: Batch) -> FloatArray:
 def candidates_of(batch: Batch) -> Candidates:
     """Return the `likely_beds` in the world frame, with their probabilities.
 
-    Of single maps those of oblique rays are less likely: on two blocks matched by semi-global
-    matching the frequency of base images fell with the fourth power of the angle in the exponent.
+    Of single maps, oblique rays are less likely: on two blocks of semi-global matching an image was
+    the base image of a point about exp(-(angle / `BASE_RAY_DEG`)^4) times as often as straight
+    above.
     """
     likely = batch.xyz[:, 2:] + likely_beds(batch)
     prior = np.ones(likely.shape)
@@ -227,6 +227,7 @@ def _invert_all(
     if matcher is None:
         raise ValueError("a model of the matcher is needed")
     if given_matcher in SINGLE:
+        least = 1 if listed else least
         matcher = matcher.of_single_maps(least, nearest=given_matcher == "nearest-map")
     images = images_of(batch.original_model, batch.survey.cameras)
     points = batch.chosen()

@@ -134,6 +134,58 @@ def test_real_cloud():
     assert verdict.chosen is IN_FRAME[1] and verdict.is_sure
 
 
+SGM = {
+    "rendered_a_sgm/multi.laz": (1.3, IN_FRAME[3]),
+    "rendered_a_sgm/steepest.laz": (1.0, IN_FRAME[4]),
+    "rendered_c_sgm/multi.laz": (2.0, IN_FRAME[3]),
+    "rendered_c_sgm/steepest.laz": (1.3, IN_FRAME[4]),
+}
+"""Clouds of semi-global matching: the largest RMSE of the bed in GSD of 5 cm, and the type."""
+
+
+@rendered
+@pytest.mark.parametrize("cloud", mostly_nightly(SGM, "rendered_c_sgm/steepest.laz"))
+def test_semi_global_matching(cloud, tmp_path):
+    import laspy
+    import rasterio
+    from scipy.ndimage import map_coordinates
+
+    path, (most_gsd, kind) = RENDERED.parent / cloud, SGM[cloud]
+    if not path.exists():
+        pytest.skip(f"{path} is absent")
+    block = path.parent.with_name(path.parent.name[:10])
+    found = pcfix.correct_file(
+        path, tmp_path / "out.las", cameras=block / "cameras.xml", water=0.37
+    )
+    assert found.made["made_of"] == kind.words
+    las = laspy.read(tmp_path / "out.las")
+    bed = np.flatnonzero(
+        (np.asarray(las.classification) == 40) & (np.asarray(las.WaterDepth) > 0.2)
+    )
+    xyz, sigma = np.asarray(las.xyz)[bed], np.asarray(las.SigmaZ)[bed]
+    with rasterio.open(block / "truth_dsm.tif") as raster:
+        left, up = ~raster.transform @ (xyz[:, 0], xyz[:, 1])
+        truth = map_coordinates(raster.read(1).astype(float), [up - 0.5, left - 0.5], order=1)
+    error = xyz[:, 2] - truth
+    assert np.sqrt(np.mean(error**2)) < most_gsd * 0.05
+    assert np.mean(np.abs(error) < 1.96 * sigma) > 0.88
+
+
+def test_list_of_base_images():
+    """With the base image of each point: half a pixel in some images 0.2 flying heights away."""
+    scene = simulated(8000, cloud="single-map", seed=1, lidar_per_m2=0.0, sensor_px=(1824, 1216))
+    rows = np.flatnonzero(np.diff(scene.views.start) > 0)
+    views = replace(scene.views.take(rows), kind="depth-maps")
+    found = pcfix.correct_points(
+        scene.xyz[rows], scene.cameras, scene.water, method="consistent", matcher="single-map",
+        views=views,
+    )  # fmt: skip
+    deep = found.corrected & (scene.depth_m(scene.true_xyz[rows]) > 0.2)
+    error = (found.xyz - scene.true_xyz[rows])[deep, 2] / scene.gsd_m
+    assert abs(error.mean()) < 0.5
+    assert np.sqrt(np.mean(error**2)) < 2.0
+
+
 # squares of a large cloud
 
 WIDTH_M, MOST = 2.0, 5000
