@@ -178,8 +178,10 @@ def invert_depth_maps(batch: Batch) -> Intersection:
     few = np.flatnonzero(result[:, OUTCOME] == ONE_CAMERA)
     if batch.survey.settings.matcher in SINGLE and not listed and len(few):
         # no image shows the point with `LEAST_NEAR` others: at the edge of the block
-        again, none = np.zeros((len(few), COLUMNS)), np.zeros((0, 0), np.float32)
-        _invert_all(batch.take(few), listed, given[few], again, none, least=1)
+        again = np.zeros((len(few), COLUMNS))
+        _invert_all(
+            batch.take(few), listed, given[few], again, np.zeros((0, 0), np.float32), least=1
+        )
         result[few] = again
     outcome = result[:, OUTCOME].astype(np.uint8)
     found = batch.result(result[:, :3], outcome=outcome, ray_miss_m=result[:, _DISTANCE])

@@ -23,11 +23,11 @@ from pcfix.refract.patches import SMOOTH_GSD, Patches, scatter_m, shares
 
 SURE = 2.3264
 """Standard errors of a significant difference: 99 %."""
-SPACING_GSD, PRIOR_TRACKS = (3.0, 8.0), (-1.0, 4.0)
-"""What the spacing of the points counts for tracks, in standard errors: dense matching has a point
-for every pixel or few, and tracks are sparser."""
-PRIOR_OF_SHARES, PRIOR_SOFTWARE = 0.25, 1.0
-"""The share of it against discontinuities, which are clearer; what the software counts."""
+SPACING_GSD, PRIOR_SPARSE = (6.0, 12.0), 4.0
+"""What a large spacing of the points counts against single maps, in standard errors: their clouds
+are dense, and neighbours that are far apart show little of their scatter."""
+PRIOR_TRACKS, PRIOR_SOFTWARE = 0.4, 1.0
+"""What it counts for tracks against other types, and what the software counts."""
 SHARE_ERROR, SHARE_WEIGHT = 0.12, 0.3
 """Standard error of a share from what the models neglect, and what shares count beside likelihoods:
 less, as the maps of a point are chosen by a smooth bed."""
@@ -187,7 +187,7 @@ class Verdict(NamedTuple):
         differs = self.is_against and abs(self.deeper_m) > self.model_uncertainty.formal_m
         unsure = differs if self.is_given else not self.is_sure
         # of single maps the shares say little
-        by_shares = not _by_likelihood((self.chosen, self.runner_up)).any()
+        by_shares = not _is_single((self.chosen, self.runner_up)).any()
         poor = by_shares and not self.is_sure and self.share > FITS
         absurd = self.share < min(MOST_BEYOND, -SURE * self.sigma)
         none_fits = not self.is_given and self.patches > 0 and (poor or absurd)
@@ -365,7 +365,8 @@ def _beds(
     if part.views is None and LIMITS[0] not in types:
         errors = (0.5 - share) / np.hypot(sigma, SHARE_ERROR)
         likely = [_log_likelihood(part, place, one, z[i]) for i, one in enumerate(types)]
-        for a, b in zip(*np.nonzero(_by_likelihood(types)), strict=True):
+        single = _is_single(types)
+        for a, b in zip(*np.nonzero(single[:, None] | single), strict=True):
             errors[a, b] *= SHARE_WEIGHT
             errors[a, b] += standard_errors(likely[a], likely[b])
     np.fill_diagonal(share, -np.inf)
@@ -373,14 +374,14 @@ def _beds(
     return _Beds(types, z, place, len(place), share, sigma, errors)
 
 
-def _by_likelihood(types: tuple[Reconstruction, ...]) -> BoolArray:
-    """Return which pairs of types are compared by the likelihood: those with a single map.
+def _is_single(types: tuple[Reconstruction, ...]) -> BoolArray:
+    """Return which types are single maps.
 
-    They predict little but the scatter of neighbours, or discontinuities at few places; the others
-    are told from each other by the discontinuities, which do not depend on the noise.
+    They are compared with the others by likelihood: they predict little but the scatter of
+    neighbours, or discontinuities at few places. The others are compared with each other by the
+    discontinuities only, which do not depend on the noise.
     """
-    single = np.array([one.words in (_SINGLE, _NEAREST) for one in types])
-    return np.asarray(single[:, None] | single)
+    return np.array([one.words in (_SINGLE, _NEAREST) for one in types])
 
 
 def _log_likelihood(part: Batch, place: IntArray, one: Reconstruction, z: FloatArray) -> FloatArray:
@@ -399,16 +400,13 @@ def _log_likelihood(part: Batch, place: IntArray, one: Reconstruction, z: FloatA
 def _with_prior(
     part: Batch, beds: _Beds, sample: Patches, step: float, hint: Hint | None
 ) -> tuple[_Beds, str]:
-    """Add what is known of the types by density and software; return what decided, if these did.
-
-    A sparse cloud is one of tracks; a dense one is what its software makes, and not of tracks.
-    """
+    """Add what is known of the types by spacing and software; return what decided, if these did."""
     words = [one.words for one in beds.types]
     spacing = patches.spacing_gsd(part, sample.place, step * sample.step)
-    by_spacing = float(np.interp(np.log(spacing), np.log(SPACING_GSD), PRIOR_TRACKS))
-    tracks = np.array([by_spacing * (one == _TRACKS) for one in words])
-    counts = np.where(_by_likelihood(beds.types), 1.0, PRIOR_OF_SHARES)
-    errors = beds.errors + counts * (tracks[:, None] - tracks)
+    sparse = float(np.interp(np.log(spacing), np.log(SPACING_GSD), (0.0, 1.0)))
+    is_single, tracks = _is_single(beds.types), np.array([one == _TRACKS for one in words])
+    prior = sparse * (PRIOR_TRACKS * tracks - PRIOR_SPARSE * is_single)
+    errors = beds.errors + prior[:, None] - prior
     if hint is not None:
         likely = np.array([PRIOR_SOFTWARE * (one in hint.words) for one in words])
         errors += likely[:, None] - likely
@@ -418,7 +416,10 @@ def _with_prior(
     if beds.patches and beds.rank(among)[0] == best:
         return known, ""
     by_software = hint is not None and words[best] in hint.words
-    return known, f"its software, {hint.source}" if hint and by_software else "its density"
+    return (
+        known,
+        f"its software, {hint.source}" if hint and by_software else "the spacing of its points",
+    )
 
 
 def _remarks(part: Batch, place: IntArray) -> tuple[str, ...]:
@@ -450,12 +451,12 @@ def _model_uncertainty(part: Batch, beds: _Beds, at: int, among: list[int]) -> M
     """
     depth = np.maximum(part.surface.height_m - beds.z[at], 1e-3)[beds.place]
     deep = depth > LEAST_DEPTH_M
-    is_likelihood = _by_likelihood(beds.types)
+    is_single = _is_single(beds.types)
 
     def left(a: int, b: int, most: float) -> float:
         apart = np.abs((beds.z[a] - beds.z[b])[beds.place]) / depth
         share = _open_share(float(beds.errors[a, b]))
-        if not is_likelihood[a, b]:
+        if not is_single[[a, b]].any():
             share = max(
                 share, min(max(float(beds.share[a, b]), 0.0) + float(beds.sigma[a, b]), 1.0)
             )
