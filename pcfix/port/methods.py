@@ -304,12 +304,12 @@ def _solve(row: FloatArray, point: Vector, chosen: IntArray, rig: Rig, is_consis
         row[_FOUND] = is_found
 
 
-Image: TypeAlias = tuple[float, float, Vector, Vector, float, float]
+Projected: TypeAlias = tuple[float, float, Vector, Vector, float, float]
 """u and v, their gradients by the point in the world frame, and their derivatives by n."""
 
 
 @device
-def _image_through(a: Vector, rig: Rig, c: int, out: FloatArray) -> Image:
+def _image_through(a: Vector, rig: Rig, c: int, out: FloatArray) -> Projected:
     """Project the point at C + a through the port of a camera; `out`, shape (3, 5), is for this."""
     r = rig.rotations[c]
     through_port(rig.port, rig.n, *times(r, a), out)

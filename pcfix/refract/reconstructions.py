@@ -26,9 +26,9 @@ SURE = 2.3264
 SPACING_GSD, PRIOR_SPARSE = (6.0, 12.0), 4.0
 """What a large spacing of the points counts against single maps, in standard errors: their clouds
 are dense, and neighbours that are far apart show little of their scatter."""
-PRIOR_TRACKS, PRIOR_SOFTWARE = 0.4, 1.0
+PRIOR_TRACKS, PRIOR_SOFTWARE = 0.8, 1.0
 """What it counts for tracks against other types, and what the software counts."""
-SHARE_ERROR, SHARE_WEIGHT = 0.12, 0.3
+SHARE_ERROR, SHARE_WEIGHT = 0.1, 0.25
 """Standard error of a share from what the models neglect, and what shares count beside likelihoods:
 less, as the maps of a point are chosen by a smooth bed."""
 WEAK = 3.0
@@ -105,12 +105,12 @@ SOFTWARE: dict[str, tuple[str, ...]] = {
     "openmvs": (_MAPS,), "odm": (_MAPS,), "opendronemap": (_MAPS,), "opensfm": (_MAPS,),
     "colmap": (_MAPS,), "realitycapture": (_MAPS,), "realityscan": (_MAPS,),
     "metashape": (_SINGLE,), "photoscan": (_SINGLE,), "sure": (_SINGLE, _PAIRS),
-    "micmac": (_PAIRS, _NEAREST),
+    "micmac": (_SINGLE, _PAIRS),
 }  # fmt: skip
 """Types of dense clouds by a word in the name of the software. OpenMVS, which ODM calls, and COLMAP
 fuse depth maps (their sources); Metashape merges the depth maps of single images (its manual); SURE
-triangulates a base image with several others (Rothermel et al. 2012); MicMac fuses stereo models
-or keeps the best image (its manual). Those of Pix4D and DJI Terra are unknown."""
+triangulates a base image with several others (Rothermel et al. 2012); MicMac computes a depth map
+for each image (its manual, PIMs) or stereo models. Those of Pix4D and DJI Terra are unknown."""
 
 
 class Hint(NamedTuple):

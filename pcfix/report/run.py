@@ -32,7 +32,7 @@ from pcfix.report.page import (
     new_figure,
 )
 from pcfix.report.summary import Summary
-from pcfix.report.text import formal_words, summary_rows, uncertainty_sentence
+from pcfix.report.text import FEWEST, formal_words, summary_rows, uncertainty_sentence
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ Pair = tuple[str, str]
 FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras")
 """Those that are shown where they are there, the first four of them."""
 SHOWN_NOTES = 3
+CONTRADICTS = 1.5
+"""Measured and predicted errors that differ by a larger factor contradict each other."""
 BESIDE_MAP = ("Submerged", "Cameras", "Water", "")
 """Labels of the rows that are also shown beside the map."""
 UNKNOWN_DATUM = "vertical datum not known"
@@ -328,9 +330,20 @@ def notes_of(s: Summary, heights: str, compared: Plain) -> list[str]:
     if not compared.get("own"):
         notes.append("No reference: the accuracy is predicted. Check points on the bed measure it.")
     elif compared.get("bed"):
-        after = compared["bed"]["after"]
+        after, noise = compared["bed"]["after"], compared["own"]["sigma_reference_m"]
+        if s.uncertainty is not None and after["count"] >= FEWEST:
+            sigma, measured = s.uncertainty["sigma_z_m"]["mean"], after["rmse_m"]
+            expected = (sigma**2 + noise**2) ** 0.5
+            if not 1.0 / CONTRADICTS <= measured / expected <= CONTRADICTS:
+                is_larger = measured > expected
+                notes.append(
+                    f"The measured errors of the bed are {'larger' if is_larger else 'smaller'}"
+                    f" than the predicted ones (RMSE {measured:.3f} m, predicted {expected:.3f} m"
+                    " with the noise of the reference):"
+                    f" {'use the measured ones' if is_larger else 'the prediction is cautious'}."
+                )
         bias = after["mean_m"]
-        if abs(bias) > max(after["sd_m"], compared["own"]["sigma_reference_m"]):
+        if abs(bias) > max(after["sd_m"], noise):
             notes.append(
                 f"The bed is too {'high' if bias > 0.0 else 'low'} by {abs(bias):.3f} m on average,"
                 " more than it scatters. Check water level, refractive index, vertical datum and"

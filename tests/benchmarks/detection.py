@@ -53,6 +53,8 @@ def detected(kind: str, block: str, seed: int, points: int) -> tuple[str, float,
     deep = (found.outcome == Outcome.CORRECTED) & (scene.depth_m(found.xyz) > LEAST_DEPTH_M)
     error = (found.xyz - scene.true_xyz[rows])[deep, 2] / scene.gsd_m
     rmse = float(np.sqrt(np.mean(error**2)))
+    if not verdicts:  # too few points, or too sparse
+        return "none", 0.5, rmse
     return verdicts[0].chosen.words, verdicts[0].confidence, rmse
 
 
