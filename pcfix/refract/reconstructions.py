@@ -23,12 +23,12 @@ from pcfix.refract.patches import SMOOTH_GSD, Patches, scatter_m, shares
 
 SURE = 2.3264
 """Standard errors of a significant difference: 99 %."""
-SPACING_GSD, PRIOR_SPARSE = (6.0, 12.0), 4.0
+SPACING_GSD, PRIOR_SPARSE = (8.0, 14.0), 8.0
 """What a large spacing of the points counts against single maps, in standard errors: their clouds
 are dense, and neighbours that are far apart show little of their scatter."""
-PRIOR_TRACKS, PRIOR_SOFTWARE = 0.8, 1.0
+PRIOR_TRACKS, PRIOR_SOFTWARE = 0.7, 1.0
 """What it counts for tracks against other types, and what the software counts."""
-SHARE_ERROR, SHARE_WEIGHT = 0.1, 0.25
+SHARE_ERROR, SHARE_WEIGHT = 0.08, 0.2
 """Standard error of a share from what the models neglect, and what shares count beside likelihoods:
 less, as the maps of a point are chosen by a smooth bed."""
 WEAK = 3.0
