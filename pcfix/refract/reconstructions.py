@@ -27,10 +27,10 @@ SPACING_GSD, PRIOR_SPARSE = (8.0, 14.0), 8.0
 """What a large spacing of the points counts against single maps, in standard errors: their clouds
 are dense, and neighbours that are far apart show little of their scatter."""
 PRIOR_TRACKS, PRIOR_SOFTWARE = 0.7, 1.0
-"""What it counts for tracks against other types, and what the software counts."""
+"""What a large spacing counts for tracks, which are sparse, and what the software counts."""
 SHARE_ERROR, SHARE_WEIGHT = 0.08, 0.2
-"""Standard error of a share from what the models neglect, and what shares count beside likelihoods:
-less, as the maps of a point are chosen by a smooth bed."""
+"""Standard error of a share from what the models neglect, and the weight of shares where
+likelihoods are compared: it is small, as the maps of a point are chosen by a smooth bed."""
 WEAK = 3.0
 """Divisor of the evidence of clouds that were smoothed."""
 LEAST_PATCHES = 100
@@ -110,7 +110,8 @@ SOFTWARE: dict[str, tuple[str, ...]] = {
 """Types of dense clouds by a word in the name of the software. OpenMVS, which ODM calls, and COLMAP
 fuse depth maps (their sources); Metashape merges the depth maps of single images (its manual); SURE
 triangulates a base image with several others (Rothermel et al. 2012); MicMac computes a depth map
-for each image (its manual, PIMs) or stereo models. Those of Pix4D and DJI Terra are unknown."""
+for each image (its manual, PIMs) or stereo models. For RealityCapture there is no source: fused
+maps are assumed. Those of Pix4D and DJI Terra are unknown."""
 
 
 class Hint(NamedTuple):
@@ -415,11 +416,9 @@ def _with_prior(
     best = known.rank(among)[0]
     if beds.patches and beds.rank(among)[0] == best:
         return known, ""
-    by_software = hint is not None and words[best] in hint.words
-    return (
-        known,
-        f"its software, {hint.source}" if hint and by_software else "the spacing of its points",
-    )
+    if hint is not None and words[best] in hint.words:
+        return known, f"its software, {hint.source}"
+    return known, "the spacing of its points"
 
 
 def _remarks(part: Batch, place: IntArray) -> tuple[str, ...]:
