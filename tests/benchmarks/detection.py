@@ -32,7 +32,7 @@ BLOCKS = {
     "nadir": COARSE,
     "oblique": {**COARSE, "obliques_deg": 25.0},
     "river": {**COARSE, "bed": "river"},
-    "wide": {**COARSE, "focal_mm": 6.0},
+    "wide": {**COARSE, "focal_mm": 6.0, "forward_overlap": 0.9},
 }
 """Images of large pixels, for which few points are nearly as dense as those of matchers."""
 LEAST_DEPTH_M = 0.2
