@@ -242,7 +242,7 @@ def _above(cameras: Cameras, xyz: FloatArray) -> float:
 def _pixel_m(cameras: Cameras, xyz: FloatArray) -> float | None:
     """Return the size of a pixel on the ground, None if the lenses do not state it."""
     lenses = cameras.lenses or ()
-    if not lenses or any(one.unit == "mm" and one.pixel_size_mm is None for one in lenses):
+    if not lenses or any(one.unit == "mm" for one in lenses):
         return None
     return _above(cameras, xyz) / float(np.median([one.focal_px for one in lenses]))
 

@@ -84,21 +84,22 @@ class Photogroup(NamedTuple):
     """What the photos of a group share.
 
     `axes` is the matrix from camera axes to x right, y down, z forward; `middle` the principal
-    point in pixels from the corner. Of `pixel_mm` and `lens` None is unknown.
+    point in pixels from the corner. A `pixel_mm` of 0 and a `lens` of None are
+    unknown.
     """
 
     name: str
     has_poses: bool
     axes: FloatArray
     middle: FloatArray
-    pixel_mm: float | None
+    pixel_mm: float
     lens: Lens | None
 
     def place(self, mark: Element) -> FloatArray:
         """Return u, v in pixels from the corner, of a measurement in pixels or in mm."""
         if mark.find("x") is not None and mark.find("y") is not None:
             return np.array([float(text_of(mark, axis)) for axis in "xy"]) + FIRST_PIXEL
-        if self.pixel_mm is None:
+        if not self.pixel_mm > 0.0:
             raise ValueError("a measurement is in mm, but its photogroup has no pixel size")
         mm = np.array([float(text_of(mark, name)) for name in ("xmm", "ymm")])
         return self.middle + self.axes[:2, :2] @ mm / self.pixel_mm
@@ -295,7 +296,7 @@ def _photogroup(path: Path, element: Element) -> Photogroup:
     else:
         given |= {k.lower(): value(f"Distortion/{k}") for k in ("K1", "K2", "K3", "P1", "P2")}
     given |= {"cx": middle[0], "cy": middle[1]}
-    more: dict[str, Any] = {"sensor": name, "pixel_size_mm": pixel_mm if pixel_mm > 0.0 else None}
+    more: dict[str, Any] = {"sensor": name}
     if is_fisheye:
         shape = [value(f"FisheyeDistortion/P{i}") for i in range(5)]
         has_shape = element.find("FisheyeDistortion") is not None
@@ -304,7 +305,7 @@ def _photogroup(path: Path, element: Element) -> Photogroup:
     if is_used and min(width, height) > 0.0 and not math.isnan(given.get("f", given.get("fx", 0))):
         lens = lens_by_name(given, width, height, **more)
     has_poses = text_of(element, "ManualPose").lower() != "false"
-    return Photogroup(name, has_poses, axes, middle, more["pixel_size_mm"], lens)
+    return Photogroup(name, has_poses, axes, middle, pixel_mm, lens)
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:

@@ -37,14 +37,13 @@ import zipfile
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import (
     ZIP_MAGIC,
@@ -172,8 +171,13 @@ class Chunk(NamedTuple):
     @property
     def settings(self) -> dict[str, str]:
         """The settings of the chunk by their names."""
-        entries = self.element.iterfind("settings/property")
-        return {entry.get("name") or "": entry.get("value") or "" for entry in entries}
+        return _properties(self.element, "settings")
+
+
+def _properties(element: Element, path: str = ".") -> dict[str, str]:
+    """Return the names and values of the properties in an element."""
+    entries = element.iterfind(f"{path}/property")
+    return {entry.get("name") or "": entry.get("value") or "" for entry in entries}
 
 
 def open_chunk(path: Path) -> Chunk:
@@ -181,19 +185,12 @@ def open_chunk(path: Path) -> Chunk:
     top, notes = _top(path), list[PcfixWarning]()
     chosen = top
     if top.root.tag != "chunk":
-        candidates = top.root.findall("chunk") or top.root.findall("chunks/chunk")
         chunks = top.root.find("chunks")
         active = None if chunks is None else chunks.get("active_id")
-        candidates.sort(key=lambda chunk: chunk.get("id") != active)
-        found, lost = [], []
-        for candidate in candidates:
-            try:
-                found.append(top.follow(candidate))
-            except InputError as error:
-                lost.append(error)
+        listed = top.root.findall("chunk") or top.root.findall("chunks/chunk")
+        listed.sort(key=lambda chunk: chunk.get("id") != active)
+        found = [top.follow(chunk) for chunk in listed]
         posed = [one for one in found if one.root.find("cameras//camera/transform") is not None]
-        if not posed and lost:
-            raise lost[0]
         if not found:
             raise checks.no_pose(path, "has no chunk")
         chosen, *others = posed or found[:1]
@@ -202,32 +199,28 @@ def open_chunk(path: Path) -> Chunk:
             sentence = f"several chunks have aligned images; {names[0]} is read. Activate another"
             values = {"chunk": names[0], "others": names[1:]}
             notes = [note(path, "cameras.several_chunks", f"{sentence} for that.", **values)]
-    entries = (*top.root.iterfind("meta/property"), *chosen.root.iterfind("meta/property"))
-    about = {entry.get("name"): entry.get("value", "") for entry in entries}
-    last, first = (about.get(f"Info/{one}SoftwareVersion") for one in ("LastSaved", "Original"))
-    document = top.root.get("version") or chosen.root.get("version")
-    software = f"Agisoft Metashape, document {document}" if document else "Agisoft Metashape"
-    if last or first:
-        program = about.get("Info/OriginalSoftwareName") or "Agisoft Metashape"
-        software = f"{program} {last or first}"
-    return Chunk(path, chosen, software, notes)
+    about = _properties(top.root, "meta") | _properties(chosen.root, "meta")
+    name = about.get("Info/OriginalSoftwareName", "Agisoft Metashape")
+    version = about.get("Info/LastSavedSoftwareVersion") or about.get(
+        "Info/OriginalSoftwareVersion", ""
+    )
+    return Chunk(path, chosen, f"{name} {version}".strip(), notes)
 
 
 def _top(path: Path) -> Document:
     """Return the outermost document; that of a .psx is in the folder beside it."""
     if path.is_dir():
         return _unpacked(path / "project.zip")
-    with path.open("rb") as stream:
-        if stream.read(len(ZIP_MAGIC)) == ZIP_MAGIC:
-            return _unpacked(path)
+    if zipfile.is_zipfile(path):
+        return _unpacked(path)
     root = read_xml(path)
     inside = root.get("path")
-    if root.tag == "document" and inside is not None:
-        archive = Path(inside.replace("{projectname}", path.stem))
-        if archive.is_absolute():
-            raise damaged(path, f"its path '{inside}' leads out of its folder")
-        return _unpacked(path.parent / archive)
-    return Document(root, path)
+    if root.tag != "document" or inside is None:
+        return Document(root, path)
+    archive = Path(inside.replace("{projectname}", path.stem))
+    if archive.is_absolute():
+        raise damaged(path, f"its path '{inside}' leads out of its folder")
+    return _unpacked(path.parent / archive)
 
 
 def _unpacked(path: Path) -> Document:
@@ -264,51 +257,53 @@ def aligned_images(chunk: Chunk) -> tuple[list[Image], tuple[str, ...], list[Pcf
     path, element = chunk.path, chunk.element
     places, _ = _places(path, element)
     sensors = {sensor.get("id"): sensor for sensor in element.iterfind("sensors/sensor")}
-    homes: dict[str, str | None] = {
+    homes: dict[str, str | None] = {  # the component of each image
         number: component.get("id")
         for component in element.iterfind("components/component")
         for ids in component.iter("camera_ids")
         for number in (ids.text or "").split()
     }
-    photos = [
-        (camera.get("id") or f"#{i}", camera)
-        for i, camera in enumerate(
-            one
-            for one in element.iterfind("cameras//camera")
-            if one.get("type", "regular") == "regular"
-        )
-    ]
-    own = {name: _matrix(path, camera) for name, camera in photos if text_of(camera, "transform")}
+    photos = {
+        camera.get("id") or f"#{i}": camera
+        for i, camera in enumerate(element.iterfind("cameras//camera"))
+        if camera.get("type", "regular") == "regular"
+    }
+    own = {one: _matrix(path, photos[one]) for one in photos if text_of(photos[one], "transform")}
     images, why, others = list[Image](), Counter[str](), list[str]()
-    for name, camera in photos:
+    for name, camera in photos.items():
         label = camera.get("label") or f"number {name}"
-        others.append(label)
         master = camera.get("master_id") or ""
-        homes[name] = camera.get("component_id") or homes.get(name) or homes.get(master)
+        home = camera.get("component_id") or homes.get(name) or homes.get(master)
+        homes[name] = home
         sensor, pose = sensors.get(camera.get("sensor_id")), own.get(name)
         if pose is None and master in own and sensor is not None:  # a slave
             pose = own[master] @ _offset(path, sensor)
-        place = places.get(homes[name], places[None])
+        place = places.get(home, places[None])
         kind = "frame" if sensor is None else _kind(sensor)
         if pose is None:
-            why["not aligned"] += 1
+            why["are not aligned"] += 1
         elif camera.get("enabled") == "false":
-            why["aligned but disabled"] += 1
+            why["are aligned but disabled"] += 1
         elif kind not in PROJECTIONS:
-            why[f"of a {kind} sensor, for which there is no lens"] += 1
+            why[f"are of a {kind} sensor, for which there is no lens"] += 1
         elif place is None:
-            why["in a component that has no transform to the frame of the others"] += 1
+            why["are in a component that has no transform to the frame of the others"] += 1
         elif sensor is None:
             raise damaged(path, f"sensor {camera.get('sensor_id')} is missing")
         else:
-            images.append(Image(name, others.pop(), camera, sensor, homes[name], pose, place))
-    lacking = [f"{why.pop('not aligned', 0)} are not aligned"]
-    lost = [f"{count} images are {reason}" for reason, count in why.items()]
+            images.append(Image(name, label, camera, sensor, home, pose, place))
+            continue
+        others.append(label)
+    lost = [f"{count} images {reason}" for reason, count in why.items()]
     if not images:
-        reasons = ", ".join(lacking + lost)
         named = element.get("label") or "without a name"
+        reasons = ", ".join(lost) or "there are none"
         raise checks.no_pose(path, f"of the {len(photos)} images of chunk {named} {reasons}")
-    notes = [note(path, "cameras.left_out", f"{one}; left out.") for one in lost]
+    notes = [
+        note(path, "cameras.left_out", f"{one}; left out.")
+        for one in lost
+        if not one.endswith("not aligned")
+    ]
     return images, tuple(others), notes
 
 
@@ -388,18 +383,15 @@ def _world(chunk: Chunk) -> tuple[str, str | None, list[PcfixWarning]]:
         remedy = "Set it again in Metashape's reference settings"
         what = f"the CRS {shortened(text)}, which has no datum,"
         raise checks.unsupported(chunk.path, what, remedy)
-    base = unbound(crs.geodetic_crs).to_json_dict()
     axes = [
         {"name": f"Geocentric {a}", "abbreviation": a, "direction": f"geocentric{a}"}
         | {"unit": "metre"}
         for a in "XYZ"
     ]
-    geocentric = {  # on the datum of the CRS, as PROJJSON
-        **{key: base[key] for key in ("$schema", "name", "datum", "datum_ensemble") if key in base},
-        "type": "GeodeticCRS",
-        "coordinate_system": {"subtype": "Cartesian", "axis": axes},
-    }
-    frame = crs_text(type(crs).from_json_dict(geocentric))
+    geocentric = unbound(crs.geodetic_crs).to_json_dict()  # on the datum of the CRS
+    geocentric |= {"coordinate_system": {"subtype": "Cartesian", "axis": axes}}
+    geocentric |= {"type": "GeodeticCRS", "id": None}
+    frame = crs_text(type(crs).from_json_dict({k: v for k, v in geocentric.items() if v}))
     return frame, frame if crs.is_geocentric else text, []
 
 
@@ -436,9 +428,7 @@ def _calibrated(
         given |= {"fx": value["f"] + value["b1"], "fy": value["f"], "skew": value["b2"]}
         given |= {"cx": width / 2.0 + value["cx"], "cy": height / 2.0 + value["cy"]}
     else:  # PhotoScan's
-        focal = given.get("fy", value["fx"])
-        given |= {"fx": given.get("fx", focal), "fy": focal}
-        given |= {"p1": value["p2"], "p2": value["p1"]}
+        given |= {"fy": given.get("fy", value["fx"]), "p1": value["p2"], "p2": value["p1"]}
     return lens_by_name(given, width, height, projection=PROJECTIONS[kind], sensor=sensor)
 
 
@@ -465,7 +455,7 @@ def _lens(path: Path, sensor: Element, image: str) -> tuple[Lens, list[PcfixWarn
     label, found, notes = name_of(sensor), _calibration(sensor), list[PcfixWarning]()
     sizes = [one.find("resolution") for one in (found, sensor) if one is not None]
     resolution = next((one for one in sizes if one is not None), None)
-    stated = {entry.get("name"): entry.get("value") for entry in sensor.iterfind("property")}
+    stated = _properties(sensor)
     pixel_mm, focal_mm = (
         number(path, f"sensor {label}, {name}", stated.get(name, "0"))
         for name in ("pixel_width", "focal_length")
@@ -487,7 +477,7 @@ def _lens(path: Path, sensor: Element, image: str) -> tuple[Lens, list[PcfixWarn
         lens = lens_by_name(given, *size, projection=PROJECTIONS[_kind(sensor)], sensor=label)
         sentence = f"sensor {label} has no calibration; the lens of its data sheet is used."
         notes.append(note(path, "cameras.data_sheet_lens", sentence, sensor=label))
-    return replace(lens, pixel_size_mm=pixel_mm if pixel_mm > 0.0 else None), notes
+    return lens, notes
 
 
 # ---- what was measured ----

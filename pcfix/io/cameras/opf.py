@@ -181,14 +181,13 @@ def _lens(path: Path, sensor: Part, given: Part) -> Lens:
         values |= zip(("p2", "p1"), map(float, inner["tangential_distortion"]), strict=True)
         lens = lens_by_name(values, *frame)
     elif inner.get("type") == "fisheye":
-        affine, polynomial = (tuple(map(float, inner[k])) for k in ("affine", "polynomial"))
-        lens = fisheye(values, affine, polynomial, *frame)
+        values |= zip(("fx", "skew", "b3", "fy"), map(float, inner["affine"]), strict=True)
+        lens = fisheye(values, [float(one) for one in inner["polynomial"]], *frame)
     else:
         what = f"the type {inner.get('type')!r:.40} of sensor {name}"
         remedy = "Leave its images out and calibrate again"
         raise checks.unsupported(path, what, remedy, sensor=name)
-    pixel_um = float(given.get("pixel_size_um", 0))
-    return replace(lens, sensor=name, pixel_size_mm=pixel_um / 1000.0 if pixel_um > 0.0 else None)
+    return replace(lens, sensor=name)
 
 
 def _gnss(path: Path, given: Part, ids: list[int]) -> GnssPositions | None:

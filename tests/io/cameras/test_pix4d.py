@@ -70,7 +70,6 @@ def test_all_tie_points_of_the_oblique_block():
     cameras = read(CA502)
     ties = read_ties(CA502)
     assert len({lens.focal for lens in cameras.lenses}) == 5
-    assert {lens.pixel_size_mm for lens in cameras.lenses} == {23.52 / 6000}
     assert len(ties.image_xy) == len(ties.views.camera) == 103328
     assert np.isfinite(ties.xyz).all(axis=1).sum() == 11  # control points
     misses = np.concatenate(list(misses_px(cameras, ties)))
@@ -180,7 +179,6 @@ def test_fisheye(tmp_path, where):
     for direction in ((0.3, 0.4, 1.0), (-2.0, 1.0, 0.1)):
         found = project(lens, np.array([direction]))[0]
         assert found == pytest.approx(fisheye_uv(direction), abs=1e-6)
-    assert lens.pixel_size_mm == pytest.approx(0.002)
 
 
 CAMERA = """Pix4D camera calibration file {0}
