@@ -168,12 +168,6 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
     if ignored:
         sentence = f"photogroup {', '.join(ignored[:10])} is skipped (its ManualPose is false)."
         notes.append(note(path, "cameras.poses_ignored", sentence, photogroups=ignored))
-    if not turned:
-        notes.append(note(path, "cameras.no_rotations", "no photo has a rotation, only positions."))
-    elif not has_lenses:
-        bare = next(photo.label for photo in photos if photo.group.lens is None)
-        why = f"the photogroup of {bare} has no frame or focal length"
-        notes.append(checks.without_lens(path, why))
     chosen = {photo.key for photo in photos}
     cameras = Cameras(
         labels=tuple(photo.label for photo in photos),

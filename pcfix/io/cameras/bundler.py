@@ -306,7 +306,7 @@ def _frame_sizes(
     why = f"the size of {missing.sum()} images is unknown. Put the images beside the file"
     least, focal = model.least_px, model.lenses[:, 0]
     if not least.any():
-        return np.empty((0, 2)), (checks.without_lens(path, why),)
+        return np.empty((0, 2)), ()
     order = np.argsort(focal)
     steps = focal[order][1:] > _SAME_CAMERA * focal[order][:-1]
     for members in np.split(order, np.flatnonzero(steps) + 1):  # images of about one focal length

@@ -39,12 +39,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import NO_TIE_POINTS, Source, are_seen, damaged
+from pcfix.io.cameras.checks import Source, damaged
 from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
 from pcfix.io.crs import is_topocentric
-from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
+from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints, Views
 from pcfix.options.declare import File
 
 _PART = re.compile(r"(cameras|images|points3D|rigs|frames)\.(bin|txt)")
@@ -361,16 +361,20 @@ def write_colmap(
     from scipy.spatial.transform import Rotation
 
     target = Path(folder)
-    rotations, lenses = checks.block_to_write(  # a file would cut off other names
-        target, cameras, lambda name: name == name.strip() != "" and not {"\0", "\n"} & {*name}
-    )
+    rotations, lenses = checks.block_to_write(target, cameras)
+    for label in cameras.labels:  # of other names a file would cut off a part
+        if not label == label.strip() != "" or {"\0", "\n"} & {*label}:
+            sentence = f"the format cannot hold the image name {label!r}. Rename the image."
+            raise bad_file(target, "output.label", sentence, image=label)
     middle = np.median(cameras.centres, axis=0)
     middle[2] = 0.0  # heights are small, and easier to read as they are
     offset = np.asarray(np.round(middle / ROUND_M) * ROUND_M if offset_m is None else offset_m)
     distinct = list(dict.fromkeys(lenses))
     number = {lens: i for i, lens in enumerate(distinct, start=1)}
-    ties = tie_points or NO_TIE_POINTS
-    kept, counts = are_seen(ties), np.diff(ties.views.start)
+    nothing = Views(np.zeros(1, np.int64), np.empty(0, np.int64))
+    ties = tie_points or TiePoints(np.empty((0, 3)), nothing, np.empty((0, 2)))
+    counts = np.diff(ties.views.start)
+    kept = np.isfinite(ties.xyz).all(axis=1) & (counts > 0)
     of_kept = np.repeat(kept, counts)
     camera = ties.views.camera[of_kept]
     order = np.argsort(camera, kind="stable")  # COLMAP lists the image points image by image

@@ -94,7 +94,7 @@ def recognises(source: Source) -> bool:
         return "project.zip" in source.names
     text = source.text
     if source.head.startswith(ZIP_MAGIC):
-        with suppress(*checks.DAMAGES), zipfile.ZipFile(source.path) as archive:
+        with suppress(Exception), zipfile.ZipFile(source.path) as archive:
             text = archive.open("doc.xml").read(len(source.head)).decode("utf-8", "replace")
     root = ROOT.match(text)
     inside = INSIDE.get(root[1]) if root else None

@@ -74,11 +74,7 @@ def read(source: Source) -> Cameras:
         for sensor in calibrated["sensors"]
         if "image_size_px" in sensors.get(sensor["id"], {})
     }
-    used, notes = [shot["sensor_id"] for shot in calibrated["cameras"]], []
-    lost = [i for i in used if i not in known]
-    if lost:
-        why = f"the input cameras have no frame of sensor {lost[0]}"
-        notes.append(checks.without_lens(path, why))
+    lenses = [known.get(shot["sensor_id"]) for shot in calibrated["cameras"]]
     captured = [
         shot["id"] for capture in given.get("captures", []) for shot in capture.get("cameras", [])
     ]
@@ -86,10 +82,10 @@ def read(source: Source) -> Cameras:
         labels=labels,
         centres=frame.points(xyz),
         rotations=from_omega_phi_kappa(*angles.T) if len(shots) else None,
-        lenses=None if lost else tuple(known[i] for i in used) or None,
+        lenses=tuple(one for one in lenses if one) if all(lenses) and lenses else None,
         crs=frame.crs,
         project_crs=frame.project_crs,
-        notes=(*of_frame, *notes, *checks.repeated(path, labels)),
+        notes=(*of_frame, *checks.repeated(path, labels)),
         gnss=_gnss(path, given, list(shots)),
         unposed=tuple(names.get(i, f"camera {i}") for i in captured if i not in shots),
         source=" ".join(["OPF", *project.generator]),

@@ -112,9 +112,6 @@ def read(source: Source) -> Cameras:
     elif "external" in files:
         labels, centres, rotations = read_external(files["external"])
         own, given = [lens_of_calibration(calibration)] * len(labels), labels
-        if own[0] is None:
-            why = f"there is no {PARAMETERS} beside it"
-            notes = (checks.without_lens(files["external"], why),)
     else:
         remedy = "Give the params folder of the project; the table in WGS 84 does not suffice"
         raise checks.missing(source.path.with_name(PARAMETERS), remedy)
