@@ -59,7 +59,7 @@ def read(source: Source) -> Cameras:
     project = _open_project(source.path)
     path, calibrated = project.part("calibration", "calibrated-cameras")
     _, given = project.part("input_cameras", "input-cameras", needed=False)
-    (frame, of_frame), names = _frame_of(project), dict[int, str]()
+    (frame, notes), names = _frame_of(project), dict[int, str]()
     for listed in project.files("camera_list", FORMAT.format("camera-list")):
         for camera in load_json(listed)["cameras"] if listed.is_file() else []:
             name = camera["uri"].replace("\\", "/").rpartition("/")[2]
@@ -74,21 +74,20 @@ def read(source: Source) -> Cameras:
         for sensor in calibrated["sensors"]
         if "image_size_px" in sensors.get(sensor["id"], {})
     }
-    lenses = [known.get(shot["sensor_id"]) for shot in calibrated["cameras"]]
-    captured = [
-        shot["id"] for capture in given.get("captures", []) for shot in capture.get("cameras", [])
-    ]
+    lenses = [known.get(shot["sensor_id"]) for shot in shots.values()]
+    captures = given.get("captures", [])
+    captured = [shot["id"] for capture in captures for shot in capture.get("cameras", [])]
     return Cameras(
         labels=labels,
         centres=frame.points(xyz),
         rotations=from_omega_phi_kappa(*angles.T) if len(shots) else None,
-        lenses=tuple(one for one in lenses if one) if all(lenses) and lenses else None,
+        lenses=tuple(one for one in lenses if one) if lenses and all(lenses) else None,
         crs=frame.crs,
         project_crs=frame.project_crs,
-        notes=(*of_frame, *checks.repeated(path, labels)),
-        gnss=_gnss(path, given, list(shots)),
+        notes=(*notes, *checks.repeated(path, labels)),
+        gnss=_gnss(path, captures, list(shots)),
         unposed=tuple(names.get(i, f"camera {i}") for i in captured if i not in shots),
-        source=" ".join(["OPF", *project.generator]),
+        source=project.generator,
     )
 
 
@@ -97,7 +96,7 @@ class Project(NamedTuple):
 
     path: Path
     items: list[Part]
-    generator: tuple[str, ...]
+    generator: str
 
     def files(self, kind: str, form: str) -> list[Path]:
         """Return the files of a format that items of a kind have."""
@@ -127,8 +126,8 @@ def _open_project(path: Path) -> Project:
         content = load_json(path)
         if content.get("format") == PROJECT:
             generator = content.get("generator", {})
-            said = tuple(str(generator[name]) for name in ("name", "version") if name in generator)
-            return Project(path, content["items"], said)
+            words = ("OPF", generator.get("name", ""), generator.get("version", ""))
+            return Project(path, content["items"], " ".join(map(str, words)).strip())
         above = path.resolve().parent
         found = [*sorted(above.glob("*.opf")), *sorted(above.parent.glob("*.opf"))]
     if len(found) != 1 or found[0] == path:
@@ -186,19 +185,19 @@ def _lens(path: Path, sensor: Part, given: Part) -> Lens:
     return replace(lens, sensor=name)
 
 
-def _gnss(path: Path, given: Part, ids: list[int]) -> GnssPositions | None:
+def _gnss(path: Path, captures: list[Part], ids: list[int]) -> GnssPositions | None:
     """Return where captures were taken, at their reference cameras, in the CRS of the first."""
     found = {
         capture["reference_camera_id"]: capture["geolocation"]
-        for capture in given.get("captures", [])
+        for capture in captures
         if capture.get("geolocation") and capture.get("reference_camera_id") in ids
     }
     text = next((place["crs"]["definition"] for place in found.values()), "local")
     if checks.crs(path, text) == "local":
         return None
-    crs = parse_crs(text, str(path))
-    order = [1, 0, 2] if crs.axis_info[0].direction.lower() == "north" else [0, 1, 2]
     said, up_m = _with_heights(text, str(path))
+    crs = parse_crs(said, str(path))
+    order = [1, 0, 2] if crs.axis_info[0].direction.lower() == "north" else [0, 1, 2]
     unit_m = 1.0 if crs.is_geographic else plan_unit(crs)[1]
     places = {
         i: (triple(p["coordinates"])[order] * [1.0, 1.0, up_m], triple(p["sigmas"])[order] * unit_m)
