@@ -301,7 +301,7 @@ def _write_models(folder: Path, found: Adjusted) -> None:
         ties = TiePoints(found.xyz[:m], Views(start, block.camera[used]), block.image_xy[used])
         ties = taken_ties(ties, np.flatnonzero(counts >= LEAST_VIEWS))
     writers = {
-        "colmap": partial(write_colmap, folder / "colmap", cameras, ties, crs=cameras.crs),
+        "colmap": partial(write_colmap, folder / "colmap", cameras, ties),
         "cameras.csv": partial(write_table, folder, cameras),
     }
     failed = []

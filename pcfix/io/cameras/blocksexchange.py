@@ -42,6 +42,7 @@ from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import ZIP_MAGIC, Source, damaged, note, number, read_xml, text_of
 from pcfix.io.cameras.lenses import lens_by_name
+from pcfix.io.crs import Topocentric
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
 from pcfix.model import Cameras, FloatArray, Lens, TiePoints
 
@@ -228,11 +229,8 @@ def _crs_of(path: Path, root: Element, srs_id: str) -> str:
     definition = definitions[srs_id].strip()
     if not definition.upper().startswith("ENU:"):
         return checks.crs(path, definition)
-    words = [word.strip() for word in [*definition[4:].split(","), "0"][:3]]
-    latitude, longitude, _ = map(float, words)
-    if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0):
-        raise damaged(path, f"'{definition[:80]}' is not ENU:latitude,longitude in degrees")
-    return "ENU:" + ",".join(words)
+    Topocentric.from_text(definition, str(path))  # checks it
+    return "ENU:" + ",".join(word.strip() for word in [*definition[4:].split(","), "0"][:3])
 
 
 def _numbers(path: Path, where: str, element: Element, names: Sequence[str]) -> FloatArray:

@@ -233,24 +233,22 @@ def _points(path: Path, body: FloatArray, count: int, images: int, width: int) -
     `count` is the number of points that the file announces, `images` that of its images, which the
     first number of a view counts from 0; its last two are x and y.
     """
-    starts: list[tuple[int, int]] = []  # where a point begins, and its number of views
-    at = 0
+    xyz, parts, at = [], [], 0
     for i in range(count):
         n = int(body[at + _BEFORE_VIEWS - 1]) if at + _BEFORE_VIEWS <= len(body) else -1
-        if n < 0 or at + _BEFORE_VIEWS + width * n > len(body):
+        end = at + _BEFORE_VIEWS + width * n
+        if n < 0 or end > len(body):
             raise damaged(path, f"it ends at point {i} of {count}")
-        starts.append((at, n))
-        at += _BEFORE_VIEWS + width * n
-    first, views = np.array(starts, np.int64).reshape(-1, 2).T
-    point = np.repeat(np.arange(count), views)
-    within = np.arange(len(point)) - np.repeat(np.cumsum(views) - views, views)
-    at_view = np.repeat(first + _BEFORE_VIEWS, views) + width * within
-    image = body[at_view]
+        xyz.append(body[at : at + 3])
+        parts.append(body[at + _BEFORE_VIEWS : end].reshape(n, width))
+        at = end
+    point = np.repeat(np.arange(count), [len(part) for part in parts])
+    views = np.concatenate([np.empty((0, width)), *parts])
+    image = views[:, 0].astype(np.int64)
     bad = ~((image >= 0) & (image < images))
     if bad.any():
-        raise damaged(path, f"point {point[np.argmax(bad)]} is in image {image[np.argmax(bad)]:g}")
-    uv = body[at_view[:, None] + np.arange(width - 2, width)]
-    return Seen(body[first[:, None] + np.arange(3)], point, image.astype(np.int64), uv)
+        raise damaged(path, f"point {point[np.argmax(bad)]} is in image {image[np.argmax(bad)]}")
+    return Seen(np.array(xyz).reshape(-1, 3), point, image, views[:, -2:])
 
 
 def _from_the_middle(

@@ -87,11 +87,6 @@ def unsupported(path: Path, what: str, remedy: str, **values: Any) -> InputError
     return bad_file(path, "cameras.unsupported", f"{what} is not supported. {remedy}.", **values)
 
 
-def missing(path: Path, remedy: str = "Keep all files of the project together") -> InputError:
-    """Return the error for a file of a project that is not there."""
-    return bad_file(path, "cameras.missing_file", f"is missing. {remedy}.")
-
-
 def note(path: object, code: str, sentence: str, **values: Any) -> PcfixWarning:
     """Return a note on what was done on reading a file."""
     return PcfixWarning(code, f"{path}: {sentence}", path=path, **values)
@@ -129,7 +124,8 @@ def reading(path: object) -> Iterator[None]:
     except PcfixError:
         raise
     except FileNotFoundError as error:
-        raise missing(Path(error.filename or str(path))) from error
+        sentence = "is missing. Keep all files of the project together."
+        raise bad_file(error.filename or path, "cameras.missing_file", sentence) from error
     except KeyError as error:
         raise damaged(path, f"{error} is missing") from error
     except Exception as error:  # whatever a reader runs into where a file is cut off

@@ -34,9 +34,10 @@ from __future__ import annotations
 import io
 import re
 import zipfile
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 from xml.etree.ElementTree import Element
@@ -83,9 +84,11 @@ PROJECTIONS: dict[str, Projection] = {
     "equisolid_fisheye": "equisolid",
 }
 """Kinds of sensors that a lens can describe: not spherical, cylindrical or RPC."""
-ROOT = re.compile(r"\s*(?:<\?.*?\?>\s*|<!--.*?-->\s*)*<(\w+)", re.DOTALL)
-OF_CHUNKS = re.compile(r"<chunks?\b|\bpath=")
-INSIDE = {"document": OF_CHUNKS, "collection": OF_CHUNKS, "chunk": re.compile(r"<sensors\b")}
+ROOT = re.compile(  # a project, chunks or a chunk, after the declaration and comments
+    r"\s*(<\?.*?\?>\s*|<!--.*?-->\s*)*"
+    r"(<(document|collection)\b.*?(<chunks?\b|\bpath=)|<chunk\b.*?<sensors\b)",
+    re.DOTALL,
+)
 
 
 def recognises(source: Source) -> bool:
@@ -96,9 +99,7 @@ def recognises(source: Source) -> bool:
     if source.head.startswith(ZIP_MAGIC):
         with suppress(Exception), zipfile.ZipFile(source.path) as archive:
             text = archive.open("doc.xml").read(len(source.head)).decode("utf-8", "replace")
-    root = ROOT.match(text)
-    inside = INSIDE.get(root[1]) if root else None
-    return bool(root and inside and inside.search(text, root.end()))
+    return bool(ROOT.match(text))
 
 
 def read(source: Source) -> Cameras:
@@ -268,8 +269,13 @@ def aligned_images(chunk: Chunk) -> tuple[list[Image], tuple[str, ...], list[Pcf
         for i, camera in enumerate(element.iterfind("cameras//camera"))
         if camera.get("type", "regular") == "regular"
     }
-    own = {one: _matrix(path, photos[one]) for one in photos if text_of(photos[one], "transform")}
-    images, why, others = list[Image](), Counter[str](), list[str]()
+    own = dict[str, FloatArray]()
+    for name, camera in photos.items():
+        if text := text_of(camera, "transform"):
+            where = f"image {camera.get('label')}"
+            matrix = numbers(path, f"{where}, transform", text, 16).reshape(4, 4)
+            own[name] = _rigid(path, where, matrix[:3, :3], matrix[:3, 3])
+    images, others, unused = list[Image](), list[str](), 0
     for name, camera in photos.items():
         label = camera.get("label") or f"number {name}"
         master = camera.get("master_id") or ""
@@ -277,52 +283,36 @@ def aligned_images(chunk: Chunk) -> tuple[list[Image], tuple[str, ...], list[Pcf
         homes[name] = home
         sensor, pose = sensors.get(camera.get("sensor_id")), own.get(name)
         if pose is None and master in own and sensor is not None:  # a slave
-            pose = own[master] @ _offset(path, sensor)
+            where = f"sensor {name_of(sensor)}"  # its place on the master, in the chunk's unit
+            turn, shift = text_of(sensor, "rotation"), text_of(sensor, "location")
+            rotation = numbers(path, where, turn, 9) if turn else np.eye(3)
+            location = numbers(path, where, shift, 3) if shift else np.zeros(3)
+            pose = own[master] @ _rigid(path, where, rotation, location)
         place = places.get(home, places[None])
-        kind = "frame" if sensor is None else _kind(sensor)
         if pose is None:
-            why["are not aligned"] += 1
-        elif camera.get("enabled") == "false":
-            why["are aligned but disabled"] += 1
-        elif kind not in PROJECTIONS:
-            why[f"are of a {kind} sensor, for which there is no lens"] += 1
-        elif place is None:
-            why["are in a component that has no transform to the frame of the others"] += 1
+            others.append(label)
         elif sensor is None:
             raise damaged(path, f"sensor {camera.get('sensor_id')} is missing")
+        elif place is None or camera.get("enabled") == "false" or _kind(sensor) not in PROJECTIONS:
+            others.append(label)
+            unused += 1
         else:
             images.append(Image(name, label, camera, sensor, home, pose, place))
-            continue
-        others.append(label)
-    lost = [f"{count} images {reason}" for reason, count in why.items()]
+    why = "disabled, of a sensor that is no frame or fisheye, or in a component without transform"
     if not images:
         named = element.get("label") or "without a name"
-        reasons = ", ".join(lost) or "there are none"
-        raise checks.no_pose(path, f"of the {len(photos)} images of chunk {named} {reasons}")
-    notes = [
-        note(path, "cameras.left_out", f"{one}; left out.")
-        for one in lost
-        if not one.endswith("not aligned")
-    ]
-    return images, tuple(others), notes
+        reason = f"{len(others) - unused} are not aligned, {unused} {why}"
+        raise checks.no_pose(path, f"of the {len(photos)} images of chunk {named} {reason}")
+    left_out = note(path, "cameras.left_out", f"{unused} aligned images are skipped: {why}.")
+    return images, tuple(others), [left_out] if unused else []
 
 
-def _matrix(path: Path, camera: Element) -> FloatArray:
-    """Return camera to chunk, 4x4."""
-    where = f"image {camera.get('label')}"
-    matrix = numbers(path, f"{where}, transform", camera.findtext("transform"), 16).reshape(4, 4)
-    matrix[:3, :3] = checks.rotations(path, [where], matrix[:3, :3])[0]
+def _rigid(path: Path, where: str, rotation: FloatArray, shift: FloatArray) -> FloatArray:
+    """Return the 4x4 matrix of a rotation, rounded in the file, and a translation."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = checks.rotations(path, [where], rotation)[0]
+    matrix[:3, 3] = shift
     return matrix
-
-
-def _offset(path: Path, sensor: Element) -> FloatArray:
-    """Return the matrix from a slave's sensor to its master, in the unit of the chunk."""
-    where, offset = f"sensor {name_of(sensor)}", np.eye(4)
-    if rotation := text_of(sensor, "rotation"):
-        offset[:3, :3] = checks.rotations(path, [where], numbers(path, where, rotation, 9))[0]
-    if location := text_of(sensor, "location"):
-        offset[:3, 3] = numbers(path, where, location, 3)
-    return offset
 
 
 def _places(path: Path, chunk: Element) -> tuple[dict[str | None, FloatArray | None], bool]:
@@ -334,15 +324,17 @@ def _places(path: Path, chunk: Element) -> tuple[dict[str | None, FloatArray | N
     world is the frame of the chunk.
     """
     of_chunk = _similarity(path, chunk.find("transform"))
-    components, parent = chunk.findall("components/component"), chunk.find("components")
-    places = {one.get("id"): _similarity(path, one.find("transform")) for one in components}
+    places: dict[str | None, FloatArray | None] = {
+        one.get("id"): _similarity(path, one.find("transform"))
+        for one in chunk.iterfind("components/component")
+    }
+    has_place = of_chunk is not None or any(place is not None for place in places.values())
+    parent = chunk.find("components")
     active = None if parent is None else parent.get("active_id")
     main = active if active in places else next(iter(places), None)
-    has_place = of_chunk is not None or any(place is not None for place in places.values())
-    of_main = of_chunk if has_place else np.eye(4)
-    if places.get(main) is None:
-        places[main] = of_main
-    places[None] = of_main
+    places[None] = of_chunk if has_place else np.eye(4)
+    if places[main] is None:
+        places[main] = places[None]
     return places, has_place
 
 
@@ -354,13 +346,13 @@ def _similarity(path: Path, element: Element | None) -> FloatArray | None:
     scale, rotation, translation = map(element.findtext, ("scale", "rotation", "translation"))
     if (element.text or "").strip():
         matrix = numbers(path, where, element.text, 16).reshape(4, 4)
-    elif scale is None and rotation is None and translation is None:
+    elif scale is rotation is translation is None:
         return None
     if rotation is not None:
         matrix[:3, :3] = numbers(path, where, rotation, 9).reshape(3, 3)
     if translation is not None:
         matrix[:3, 3] = numbers(path, where, translation, 3)
-    inside = float(np.cbrt(np.linalg.det(matrix[:3, :3]))) if scale is None else 1.0
+    inside = np.cbrt(np.linalg.det(matrix[:3, :3])) if scale is None else 1.0
     size = inside if scale is None else number(path, where, scale)
     if not size > 0.0:
         raise damaged(path, f"{where}: the scale {size:g} is not positive")
@@ -380,9 +372,7 @@ def _world(chunk: Chunk) -> tuple[str, str | None, list[PcfixWarning]]:
         foreign = note(chunk.path, "cameras.local_unit", sentence, unit=unit)
         return LOCAL, None, [] if unit in METRES else [foreign]
     if crs.geodetic_crs is None:
-        remedy = "Set it again in Metashape's reference settings"
-        what = f"the CRS {shortened(text)}, which has no datum,"
-        raise checks.unsupported(chunk.path, what, remedy)
+        raise damaged(chunk.path, f"the CRS {shortened(text)} has no datum")
     axes = [
         {"name": f"Geocentric {a}", "abbreviation": a, "direction": f"geocentric{a}"}
         | {"unit": "metre"}
@@ -492,31 +482,29 @@ def _gnss_positions(
     when only control points determine the block.
     """
     path, given = chunk.path, [image.element.find("reference") for image in images]
-    ticked = [None if r is None or r.get("enabled") == "false" else r for r in given]
-    used = given if all(reference is None for reference in ticked) else ticked
+    stated = {i: one.attrib for i, one in enumerate(given) if one is not None}
+    ticked = {i: of for i, of in stated.items() if of.get("enabled") != "false"}
     settings = {name.replace("/", "_"): value for name, value in chunk.settings.items()}
     start = spreads(path, "settings of the chunk", settings, DEFAULTS, np.full(3, np.nan))
-    xyz, sigma = np.full((2, len(used), 3), np.nan)
-    for i, reference in enumerate(used):
+    places = {}
+    for i, of in (ticked or stated).items():
         where = f"image {images[i].label}, reference"
-        stated = {} if reference is None else reference.attrib
-        for j, axis in enumerate("xyz"):
-            if axis in stated:
-                xyz[i, j] = number(path, where, stated[axis])
-        sigma[i] = spreads(path, where, stated, SPREADS, start)
-    if not np.isfinite(xyz[:, :2]).all(axis=1).any():
-        return None, []
-    sigma = np.where(np.isfinite(xyz) & (sigma > 0.0), sigma, np.nan)
+        xyz = [number(path, where, of[axis]) if axis in of else np.nan for axis in "xyz"]
+        sigma = spreads(path, where, of, SPREADS, start)
+        places[i] = xyz, np.where(np.isfinite(xyz) & (sigma > 0.0), sigma, np.nan)
     # the CRS of the cameras may differ from that of the chunk
     own, notes = text_of(chunk.element, "camera_reference"), list[PcfixWarning]()
     crs = own or text_of(chunk.element, "reference") or "LOCAL"
-    are_degrees = bool((np.nanmax(np.abs(xyz[:, :2]), axis=0) <= [180.0, 90.0]).all())
+    found = checks.measured(range(len(images)), places, crs)
+    if found is None:
+        return None, []
+    are_degrees = bool((np.nanmax(np.abs(found.xyz[:, :2]), axis=0) <= [180.0, 90.0]).all())
     if crs.upper() == "LOCAL" or is_local(parsed := parse_crs(crs, str(path))):
         crs = LOCAL
     elif are_degrees and not own and not parsed.is_geographic:
         sentence = "the camera positions are degrees in a CRS in metres; WGS 84 is assumed."
         crs, notes = "EPSG:4979", [note(path, "cameras.gnss_in_degrees", sentence)]
-    return GnssPositions(xyz, sigma, crs), notes
+    return replace(found, crs=crs), notes
 
 
 def spreads(

@@ -3,9 +3,9 @@
 `Externe` has the projection centre (`Centre`) and the matrix camera to world as rows L1, L2, L3
 (`CodageMatr`); the camera is x right, y down, z forward. The interior orientation is `Interne` in
 the same file or another file, `FileInterne`, named from the folder in which MicMac ran; it is
-looked for beside the orientation first. `OrIntImaM2C`, an affine map from the camera's pixels to
-those of a scanned image, must change nothing. Where MicMac's pixels begin, at the corner or the
-centre of the first, its formats do not say; they are taken as they are. The files name no CRS.
+looked for beside the orientation first. `OrIntImaM2C` is an affine map from the camera's pixels
+to those of a scaled image. Where MicMac's pixels begin, at the corner or the centre of the first,
+its formats do not say; they are taken as they are. The files name no CRS.
 
 An ideal position F (x, y) / z + PP, in pixels, goes through the distortion of the calibration to
 the observed one (eConvApero_DistM2C), or from the observed to the ideal one (eConvApero_DistC2M).
@@ -29,6 +29,7 @@ MMVII's files write the formula of each coefficient beside it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from xml.etree.ElementTree import Element
 
@@ -90,12 +91,9 @@ def _orientation(path: Path, known: dict[Path, Lens]) -> tuple[FloatArray, Float
             known[where] = _calibration_2(where, read_xml(where))
         return centre, np.array(axes), known[where]
     conic = _first(path, root, "OrientationConique")
-    outer = _first(path, conic, "Externe")
     projection = _text(conic, "TypeProj") or "eProjStenope"
+    outer = _first(path, conic, "Externe")
     convention, matrix = _text(outer, "KnownConv"), outer.find("ParamRotation/CodageMatr")
-    scan = [_text(conic, f"OrIntImaM2C/{tag}").split() for tag in ("I00", "V10", "V01")]
-    if any(scan) and [[float(x) for x in row] for row in scan] != [[0, 0], [1, 0], [0, 1]]:
-        projection = "of scanned images (OrIntImaM2C)"
     if projection != "eProjStenope" or convention not in _IS_INVERSE or matrix is None:
         what = f"the projection {projection} with rotations by {convention or 'angles'}"
         raise checks.unsupported(path, what, "Write the orientations again with OriConvert")
@@ -110,7 +108,7 @@ def _orientation(path: Path, known: dict[Path, Lens]) -> tuple[FloatArray, Float
         if inner is None:
             inner = _first(where, read_xml(where), "CalibrationInternConique")
         known[where] = _calibration(where, inner)
-    return centre, np.array(rows).T, known[where]
+    return centre, np.array(rows).T, _scanned(path, conic.find("OrIntImaM2C"), known[where])
 
 
 def _calibration_file(path: Path, places: Sequence[Path]) -> Path:
@@ -179,6 +177,23 @@ def _lens(
         if is_inverse or not np.hypot(b1, b2) * away <= AFFINITY_PX:
             raise _not_held(path, "affinity (b1, b2)")
     return lens
+
+
+def _scanned(path: Path, element: Element | None, lens: Lens) -> Lens:
+    """Return the lens of an image that is an affine map of the camera's."""
+    if element is None:
+        return lens
+    tags = ("I00", "V10", "V01")
+    origin, *along = (numbers(path, tag, element.findtext(tag), 2) for tag in tags)
+    turn = np.column_stack(along)
+    if not origin.any() and (turn == np.eye(2)).all():
+        return lens
+    inner = turn @ np.array([[lens.focal + lens.b1, lens.b2], [lens.b3, lens.focal]])
+    (m00, m01), (m10, m11) = inner.tolist()
+    x, y = (origin + turn @ np.array([lens.principal_x, lens.principal_y])).tolist()
+    width, height = (np.abs(turn) @ np.array([lens.width, lens.height])).tolist()
+    scanned = replace(lens, focal=m11, b1=m00 - m11, b2=m01, b3=m10)
+    return replace(scanned, principal_x=x, principal_y=y, width=width, height=height)
 
 
 def _calibration_2(path: Path, root: Element) -> Lens:

@@ -32,7 +32,7 @@ import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Source, damaged, note, number, read_xml
+from pcfix.io.cameras.checks import Source, damaged, note, number, numbers, read_xml
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_omega_phi_kappa
@@ -104,7 +104,12 @@ def read(source: Source) -> Cameras:
             centres, rotations = there[rows], turned[rows]
             centres[np.array(rows) < 0] = np.nan
         else:
-            centres, notes = _absolute(files, images)
+            centres = np.array([image.fields["centre"] for image in images])
+            if "offset" in files:
+                centres += _offset(files["offset"])
+            else:
+                sentence = "there is no offset.xyz beside it. Give the offset by --cameras-offset."
+                notes = (note(files["parameters"], "cameras.no_offset", sentence),)
         posed = np.flatnonzero(np.isfinite(centres).all(axis=1))
         given = [*labels, *names]
         labels, centres, rotations = [labels[i] for i in posed], centres[posed], rotations[posed]
@@ -113,8 +118,8 @@ def read(source: Source) -> Cameras:
         labels, centres, rotations = read_external(files["external"])
         own, given = [lens_of_calibration(calibration)] * len(labels), labels
     else:
-        remedy = "Give the params folder of the project; the table in WGS 84 does not suffice"
-        raise checks.missing(source.path.with_name(PARAMETERS), remedy)
+        sentence = f"{PARAMETERS} is missing. Give the params folder of the project."
+        raise bad_file(source.path, "cameras.missing_file", sentence)
     lenses = tuple(lens for lens in own if lens is not None)
     gnss, enabled = _priors(files["project"], labels) if "project" in files else (None, [])
     wkt = " ".join(read_lines(files["wkt"])).strip() if "wkt" in files else ""
@@ -199,18 +204,13 @@ def _rows(
     return found
 
 
-def _absolute(files: Files, images: list[Image]) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
-    """Return the centres with the offset added."""
-    local = np.array([image.fields["centre"] for image in images])
-    if "offset" not in files:
-        sentence = "there is no offset.xyz beside it. Give the offset with --cameras-offset."
-        return local, (note(files["parameters"], "cameras.no_offset", sentence),)
-    # one line, or one for each group of images
-    lines = [line.replace(",", " ").split()[-3:] for line in read_lines(files["offset"])]
-    offsets = {tuple(_numbers(files["offset"], "the offset", line)) for line in lines if line}
-    if len(offsets) != 1 or len(offset := offsets.pop()) != 3:
-        raise damaged(files["offset"], "it should have one offset x y z")
-    return local + offset, ()
+def _offset(path: Path) -> FloatArray:
+    """Read the offset: one line, or the same one for each group of images."""
+    lines = [line.replace(",", " ").split()[-3:] for line in read_lines(path) if line.strip()]
+    offsets = np.array([numbers(path, "the offset", " ".join(line), 3) for line in lines])
+    if not len(offsets) or (offsets != offsets[0]).any():
+        raise damaged(path, "it should have one offset x y z")
+    return offsets[0]
 
 
 def _priors(path: Path, labels: list[str]) -> tuple[GnssPositions | None, list[str]]:
@@ -277,10 +277,9 @@ def read_parameters(path: Path) -> list[Image]:
         while len(words_of) < ends[-1] and row < len(lines):
             words_of += lines[row].split()
             row += 1
-        if len(words_of) != ends[-1]:
-            raise damaged(path, f"image {label}: {len(words_of)} numbers instead of {ends[-1]}")
-        width, height = _numbers(path, f"image {label}", size)
-        parts = np.split(_numbers(path, f"image {label}", words_of), ends[:-1])
+        width, height = numbers(path, f"image {label}", " ".join(size), 2)
+        values = numbers(path, f"image {label}", " ".join(words_of), ends[-1])
+        parts = np.split(values, ends[:-1])
         fields = {name: part for (name, _), part in zip(layout, parts, strict=True) if name}
         images.append(Image(label.strip(), float(width), float(height), fields))
     if not images:
@@ -288,16 +287,12 @@ def read_parameters(path: Path) -> list[Image]:
     return images
 
 
-def _numbers(path: Path, where: str, words: list[str]) -> FloatArray:
-    return np.array([number(path, where, word) for word in words])
-
-
 def read_external(path: Path) -> tuple[list[str], FloatArray, FloatArray]:
     """Read the absolute table: labels, centres (k, 3) and rotations (k, 3, 3)."""
     rows = [line.rsplit(None, 6) for line in read_lines(path)[1:] if line.strip()]
     if not rows:
         raise damaged(path, "has a header but no images")
-    values = np.array([_numbers(path, f"image {row[0]}", row[1:]) for row in rows])
+    values = np.array([numbers(path, f"image {row[0]}", " ".join(row[1:]), 6) for row in rows])
     rotations = from_omega_phi_kappa(*values[:, 3:].T)
     return [row[0].strip() for row in rows], values[:, :3], rotations
 
@@ -311,8 +306,8 @@ def read_calibrations(path: Path) -> list[Calibration]:
     cameras: list[Calibration] = []
     for text in CALIBRATION.split("\n".join(read_lines(path)))[1:]:
         size, rows = SENSOR.search(text), [line.split() for line in text.splitlines()]
-        width, height = _numbers(path, "the sensor size", [*size.groups()] if size else ["0", "0"])
-        given = {"width": float(width), "height": float(height)}
+        sides = " ".join(size.groups()) if size else "0 0"
+        given = dict(zip(("width", "height"), numbers(path, "sensor", sides, 2), strict=True))
         for name, *values in filter(None, rows):
             if values and not name.startswith("#"):
                 given[name.lower()] = number(path, f"camera {len(cameras)}, {name}", values[0])

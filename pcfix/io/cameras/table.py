@@ -152,17 +152,26 @@ _GEO_CRS = re.compile(r"(EPSG:\d+|\+proj=.+|WGS84 UTM \d\d?\s*[NS])\s*", re.IGNO
 
 
 def open_table(path: Path) -> Table:
-    """Read a table with a header, or ODM's geo.txt, which has none."""
+    """Read a table with a header, which may be a comment, or ODM's geo.txt, which has none."""
     lines = tables.read_lines(path)
-    if not is_geo(lines):
-        return read_columns(path)
-    split = [(i, line.split()) for i, line in enumerate(lines[1:], start=2)]
-    rows = [[*fields, *[""] * len(GEO)][: len(GEO)] for _, fields in split if fields]
-    lines_of = [i for i, fields in split if fields]
-    place = {name: GEO.index(name) for name in ("label", "x", "y", "z")}
-    place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
-    crs = checks.utm_as_code(lines[0].strip())
-    return Table(path, list(GEO), rows, lines_of, place, [""] * len(GEO), crs=crs)
+    if is_geo(lines):
+        split = [(i, line.split()) for i, line in enumerate(lines[1:], start=2) if line.strip()]
+        rows = [[*fields, *[""] * len(GEO)][: len(GEO)] for _, fields in split]
+        place = {name: GEO.index(name) for name in ("label", "x", "y", "z")}
+        place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
+        crs = checks.utm_as_code(lines[0].strip())
+        return Table(path, [*GEO], rows, [i for i, _ in split], place, [""] * len(GEO), crs=crs)
+    kinds = [("label", *three) for three in (*AXES, ("x_est", "y_est", "z_est"), TRANSLATION)]
+    table = tables.read_table(path, *kinds, spellings=SPELLINGS)
+    for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
+        alike = [name for name in table.header if name in spellings]
+        if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
+            sentence = f"the columns {', '.join(alike)} may all be {role}. Take out all but one."
+            raise bad_file(path, "table.columns_alike", sentence, columns=alike)
+    if table.has(*TRANSLATION) and axes(table.place) is None:
+        sentence = "tx, ty, tz may be translations. Give the projection centres as x, y, z."
+        raise bad_file(path, "table.translations", sentence)
+    return table
 
 
 def gnss_positions(columns: Table) -> GnssPositions | None:
@@ -180,22 +189,6 @@ def gnss_positions(columns: Table) -> GnssPositions | None:
 def axes(place: Iterable[str]) -> tuple[str, str, str] | None:
     """Return the three columns of a position: x, y, z or longitude, latitude, z."""
     return next((three for three in AXES if {*three} <= {*place}), None)
-
-
-def read_columns(path: Path) -> Table:
-    """Read a table with a header line, which may be a comment."""
-    kinds = [("label", *three) for three in (*AXES, ("x_est", "y_est", "z_est"), TRANSLATION)]
-    table = tables.read_table(path, *kinds, spellings=SPELLINGS)
-    names = table.header
-    for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
-        alike = [name for name in names if name in spellings]
-        if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
-            sentence = f"the columns {', '.join(alike)} may all be {role}. Take out all but one."
-            raise bad_file(path, "table.columns_alike", sentence, columns=alike)
-    if table.has(*TRANSLATION) and axes(table.place) is None:
-        sentence = "tx, ty, tz may be translations. Give the projection centres as x, y, z."
-        raise bad_file(path, "table.translations", sentence)
-    return table
 
 
 def centres(columns: Table, *, needed: bool = False) -> FloatArray:
