@@ -54,6 +54,8 @@ SRS_OF_ALL = re.compile(rb"<SRSId>\s*([^<]*?)\s*</SRSId>")
 MAIN_COMPONENT = "1"
 CENTRE = [f"Pose/Center/{axis}" for axis in "xyz"]
 DEGREES = ["Longitude", "Latitude", "Altitude"]
+EXIF = "EPSG:4326"
+"""The CRS of positions in ExifData."""
 FIRST_PIXEL = 0.5
 """The centre of the first pixel, seen from its corner."""
 DIRECTIONS = {"Right": (1, 0, 0), "Left": (-1, 0, 0), "Down": (0, 1, 0), "Up": (0, -1, 0)}
@@ -141,7 +143,13 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
                     continue
                 centre = _numbers(path, f"image {label}", photo, CENTRE)
                 turn = _rotation(path, label, photo.find("Pose/Rotation"), group.axes)
-                prior = _prior(path, label, photo, srs)
+                metadata, gps, prior = photo.find("Pose/Metadata"), photo.find("ExifData/GPS"), None
+                if metadata is not None and metadata.find("Center") is not None:
+                    axes = [f"Center/{axis}" for axis in "xyz"]
+                    place = _numbers(path, f"image {label}, Metadata", metadata, axes)
+                    prior = text_of(metadata, "SRSId") or srs, place
+                elif gps is not None and all(gps.findtext(name) for name in DEGREES):
+                    prior = EXIF, _numbers(path, f"image {label}, GPS", gps, DEGREES)
                 is_main = text_of(photo, "Component") in ("", MAIN_COMPONENT)
                 one = Photo(key, label, group, centre, turn, srs, prior)
                 (main if is_main else outside).append(one)
@@ -162,7 +170,7 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
     if priors:  # positions in the CRS that the first of them has
         of = next(iter(priors.values()))[0]
         places = {k: (xyz, np.full(3, np.nan)) for k, (srs, xyz) in priors.items() if srs == of}
-        crs = "EPSG:4326" if of == "exif" else _crs_of(path, root, of)
+        crs = EXIF if of == EXIF else _crs_of(path, root, of)
         gnss = checks.measured([photo.key for photo in photos], places, crs)
     lenses = [photo.group.lens for photo in photos if photo.group.lens is not None]
     has_lenses, notes = bool(turned) and len(lenses) == len(photos), []
@@ -186,17 +194,6 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
         i = data.count(b"<Block>", 0, match.start()) - 1
         texts.append((i, text_of(blocks[i], "SRSId"), match[1]))
     return cameras, photos, texts
-
-
-def _prior(path: Path, label: str, photo: Element, srs: str) -> tuple[str, FloatArray] | None:
-    """Return the GNSS position of a photo, and its SRS id, which is "exif" for WGS 84."""
-    metadata, gps = photo.find("Pose/Metadata"), photo.find("ExifData/GPS")
-    if metadata is not None and metadata.find("Center") is not None:
-        place = _numbers(path, f"image {label}, Metadata", metadata, [f"Center/{a}" for a in "xyz"])
-        return text_of(metadata, "SRSId") or srs, place
-    if gps is not None and all(gps.findtext(name) for name in DEGREES):
-        return "exif", _numbers(path, f"image {label}, GPS", gps, DEGREES)
-    return None
 
 
 def _rotation(
