@@ -148,6 +148,8 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
         raise checks.no_tie_points(source.path, f"the format ({FORMATS[form]}) has none")
     with reading(path):
         ties: TiePoints = reader_of(form).tie_points(source, cameras)
+    if not len(ties.views.camera):
+        raise checks.no_tie_points(source.path, "its images saw no points")
     return ties
 
 

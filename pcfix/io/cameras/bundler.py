@@ -119,13 +119,11 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     model = _read(source)
     if model.software == "MVE":
         raise checks.no_tie_points(source.path, "MVE writes no image coordinates")
-    if not len(model.points.camera) or cameras.lenses is None:
-        raise checks.no_tie_points(source.path, "it lists no points")
     row = np.full(len(model.names), -1)
     row[model.posed] = np.arange(len(cameras))
     camera = row[model.points.camera]
-    middle = np.array([(lens.principal_x, lens.principal_y) for lens in cameras.lenses])
-    uv = middle[camera] + model.points.uv
+    middles = [(one.principal_x, one.principal_y) for one in cameras.lenses or ()]
+    uv = np.array(middles).reshape(-1, 2)[camera] + model.points.uv
     return checks.tie_points(model.points._replace(camera=camera, uv=uv))
 
 

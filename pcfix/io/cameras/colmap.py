@@ -92,8 +92,6 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     identifiers, xyz = read_points(path)
     images = [i for i in read_images(listed.with_stem("images"), points=True) if i.posed]
     seen = np.concatenate([image.seen for image in images])
-    if not len(identifiers) or not len(seen):
-        raise checks.no_tie_points(path, "the model has no points that its images saw")
     camera = np.repeat(np.arange(len(cameras)), [len(image.seen) for image in images])
     xyz = xyz + read_place(listed.parent)[0]
     row = checks.rows_of(seen["point"], identifiers)

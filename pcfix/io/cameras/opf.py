@@ -219,8 +219,8 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     row_of = {shot["id"]: i for i, shot in enumerate(calibrated["cameras"])}
     models = project.files("calibration", "model/gltf+json")
     found = [node for model in models for node in _nodes(model, row_of)]
-    if not any((node.camera >= 0).any() for node in found):
-        raise checks.no_tie_points(project.path, "its calibration has no tracks in its images")
+    if not found:
+        raise checks.no_tie_points(project.path, "its calibration has no tracks")
     frame, _ = _frame_of(project)
     return checks.tie_points(*(node._replace(xyz=frame.points(node.xyz)) for node in found))
 
