@@ -232,9 +232,7 @@ def georeference(
     if cloud is not None:
         return _into(cloud, frame, project, cameras, offset, name, trusted=trusted)
     if frame.topocentric or (frame.direct and frame.crs.is_projected):
-        unit, size = systems.plan_unit(frame.crs)
-        words = frame.crs.name + ("" if size == 1.0 else f", unit {unit},")
-        words = systems.shortened(crs) if frame.topocentric else words
+        words = systems.shortened(crs) if frame.topocentric else frame.crs.name
         found = Georeference(_same, None, offset, stated, (), name)
     elif frame.direct or project is None or not project.is_projected:
         kind = "degrees" if frame.direct else "geocentric coordinates"
