@@ -62,23 +62,21 @@ def read(source: Source) -> Cameras:
     listed, *others = _models_at(source.path)
     path, folder = listed.with_stem("images"), listed.parent
     cameras, images = read_list(listed), read_images(path, points=False)
-    posed = [image for image in images if image.posed]
-    if not posed:
+    if not images:
         raise checks.no_pose(path)
-    poses = np.array([image.pose for image in posed])
-    labels = tuple(image.name for image in posed)
+    poses = np.array([image.pose for image in images])
+    labels = tuple(image.name for image in images)
     rotations = checks.quaternions(path, labels, poses[:, :4])
-    used = dict.fromkeys(image.camera for image in posed)
+    used = dict.fromkeys(image.camera for image in images)
     lenses = {number: lens_of(listed, number, cameras[number]) for number in used}
     offset, crs = read_place(folder)
     return Cameras(
         labels=labels,
         centres=checks.centres(rotations, poses[:, 4:]) + offset,
         rotations=rotations,
-        lenses=tuple(lenses[image.camera] for image in posed),
+        lenses=tuple(lenses[image.camera] for image in images),
         crs=crs,
-        notes=(checks.several(folder, len(others) + 1, len(posed)),) if others else (),
-        unposed=tuple(image.name for image in images if not image.posed),
+        notes=(checks.several(folder, len(others) + 1, len(images)),) if others else (),
         source="COLMAP",
     )
 
@@ -90,7 +88,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     if not path.is_file():
         raise checks.no_tie_points(path, "there is no such file")
     identifiers, xyz = read_points(path)
-    images = [i for i in read_images(listed.with_stem("images"), points=True) if i.posed]
+    images = read_images(listed.with_stem("images"), points=True)
     seen = np.concatenate([image.seen for image in images])
     camera = np.repeat(np.arange(len(cameras)), [len(image.seen) for image in images])
     xyz = xyz + read_place(listed.parent)[0]
@@ -204,11 +202,6 @@ class Image(NamedTuple):
     camera: int
     name: str
     seen: np.ndarray
-
-    @property
-    def posed(self) -> bool:
-        """Whether it has a pose at all; COLMAP itself writes no others."""
-        return bool(np.isfinite(self.pose).all())
 
 
 OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])

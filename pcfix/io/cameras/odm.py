@@ -32,7 +32,6 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import bad_file
 from pcfix.io.cameras import checks, opensfm
 from pcfix.io.cameras.checks import AffineFrame, Source, damaged, load_json, note, triple
 from pcfix.io.cameras.lenses import lens_by_name
@@ -130,12 +129,7 @@ def _crs_of(files: Files) -> str | None:
 def named_crs(path: Path) -> str:
     """Return the CRS in the first line of a file: a PROJ string, EPSG:n or WGS84 UTM 16N."""
     text = path.read_bytes()[:4096].decode("utf-8-sig", errors="replace").strip()
-    line = text.partition("\n")[0].strip()
-    crs = checks.utm_as_code(line)
-    if not checks.names_crs(crs):
-        sentence = f"'{line[:80]}' names no CRS. Put its EPSG code there."
-        raise bad_file(path, "cameras.crs", sentence, crs=line)
-    return crs
+    return checks.crs(path, checks.utm_as_code(text.partition("\n")[0].strip()))
 
 
 def _frame(files: Files, found: opensfm.Reconstruction) -> AffineFrame | None:
