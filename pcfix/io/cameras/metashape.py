@@ -59,7 +59,7 @@ from pcfix.io.cameras.checks import (
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.crs import LOCAL, METRES, crs_text, is_local, parse_crs, shortened, unbound
 from pcfix.io.ply import parse_header
-from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, Projection, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
 
 Spreads: TypeAlias = "tuple[tuple[str, tuple[int, ...]], ...]"
 """Names of stated standard deviations and the axes that they are of."""
@@ -72,7 +72,6 @@ DEFAULTS: Spreads = (
     ("accuracy_cameras_xy", (0, 1)),
     ("accuracy_cameras_z", (2,)),
 )
-POINTS, MARKS = ("x", "y", "z", "id"), ("x", "y", "id")
 PARAMETERS = {
     *("f", "fx", "fy", "cx", "cy", "b1", "b2", "skew"),
     *("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4"),
@@ -538,17 +537,12 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """
     chunk = open_chunk(source.path)
     images, frame, seen = aligned_images(chunk)[0], chunk.frame, list[checks.Seen]()
-    if len(images) != len(cameras):
-        raise damaged(chunk.path, f"{len(images)} aligned images, {len(cameras)} cameras")
     if frame is not None:
         row_of = {image.id: i for i, image in enumerate(images)}
         marks = [mark for mark in measured_marks(frame) if mark[1] in row_of]
         names = {name: i for i, name in enumerate(dict.fromkeys(name for name, _, _ in marks))}
-        point, camera = (
-            np.array([(names[name], row_of[one]) for name, one, _ in marks], np.int64)
-            .reshape(-1, 2)
-            .T
-        )
+        point = np.array([names[name] for name, _, _ in marks], np.int64)
+        camera = np.array([row_of[one] for _, one, _ in marks], np.int64)
         uv = np.array([uv for _, _, uv in marks]).reshape(-1, 2)
         markers = checks.Seen(np.full((len(names), 3), np.nan), point, camera, uv)
         seen = [*_tie_points(frame, images), markers]
@@ -582,29 +576,25 @@ def _tie_points(frame: Document, images: list[Image]) -> Iterator[checks.Seen]:
             ]
             if not rows:
                 continue
-            vertices, place = _vertices(archive, points.get("path"), POINTS), images[rows[0]].place
-            xyz = _columns(vertices, "xyz") @ place[:3, :3].T + place[:3, 3]
-            marks = [_vertices(archive, files[images[row].id], MARKS) for row in rows]
-            tracks = np.concatenate([one["id"].astype(np.int64) for one in marks])
-            point = checks.rows_of(tracks, vertices["id"].astype(np.int64))
-            camera = np.repeat(rows, [len(one) for one in marks])
-            uv = np.concatenate([_columns(one, "xy") for one in marks])
-            yield checks.Seen(xyz, point, camera, uv)
+            xyz, tracks = _vertices(archive, points.get("path"), "xyz")
+            place = images[rows[0]].place
+            marks = [_vertices(archive, files[images[row].id], "xy") for row in rows]
+            point = checks.rows_of(np.concatenate([of_track for _, of_track in marks]), tracks)
+            camera = np.repeat(rows, [len(uv) for uv, _ in marks])
+            uv = np.concatenate([uv for uv, _ in marks])
+            yield checks.Seen(xyz @ place[:3, :3].T + place[:3, 3], point, camera, uv)
 
 
-def _columns(vertices: np.ndarray, names: str) -> FloatArray:
-    return np.column_stack([vertices[name] for name in names]).astype(np.float64)
-
-
-def _vertices(archive: zipfile.ZipFile, name: str | None, needed: tuple[str, ...]) -> np.ndarray:
-    """Return the vertices of a binary PLY in an archive, with the properties that are needed."""
+def _vertices(archive: zipfile.ZipFile, name: str | None, axes: str) -> tuple[FloatArray, IntArray]:
+    """Return the coordinates and tracks (id) of a binary PLY in an archive."""
     where, data = f"{archive.filename}: {name}", checks.unpacked(archive, name or "")
     header = parse_header(where, data)
-    kinds = [(p.name, header.order + p.item) for p in header.properties if not p.length]
-    if not header.order or header.skipped or not {*needed} <= dict(kinds).keys():
-        raise damaged(where, f"it is not a binary PLY of vertices with {', '.join(needed)}")
+    kinds = {p.name: header.order + p.item for p in header.properties if not p.length}
+    if not header.order or header.skipped or not {*axes, "id"} <= kinds.keys():
+        raise damaged(where, f"it is not a binary PLY of vertices with {', '.join(axes)}, id")
     with checks.reading(where):
-        vertices = np.frombuffer(data, np.dtype(kinds), header.records, header.end)
-        if vertices["id"].dtype.kind not in "iu":
+        rows = np.frombuffer(data, np.dtype([*kinds.items()]), header.records, header.end)
+        if rows["id"].dtype.kind not in "iu":
             raise damaged(where, "the id is not a whole number")
-    return vertices
+        columns = np.column_stack([rows[axis] for axis in axes]).astype(np.float64)
+    return columns, rows["id"].astype(np.int64)
