@@ -145,7 +145,7 @@ def plan_of(
 
 
 def _check_frames(cameras: Cameras, options: CorrectOptions) -> None:
-    """Refuse cameras without angles or lens: nothing tells which of them saw a point.
+    """Refuse cameras without angles or lens, as it is not known which of them saw a point.
 
     On the sample scene the bed is 0.9 m off with all 40 cameras, 0.02 m with those in whose frame
     the points are. A method or a limit of the rays that the user gives is used.

@@ -166,7 +166,7 @@ def _posed(path: Path, has_focal: BoolArray) -> IntArray:
 
 
 def _listed_names(path: Path, count: int) -> list[str]:
-    """Return the names in the first list beside a file that has one for each image."""
+    """Return the names in the first list next to a file that has one for each image."""
     stem = path.name.removesuffix(".out")
     own = (f"{one}.list.txt" for one in (stem, path.name, stem.removesuffix(".bundle")))
     for place in (*map(path.with_name, (*own, "list.txt")), path.parent.parent / "list.txt"):
@@ -306,6 +306,6 @@ def _frame_sizes(
     if not least_px.any():
         return np.empty((0, 2)), ()
     first = sizes[missing] = least_px.max(axis=0)
-    sentence = f"the size of {missing.sum()} images is unknown. Put the images beside the file;"
+    sentence = f"the size of {missing.sum()} images is unknown. Put the images next to the file;"
     sentence += f" until then they are estimated as {first[0]:.0f} x {first[1]:.0f} px."
     return sizes, (note(path, "cameras.frames_estimated", sentence, size_px=first.tolist()),)

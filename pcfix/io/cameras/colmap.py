@@ -351,13 +351,13 @@ def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = 
     nothing = Views(np.zeros(1, np.int64), np.empty(0, np.int64))
     ties = tie_points or TiePoints(np.empty((0, 3)), nothing, np.empty((0, 2)))
     counts = np.diff(ties.views.start)
-    kept = np.isfinite(ties.xyz).all(axis=1) & (counts > 0)
-    of_kept = np.repeat(kept, counts)
-    camera = ties.views.camera[of_kept]
+    used = np.isfinite(ties.xyz).all(axis=1) & (counts > 0)
+    of_used = np.repeat(used, counts)
+    camera = ties.views.camera[of_used]
     order = np.argsort(camera, kind="stable")  # COLMAP lists the image points image by image
     seen = np.empty(len(camera), OBSERVATION)
-    seen["xy"] = ties.image_xy[of_kept][order]
-    seen["point"] = np.repeat(np.cumsum(kept), counts)[of_kept][order]
+    seen["xy"] = ties.image_xy[of_used][order]
+    seen["point"] = np.repeat(np.cumsum(used), counts)[of_used][order]
     start = np.concatenate([[0], np.cumsum(np.bincount(camera, minlength=len(cameras)))])
     listed = [struct.pack("<Q", len(distinct))]
     for i, lens in enumerate(distinct, start=1):
@@ -376,7 +376,7 @@ def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = 
     contents = {
         "cameras.bin": b"".join(listed),
         "images.bin": b"".join(images),
-        "points3D.bin": _points(ties.xyz[kept] - offset, seen["point"], start),
+        "points3D.bin": _points(ties.xyz[used] - offset, seen["point"], start),
         FILE: place_text(offset, cameras.crs).encode(),
     }
     checks.write_new(target, contents)

@@ -179,7 +179,7 @@ def _located(
     """Return the CRS in which a place has these coordinates to a metre, and the coordinates.
 
     Without `place` they are whole metres. The CRS is the one that is named, or else UTM, the zone
-    of the place or one beside it.
+    of the place or a neighbouring one.
     """
     zone = int((lon + 180.0) // 6.0) if np.isfinite(lon) else 0
     first = 32601 if lat >= 0.0 else 32701

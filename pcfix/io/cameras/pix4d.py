@@ -108,7 +108,7 @@ def read(source: Source) -> Cameras:
             if "offset" in files:
                 centres += _offset(files["offset"])
             else:
-                sentence = "there is no offset.xyz beside it. Give the offset by --cameras-offset."
+                sentence = "there is no offset.xyz next to it. Give the offset by --cameras-offset."
                 notes = (note(files["parameters"], "cameras.no_offset", sentence),)
         posed = np.flatnonzero(np.isfinite(centres).all(axis=1))
         given = [*labels, *names]

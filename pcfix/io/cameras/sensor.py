@@ -38,10 +38,10 @@ FILM_MM = 36.0
 
 
 def sensor_file(source: checks.Source) -> Path | None:
-    """Return the file with the lens of all images: that of the user, or the one beside them."""
+    """Return the file with the lens of all images: that of the user, or the one next to them."""
     folder = source.path if source.path.is_dir() else source.path.parent
-    beside = folder / "sensor.csv"
-    return source.sensor or (beside if beside.is_file() else None)
+    default = folder / "sensor.csv"
+    return source.sensor or (default if default.is_file() else None)
 
 
 def read_sensor(path: Path) -> Lens:

@@ -6,7 +6,7 @@ projection centre (longitude and latitude in degrees of WGS 84 are EPSG:4326, or
 header says that the heights are ellipsoidal), and how it is turned, or nothing:
 
 - omega, phi, kappa: photogrammetric camera axes (x right, y up, z back) go to the world by
-  Rx(omega) Ry(phi) Rz(kappa); a matrix beside them is ignored.
+  Rx(omega) Ry(phi) Rz(kappa); a matrix next to them is ignored.
 - yaw, pitch, roll, 0 for a view straight down: those axes go to the world by
   Rz(-yaw) Rx(pitch) Ry(roll). So are Metashape's reference angles, ODM's, and the heading,
   pitch, roll of RealityCapture.
