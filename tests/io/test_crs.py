@@ -1,8 +1,5 @@
 """Texts that name a CRS, kinds of heights, units, and transformations."""
 
-import struct
-
-import laspy
 import numpy as np
 import pytest
 from pyproj import CRS, Transformer
@@ -19,7 +16,6 @@ from pcfix.io.crs import (
     parts,
     transformation,
 )
-from pcfix.io.las.source import LasSource, metric_crs
 from tests.utils.codes import refused
 from tests.utils.pose_files.block import geocentric
 
@@ -168,30 +164,6 @@ def test_plan_in_feet():
     assert forward(np.array([[x, y, 1000.0]])) == pytest.approx(
         np.array([[5e5, 4.9e6, 304.8]]), abs=1e-3
     )
-
-
-@pytest.mark.parametrize(
-    ("keys", "crs", "code"),
-    [
-        ({3072: 32633, 3076: 9001, 4096: 5703, 4099: 9001}, "EPSG:32633+5703", None),
-        ({3072: 32633, 4096: 32767}, "EPSG:32633", None),
-        ({3072: 26995, 3076: 9003}, None, "cloud.crs_unit"),
-        ({3072: 32633, 4096: 6360}, None, "cloud.crs_unit"),
-    ],
-)
-def test_geotiff_keys(tmp_path, keys, crs, code):
-    las = laspy.LasData(laspy.LasHeader(version="1.2", point_format=1))
-    las.x, las.y, las.z = np.zeros((3, 4))
-    directory = struct.pack("<4H", 1, 1, 0, len(keys))
-    directory += b"".join(struct.pack("<4H", key, 0, 1, value) for key, value in keys.items())
-    las.vlrs.append(laspy.VLR("LASF_Projection", 34735, "", directory))
-    las.write(tmp_path / "a.las")
-    with LasSource(tmp_path / "a.las") as source:
-        if code is None:
-            assert is_same(metric_crs(source), CRS(crs))
-        else:
-            with refused(code):
-                metric_crs(source)
 
 
 UNKNOWN_HEIGHTS = (

@@ -460,57 +460,22 @@ def stated_crs(source: LasSource) -> CRS | None:
 
     try:
         with las_errors(source.path):
-            crs = header_crs(source.header)
+            crs: CRS | None = source.header.parse_crs()
     except CRSError as error:
         sentence = f"its CRS cannot be read ({shortened(str(error))}). Set it again."
         raise bad_file(source.path, "cloud.crs", sentence) from error
     return crs
 
 
-PLAN_UNIT_KEY, VERTICAL_CRS_KEY, VERTICAL_UNIT_KEY = 3076, 4096, 4099
-"""Numbers of GeoTIFF keys; their values are EPSG codes, from 32767 on a user's own."""
-METRE_CODE, OWN_CODE = 9001, 32767
-UNITS = {METRE_CODE: "metre", 9002: "foot", 9003: "US survey foot"}
-
-
-def header_crs(header: laspy.LasHeader) -> CRS | None:
-    """Return the CRS of a header, None if it has none, with the vertical CRS of its GeoTIFF keys.
-
-    laspy itself reads the horizontal CRS of the keys only.
-    """
-    from pyproj import CRS
-    from pyproj.crs import CompoundCRS
-
-    crs: CRS | None = header.parse_crs()
-    vertical = _geo_keys(header).get(VERTICAL_CRS_KEY, OWN_CODE)
-    if crs is None or crs.is_compound or vertical >= OWN_CODE:
-        return crs
-    heights = CRS.from_epsg(vertical)
-    if not heights.is_vertical:
-        return crs
-    return CRS(CompoundCRS(f"{crs.name} + {heights.name}", [crs, heights]))
-
-
-def _geo_keys(header: laspy.LasHeader) -> dict[int, int]:
-    """Return the GeoTIFF keys of a header that are numbers; none where WKT counts."""
-    if header.global_encoding.wkt:
-        return {}
-    found = [key for record in header.vlrs for key in getattr(record, "geo_keys", ())]
-    return {key.id: key.value_offset for key in found if key.tiff_tag_location == 0}
-
-
 def metric_crs(source: LasSource) -> CRS | None:
     """Return the coordinate system of a cloud in metres, or None if it states none.
 
-    An `InputError` if its coordinates or heights are in degrees, feet or another unit.
+    An `InputError` if its plan coordinates are in degrees, feet or another unit.
     """
     crs = stated_crs(source)
     if crs is None:
         return None
-    units = {axis.unit_name for axis in crs.axis_info}
-    keys = _geo_keys(source.header)
-    codes = {keys.get(key, METRE_CODE) for key in (PLAN_UNIT_KEY, VERTICAL_UNIT_KEY)}
-    units |= {UNITS.get(code, f"EPSG unit {code}") for code in codes if 0 < code < OWN_CODE}
+    units = {axis.unit_name for axis in crs.axis_info[:2]}
     if not units.issubset(METRES):
         unit = " and ".join(sorted(units))
         sentence = f"its CRS {crs.name} is in {unit}. Reproject the cloud to metres first."

@@ -35,7 +35,6 @@ from pcfix.io.las.source import (
     RecordList,
     append_evlrs,
     backend,
-    header_crs,
     las_errors,
     part_report,
 )
@@ -126,7 +125,7 @@ def _upgraded(
     crs = None
     if old.point_format.id < 6 and not header.global_encoding.wkt:  # formats 6 and up want WKT
         with las_errors(source.path):
-            crs = header_crs(old)
+            crs = old.parse_crs()
     if crs is not None:
         wkt = WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL")).record_data_bytes()
         vlrs.append(VLR("LASF_Projection", 2112, "OGC COORDINATE SYSTEM WKT", wkt))
