@@ -141,10 +141,11 @@ def test_label_doors(path, tmp_path, mask, choices, monkeypatch):
 def test_correct_doors(path, tmp_path, mask, choices):
     cameras = cameras_csv(tmp_path / "cameras.csv", block())
     las = laspy.read(path)
-    words = ["--cameras", cameras, "--water", WATER_M, "--water-mask", mask, *options_of(choices)]
+    words = ["--cameras", cameras, "--water", WATER_M, "--water-mask", mask, "--max-angle", 80]
+    words += options_of(choices)
     assert run_pcfix("correct", path, tmp_path / "a.las", *words).returncode == 0
     result = pcfix.correct_file(
-        path, tmp_path / "b.las", cameras=cameras, water=WATER_M, water_mask=mask,
+        path, tmp_path / "b.las", cameras=cameras, water=WATER_M, water_mask=mask, max_angle=80.0,
         **choices,
     )  # fmt: skip
     assert (tmp_path / "a.las").read_bytes() == (tmp_path / "b.las").read_bytes()
@@ -162,7 +163,7 @@ def test_correct_doors(path, tmp_path, mask, choices):
     assert result.submerged == submerged.sum() == arrays.submerged.sum()
     assert 0 < result.submerged < (np.asarray(las.z) < WATER_M).sum()
     outs, _ = run("correct", arrays_of(las), metadata(las), cameras=str(cameras),
-                  water=WATER_M, water_mask=str(mask), **choices)  # fmt: skip
+                  water=WATER_M, water_mask=str(mask), max_angle=80.0, **choices)  # fmt: skip
     np.testing.assert_array_equal(outs["RayCount"], out.RayCount)
     np.testing.assert_array_equal(outs["Classification"], np.asarray(out.classification))
     for axis in "XYZ":
@@ -259,12 +260,13 @@ def test_options_refused(path, tmp_path, words, code):
 def test_pipeline(path, tmp_path, mask):
     cameras = cameras_csv(tmp_path / "cameras.csv", block())
     words = [path, tmp_path / "out.las", "--cameras", cameras, "--water", WATER_M]
+    words += ["--max-angle", 80]
     more = ["--water-mask", mask, "--connected", "--least-pool", 9, "--respect-classes", "2,5"]
     stage = json.loads(run_pcfix("pipeline", *words, *more).stdout)["pipeline"][1]
     expected = {"water_mask": str(mask), "connected": True, "least_pool": 9.0}
     assert {**expected, "respect_classes": "2,5"}.items() <= stage["pdalargs"].items()
     plain = json.loads(run_pcfix("pipeline", *words).stdout)["pipeline"][1]["pdalargs"]
-    assert set(plain) == {"cameras", "water", "uncorrected", "dimensions"}
+    assert set(plain) == {"cameras", "water", "max_angle", "uncorrected", "dimensions"}
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -127,6 +127,16 @@ def test_residuals_of_tie_points(with_ties, fault):
 
 
 @rendered
+def test_residuals_of_one_image(with_ties):
+    """The median of the block does not show it."""
+    turns = with_ties.cameras.rotations.copy()
+    turns[3] = turns[3] @ Rotation.from_euler("x", 10, degrees=True).as_matrix()
+    cameras = replace(with_ties.cameras, rotations=turns)
+    (doubt,) = plausible(cameras, with_ties.xyz, with_ties.ties).doubts
+    assert (doubt.code, doubt.values["image"]) == ("cameras.residuals", cameras.labels[3])
+
+
+@rendered
 def test_heights_of_tie_points(with_ties):
     """Cameras and tie points moved alike: an offset, or another datum."""
     ties = replace(with_ties.ties, xyz=with_ties.ties.xyz + np.array([0.0, 0.0, 47.0]))

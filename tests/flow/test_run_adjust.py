@@ -79,8 +79,7 @@ def _write(folder, name, block, cameras):
     """Write a model and the cloud that it makes."""
     apparent = intersect_fixed(block.block(cameras, None)).xyz
     ties = TiePoints(apparent, Views(block.start, block.camera), block.image_xy)
-    write_colmap(folder / name, replace(cameras, gnss=None), ties, offset_m=(0.0, 0.0, 0.0))
-    (folder / name / "georeference.json").unlink(missing_ok=True)
+    write_colmap(folder / name, replace(cameras, gnss=None, crs=None), ties)
     _write_las(folder / f"{name}.las", apparent + ORIGIN_M)
 
 

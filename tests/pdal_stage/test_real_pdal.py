@@ -54,7 +54,7 @@ def stage_of(**options: object) -> dict[str, Any]:
         "module": "pcfix_stage",
         "function": "correct",
         "add_dimension": f"{add_dimension(COLUMNS)},{CLASS_FLAGS}",
-        "pdalargs": {"cameras": "cameras.csv", "water": WATER_M, **options},
+        "pdalargs": {"cameras": "cameras.csv", "water": WATER_M, "max_angle": 80.0, **options},
     }
 
 
@@ -113,14 +113,14 @@ def test_pipeline_of_a_call(tmp_path: Path, more: dict[str, Any]) -> None:
     words = [
         word for name, value in more.items() for word in ("--" + name.replace("_", "-"), value)
     ]
-    words += ["--cameras", "cameras.csv", "--water", WATER_M]
+    words += ["--cameras", "cameras.csv", "--water", WATER_M, "--max-angle", 80]
     done = run_pipeline(
         "program", pipeline_of(tmp_path, "cloud.las", "stage.las", *words), tmp_path
     )
     assert (done.returncode, done.stderr) == (0, "")
     pcfix.correct_file(
         tmp_path / "cloud.las", tmp_path / "cli.las",
-        cameras=tmp_path / "cameras.csv", water=WATER_M, **more,
+        cameras=tmp_path / "cameras.csv", water=WATER_M, max_angle=80.0, **more,
     )  # fmt: skip
     cli, stage = laspy.read(tmp_path / "cli.las"), laspy.read(tmp_path / "stage.las")
     for name in [*"XYZ", "classification", "withheld"]:
@@ -139,11 +139,12 @@ def test_water_of_a_dimension(tmp_path: Path, door: str) -> None:
     las.write(tmp_path / "cloud.las")
     cameras_csv(tmp_path / "cameras.csv", block())
     words = ["cloud.las", "stage.las", "--cameras", "cameras.csv", "--water", "dim:w_surf"]
+    words += ["--max-angle", "80"]
     done = run_pipeline(door, pipeline_of(tmp_path, *words), tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     pcfix.correct_file(
         tmp_path / "cloud.las", tmp_path / "cli.las",
-        cameras=tmp_path / "cameras.csv", water="dim:w_surf",
+        cameras=tmp_path / "cameras.csv", water="dim:w_surf", max_angle=80.0,
     )  # fmt: skip
     assert_same(tmp_path / "cli.las", tmp_path / "stage.las")
 
@@ -282,7 +283,7 @@ for attempt in range(30):
     after = sys.stdout, os.getcwd(), signal.getsignal(signal.SIGINT), sys.getdlopenflags()
     assert after == before, after
 good = json.loads(job)
-good[1]["pdalargs"] = {"cameras": "cameras.csv", "water": float(sys.argv[2])}
+good[1]["pdalargs"] = {"cameras": "cameras.csv", "water": float(sys.argv[2]), "max_angle": 80.0}
 assert pdal.Pipeline(json.dumps(good)).execute() == 300
 assert sys.stdout is before[0]
 print(message)
@@ -333,7 +334,7 @@ def test_pipeline_command(tmp_path: Path) -> None:
     write_cloud(tmp_path / "cloud.las", 7, plain=True, count=300)
     write_cloud(tmp_path / "waves.las", 10, plain=True, count=300)
     cameras_csv(tmp_path / "cameras.csv", block())
-    good = ["--cameras", "cameras.csv", "--water", "5"]
+    good = ["--cameras", "cameras.csv", "--water", "5", "--max-angle", "80"]
     whole = pipeline_of(tmp_path, "cloud.las", "out.las", *good)
     assert pipeline_of(tmp_path, "cloud.las", *good, "--stage") == whole["pipeline"][1]
     assert run_pcfix("pipeline", "cloud.las", *good, folder=tmp_path).returncode == 2

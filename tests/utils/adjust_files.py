@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import laspy
@@ -55,8 +55,9 @@ def write_block(folder: Path, points: int = 1600, **settings: object) -> Files:
     } | settings  # fmt: skip
     scene, others = parted(simulate_tie_points(points, **given), TIES)
     made = unaware(scene)
-    write_colmap(folder / "model", made.cameras, made.ties, crs=EPSG)
-    write_colmap(folder / "bare", made.cameras, crs=EPSG)
+    cameras = replace(made.cameras, crs=EPSG)
+    write_colmap(folder / "model", cameras, made.ties)
+    write_colmap(folder / "bare", cameras)
     write_las(folder / "cloud.las", apparent_cloud(made, others))
     positions = scene.cameras.gnss
     write_gnss(folder / "gnss.csv", scene.cameras.labels, positions.xyz, positions.sigma_m)

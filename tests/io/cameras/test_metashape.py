@@ -267,7 +267,6 @@ def test_new_calibration(tmp_path):
         *(100.0, 60.0, 40.0, 33.0, 16.0, 0.5, 0.25),
         radial=(0.1, 0.2, 0.3, 0.4),
         tangential=(0.01, 0.02, 0.03, 0.04),
-        pixel_size_mm=0.005,
         sensor="S0",
     )
     # the manual's formula, written out again

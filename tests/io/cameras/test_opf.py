@@ -107,7 +107,6 @@ def test_tracks_fall_where_the_images_saw_them(make, kind):
     assert len(misses) == 59
     assert misses.max() < FLOAT32_PX
     assert cameras.labels == ("a b.jpg", "b.jpg")
-    assert cameras.lenses[0].pixel_size_mm == pytest.approx(2.4e-3)
     assert cameras.source == "OPF PIX4Dmatic 1.6"
 
 
