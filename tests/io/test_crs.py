@@ -17,7 +17,7 @@ from pcfix.io.crs import (
     transformation,
 )
 from tests.utils.codes import refused
-from tests.utils.pose_files.block import geocentric
+from tests.utils.geodesy import geocentric
 
 pytestmark = pytest.mark.quick_but("test_unknown")
 

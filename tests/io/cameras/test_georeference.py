@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from pcfix.errors import InputError
 from pcfix.io.cameras.georeference import adjusted_minus_gnss, georeference
 from pcfix.model import Cameras, GnssPositions
+from tests.utils import geodesy
 from tests.utils.codes import refused
+from tests.utils.geodesy import axes_at as east_north_up
 from tests.utils.nightly import mostly_nightly
-from tests.utils.pose_files import block
-from tests.utils.pose_files.block import axes_at as east_north_up
 from tests.utils.reprojection import bring_to
 
 pytestmark = pytest.mark.quick_but(
@@ -43,7 +43,7 @@ def cameras(centres, crs, rotations=None, **more):
 
 
 def geocentric(lon, lat, h, f=1 / 298.257222101):
-    return block.geocentric(lon, lat, h, 6378137.0, f)
+    return geodesy.geocentric(lon, lat, h, 6378137.0, f)
 
 
 def image_px(rotation, centre, points):
