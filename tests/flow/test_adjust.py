@@ -18,8 +18,6 @@ from tests.utils.adjust_files import IMAGE_PX, write_block
 from tests.utils.codes import refused, warned
 from tests.utils.program import run_pcfix
 
-FOCAL_PX = 3648.0
-
 pytestmark = pytest.mark.filterwarnings("default::pcfix.errors.PcfixWarning")
 
 
@@ -281,27 +279,3 @@ def test_output_folder(files, tmp_path):
         with refused(code, path=wrong):
             adjust(files, out=wrong, overwrite=True, **quick)
     assert (other / "mine.txt").read_text() == "keep"
-
-
-def test_gnss_crs(files):
-    """Longitude and latitude of the same places give the same adjustment."""
-    from pyproj import Transformer
-
-    positions = files.scene.cameras.gnss
-    way = Transformer.from_crs(32633, 4326, always_xy=True)
-    x, y = way.transform(*positions.xyz.T[:2])
-    rows = [
-        f"{label},{lon:.12f},{lat:.12f},{z:.6f},0.03,0.03,0.03"
-        for label, lon, lat, z in zip(
-            files.scene.cameras.labels, x, y, positions.xyz[:, 2], strict=True
-        )
-    ]
-    path = files.folder / "degrees.csv"
-    path.write_text("\n".join(["image,longitude,latitude,height,sx,sy,sz", *rows]) + "\n")
-    fast = {"lens": files.folder / "lens.csv", "outliers": False}
-    one = adjust(files, **fast)
-    two = adjust(files, gnss="degrees.csv", gnss_crs="EPSG:4326", **fast)
-    known = np.isfinite(two.gnss_residual_m)
-    assert known[:, :2].all()
-    # m: the table of metres has four digits
-    np.testing.assert_allclose(two.cameras.centres[:, :2], one.cameras.centres[:, :2], atol=0.01)

@@ -218,15 +218,3 @@ def test_list_of_all_visible_cameras(tmp_path, plain):
     assert same(found, plain[0])
     assert summary.views["by_row"] == len(xyz)
     assert summary.views["share_seen"] == 1.0
-
-
-@rendered
-def test_views_of_a_real_cloud(tmp_path):
-    offset = [float(word) for word in (RENDERED / "offset.txt").read_text().splitlines()[1].split()]
-    with pytest.warns(pcfix.PcfixWarning, match="83,334 points"):
-        summary = pcfix.correct_file(
-        RENDERED / "cloud.las", tmp_path / "c.las", cameras=RENDERED / "colmap", **SNELL,
-        cameras_offset=tuple(offset), views=RENDERED / "dense.vis",
-    )  # fmt: skip
-    assert summary.corrected == summary.submerged
-    assert summary.rays / summary.corrected == pytest.approx(5.5, abs=0.1)  # of the list's README

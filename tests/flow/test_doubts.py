@@ -209,19 +209,6 @@ def test_depth_ratio():
     assert depth_ratio(done, ties) > CORRECTED_RATIO + 0.1
 
 
-def test_minimal(tmp_path):
-    scene = scene_of()
-    path = as_file(tmp_path / "cloud.las", scene.apparent_xyz, 0)
-    given = {"cameras": scene.cameras, "water": scene.water, "method": "snell", "max_angle": None}
-    made, out = {}, {}
-    for dimensions in ("all", "minimal"):
-        target = tmp_path / f"{dimensions}.las"
-        made[dimensions] = pcfix.correct_file(path, target, dimensions=dimensions, **given).made
-        out[dimensions] = laspy.read(target).xyz
-    assert made["all"]["patches"] > 0 and made["minimal"] is None
-    np.testing.assert_array_equal(out["all"], out["minimal"])
-
-
 @pytest.mark.filterwarnings("ignore::pcfix.PcfixWarning")
 def test_list_of_half(tmp_path):
     scene = scene_of(points=6000)

@@ -211,19 +211,6 @@ def test_file(files):
     assert since.uncertainty["poses_m"] == pytest.approx(told.uncertainty["poses_m"], rel=0.01)
 
 
-def test_pdal_stage(files):
-    from tests.pdal_stage.test_arrays import arrays_of, metadata_of, run
-
-    write_members(files[1].parent, members_of(pcfix.read_cameras(files[1]), 0.1))
-    _, las = corrected(files)
-    before = laspy.read(files[0])
-    outs, _ = run(
-        "correct", arrays_of(before), metadata_of(before.header), cameras=str(files[1]),
-        water=WATER_M, method="snell", max_angle="none", sigma_level=0.0,
-    )  # fmt: skip
-    np.testing.assert_array_equal(outs["SigmaZ"], np.array(las.SigmaZ).astype(np.float32))
-
-
 def test_other_ensemble(files):
     _, bare = corrected(files)
     cameras = pcfix.read_cameras(files[1])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import re
@@ -215,16 +214,6 @@ def test_order_not_claimed(tmp_path):
     assert said.endswith("IHO S-44 order 1a/1b")  # the bed is off by nearly half of the level
     assert said in text
     assert formal not in text and "Exclusive Order" not in text
-
-
-@pytest.mark.skipif(importlib.util.find_spec("py4dgeo") is None, reason="needs the extra m3c2")
-def test_m3c2(copied):
-    done = run(copied, *WORDS, "--m3c2", "--overwrite")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "M3C2 distance, corrected" in (copied / "out" / "report.html").read_text()
-    m3c2 = json.loads((copied / "out" / "compare" / "compare.json").read_text())["m3c2"]
-    assert abs(m3c2["after"]["statistics"]["mean_m"]) < 0.05  # noise of 4 cm; 1.3 m before
-    assert m3c2["before"]["statistics"]["mean_m"] > 1.0
 
 
 def test_done_before(copied):
@@ -453,23 +442,6 @@ def test_check_points(tmp_path):
     assert not (tmp_path / "out" / "compare" / "dod.tif").exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "code"),
-    [
-        (["--water", "-40"], None),
-        (["--reference", "none.laz"], None),
-        (["--cameras", "none.csv"], None),
-        (["--resolution", "0"], "option.range"),
-        (["--index", "2"], "option.range"),
-    ],
-)
-def test_mistakes(tmp_path, words, code):
-    done = run(tmp_path, *WORDS, *words)
-    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
-    assert code in (None, done.code)
-    assert not (tmp_path / "out" / "corrected.laz").exists()
-
-
 def test_refused(tmp_path):
     done = run(tmp_path, *WORDS[:-2], "--m3c2")
     assert (done.code, done.error.values["needs"]) == ("option.needs", "reference")
@@ -481,11 +453,6 @@ def test_refused(tmp_path):
         (tmp_path / "run.json").write_text(text)
         assert run(tmp_path, "new", "--config", "run.json").code == "run.record"
     assert not (tmp_path / "new").exists()
-
-
-@pytest.mark.parametrize("words", [[], ["a.laz", "out"], ["--config", "run.json"]])
-def test_usage(tmp_path, words):
-    assert run(tmp_path, *words).returncode == 2
 
 
 @pytest.mark.usefixtures("undrawn")

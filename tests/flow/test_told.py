@@ -17,9 +17,8 @@ from pcfix.model import Cameras, Lens, Outcome
 from tests.utils.crops import middle_of
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
-from tests.utils.shared import ROOT, needs
+from tests.utils.shared import needs
 
-SCENE = ROOT / "samples" / "scene"
 BENT, bent = needs("rendered_c_free")
 OFFSET_M = (318700.0, 3851200.0, 0.0)
 LEVEL_M = 0.37

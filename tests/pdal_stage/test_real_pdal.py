@@ -258,8 +258,6 @@ def test_options_of_recipes(path: Path) -> None:
 
 # Clouds larger than memory
 
-RUN = "import runpy, sys; sys.argv.pop(0); runpy.run_path(sys.argv[0])"
-
 
 # Mistakes
 

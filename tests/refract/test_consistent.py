@@ -19,7 +19,6 @@ from tests.utils.batches import batch_of
 from tests.utils.codes import refused, warned
 from tests.utils.compiled import compiled
 from tests.utils.consistent_twin import (
-    found_by_full_triangulation,
     image_in,
     images_through_level,
     path_under,
@@ -199,32 +198,6 @@ def test_snell_is_biased(exact):
     )
     # half a pixel on the ground and more: the scenes test something
     assert np.abs(apparent + result.shift_m - truth).max() > 0.01
-
-
-def test_full_triangulation(exact):
-    # points moved from where a noise-free point can be: the residuals are some pixels
-    cameras, plane, truth, apparent, lists = exact
-    shifted = apparent + np.random.default_rng(2).normal(0, 0.03, apparent.shape)
-    result = run(shifted + UTM, moved(cameras, UTM), in_utm(plane), views_of(lists))
-    for i in range(0, 12, 4):
-        planes = [plane] * len(lists[i])
-        expected = found_by_full_triangulation(
-            shifted[i], cameras, lists[i], planes, N_WATER, truth[i]
-        )
-        # a triangulation by scipy is good to 1e-7 m, and the root is found through it
-        assert shifted[i] + result.shift_m[i] == pytest.approx(expected, abs=2 * MICROMETRE)
-
-
-def test_symmetrical_pair():
-    # all is in one plane: tan(r) = x / D, tan(i) = x / D', and sin(i) = n sin(r)
-    cameras = looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0, 15.0], [0.0, 180.0])
-    depth = 4.0
-    way = images_through_level(np.array([[0, 0, -depth]] * 2), cameras, np.array([0, 1]), 0.0, 1.34)
-    tangent = np.tan(np.radians(15.0) + np.arctan((way[0, 0] - PLAIN.principal_x) / PLAIN.focal))
-    apparent = np.array([[0.0, 0.0, 70.0 - 20.0 / tangent]])
-    result = run(apparent, cameras, WaterPlane(0.0), views_of([[0, 1]]))
-    assert (apparent + result.shift_m)[0] == pytest.approx([0, 0, -depth], abs=MICROMETRE)
-    assert result.ray_miss_m[0] == pytest.approx(0.0, abs=MICROMETRE)
 
 
 def test_level_per_camera():

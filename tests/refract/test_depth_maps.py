@@ -12,20 +12,11 @@ from pcfix.io.views import ViewMatch, read_views
 from pcfix.lens.frames import frames_of
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import FLAT_DEG, Batch, Chosen, Learned, Survey, images_of
-from pcfix.refract.depth_maps import (
-    BED,
-    BEST,
-    DEPTH,
-    Block,
-    best_pairs,
-    look,
-    room_of_tile,
-    start_tile,
-)
+from pcfix.refract.batch import Batch, Chosen, Learned, Survey, images_of
+from pcfix.refract.depth_maps import BED, DEPTH, Block, look, room_of_tile, start_tile
 from pcfix.refract.learning import learn_of_sample
 from pcfix.refract.matcher import Bed, Matcher, bed_of
-from pcfix.refract.methods import correct, with_rays
+from pcfix.refract.methods import correct
 from pcfix.refract.tiling import TILE
 from pcfix.running import threads
 from pcfix.water.surface import is_submerged, surface_above
@@ -76,33 +67,6 @@ def listed(lists, weights=None):
 
 
 # one depth
-
-
-def test_best_pairs():
-    rng = np.random.default_rng(1)
-    for count in (1, 2, 3, 5):
-        places, squares = rng.normal(0, 0.3, (count, 20)), rng.uniform(0, 1, (count, 20))
-        curvatures = rng.uniform(4, 40, (count, 20))
-        found = best_depths(places, squares, curvatures, 0.1)
-        for i, t in enumerate(found):
-            columns = zip(places[:, i], squares[:, i], curvatures[:, i], strict=True)
-            costs = [lambda t, p=p: float(p[1] + p[2] * (t - p[0]) ** 2) for p in columns]
-            # scipy knows the place of a least value to about the root of its precision
-            assert t == pytest.approx(
-                slow_depth(costs, 0.1) if count > 1 else places[0, i], abs=1e-6
-            )
-
-
-@numba.njit(error_model="numpy")
-def best_depths(places, squares, curvatures, tolerance):
-    """Return the depths of best agreement at places, of partners by row and points by column."""
-    tile = room_of_tile(1, len(places))
-    for p in range(len(places)):
-        for i in range(places.shape[1]):
-            tile.partners[p, i], tile.partners[p, TILE + i] = places[p, i], squares[p, i]
-            tile.partners[p, 2 * TILE + i] = curvatures[p, i]
-    best_pairs(tile.room, tile.partners, tile.pairs, places.shape[1], tolerance)
-    return tile.room[BEST * TILE : BEST * TILE + places.shape[1]].copy()
 
 
 @numba.njit(error_model="numpy")
@@ -314,15 +278,6 @@ def test_unknown_bed():
     assert (heights[:40] == -1.0).all() and np.isnan(heights[40:]).all()
 
 
-def test_no_bed():
-    xyz = np.array([[3.0, 4.0, -4.5]])
-    one = Learned(matcher=matcher(fused=FUSED))
-    far = one._replace(bed=Bed(np.zeros((1, 1)), 500.0, 500.0, 1.0))
-    assert np.array_equal(
-        run(xyz, WaterPlane(0.3), None, one).shift_m, run(xyz, WaterPlane(0.3), None, far).shift_m
-    )
-
-
 def test_any_chunk():
     """The result of a point does not depend on the others, nor on the number of threads."""
     scene = scene_of("nadir")
@@ -337,18 +292,6 @@ def test_any_chunk():
         with threads(3):
             some = correct(one.take(rows)).shift_m
         np.testing.assert_array_equal(some, correct(one).shift_m[rows])
-
-
-def test_seen_flat():
-    cameras = looking(
-        [[0, 0, 70], [10, 0, 70], [160, 0, 70], [165, 5, 70]], [0, 0, 50, 50], [0, 0, 180, 180]
-    )
-    xyz = np.array([[5.0, 0.0, -2.0], [80.0, 0.0, -2.0], [900.0, 0.0, -2.0]])
-    above = surface_above(WaterPlane(0.0), xyz)
-    settings = ScienceOptions(method="consistent", camera_set="all")
-    flat = with_rays(batch_of(xyz, above, WaterPlane(0.0), cameras, settings)).seen_flat()
-    assert flat.tolist() == [False, True, False]  # from above; at 48 degrees; not at all
-    assert FLAT_DEG < 48.0
 
 
 # a real cloud

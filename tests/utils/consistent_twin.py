@@ -45,16 +45,6 @@ def triangulated_straight(seen, cameras, mine, start):
     return start + found.x
 
 
-def found_by_full_triangulation(apparent, cameras, mine, planes, n, start):
-    """Return Q with F(Q) = P: every step triangulates anew, and scipy looks for the root."""
-
-    def miss(shift):
-        seen = seen_through_water(start + shift, cameras, mine, planes, n)
-        return triangulated_straight(seen, cameras, mine, apparent) - apparent
-
-    return start + root(miss, np.zeros(3), tol=1e-9).x
-
-
 def path_under(surface, point, centre, n, step=1e-5):
     """Return where light leaves the water under a smooth z = surface(x, y): Fermat by scipy."""
 
