@@ -1,20 +1,15 @@
 """The import rules: which room may import which, and who opens files."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
 from pcfix.kernels import KERNEL_SOURCES
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 HOUSE = Path(__file__).parents[1] / "pcfix"
 

@@ -1,7 +1,5 @@
 """The sentences that users read most often, word by word; other tests compare codes and values."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.test_bad_input import TABLES, correct

@@ -1,7 +1,5 @@
 """A block is put together from what there is, and nothing is mixed up on the way."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

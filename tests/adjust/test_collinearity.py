@@ -1,7 +1,5 @@
 """Analytic derivatives of one observation against central differences."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

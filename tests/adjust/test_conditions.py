@@ -1,7 +1,5 @@
 """Points that lie on the water or on planes, and planes that are parallel."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Adjustment by tie points: noise, outliers, datum, check points and lens parameters."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

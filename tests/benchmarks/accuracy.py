@@ -26,16 +26,15 @@ with them, with several seeds, as a block has few poses; measured is the RMS err
 the RMS of sigma.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -50,9 +49,6 @@ from pcfix.simulate.tracing import piercing_points_of_planes, project
 from pcfix.water.surface import surface_above
 from tests.utils.matchers import matched_scene
 from tests.utils.shared import needs
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 METHODS = ("butler", "murase", "shan", "snell", "consistent")
 CHECK_DEPTHS, CHECK_NOISE_M = 50, 0.03

@@ -6,8 +6,6 @@ The block is rendered_a of PCFIX_SHARED, its bed its truth; its texture is our o
 ground can be rendered with and without water.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 import warnings

@@ -1,10 +1,8 @@
 """Cleaning of files: nothing lost, the same result as with arrays, and restored corrections."""
 
-from __future__ import annotations
-
 import json
 import struct
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import laspy
 import numpy as np
@@ -28,9 +26,6 @@ from tests.utils.clouds import (
 )
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 MANY = {"deviations": 0.5, "fences": 0.2}
 """On a cloud of white noise, a third of the points."""

@@ -1,7 +1,5 @@
 """Neighbours against brute force over all pairs, and outliers against open3d."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -18,7 +18,6 @@ from pcfix.compare.statistics import own_of, statistics_of
 from pcfix.flow.compare import compare_clouds
 from pcfix.report.comparison import in_a_sentence
 from tests.utils.codes import refused
-from tests.utils.program import run_pcfix
 from tests.utils.shared import ROOT
 
 SCENE = ROOT / "samples" / "scene"
@@ -322,15 +321,6 @@ def test_output_files(tmp_path, corrected):
         compare_clouds(corrected, LIDAR, **options)
     compare_clouds(corrected, LIDAR, overwrite=True, **options)  # fewer sections
     assert [p.name for p in sorted(out.glob("section_*"))] == ["section_01.csv", "section_02.csv"]
-
-
-def test_command(tmp_path, corrected, sample):
-    words = [corrected, LIDAR, "--out-dir", tmp_path / "o", "--sections", "1"]
-    done = run_pcfix("compare", *words)
-    assert done.returncode == 0, done.stderr
-    assert f"{sample.vertical.after.statistics.mean_m:.3f}" in done.stdout
-    said = json.loads((tmp_path / "o" / "compare.json").read_text())
-    assert said["c2c"]["after"]["statistics"] == sample.as_dict()["c2c"]["after"]["statistics"]
 
 
 @pytest.mark.parametrize(

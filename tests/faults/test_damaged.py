@@ -1,7 +1,5 @@
 """Damaged clouds: one sentence each, no traceback, no end of the process, nothing left behind."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

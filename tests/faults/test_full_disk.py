@@ -1,7 +1,5 @@
 """A disk that is full at any stage of a command: nothing half-written, and one clear sentence."""
 
-from __future__ import annotations
-
 import gc
 import json
 import math

@@ -1,7 +1,5 @@
 """Whatever ends a command, no input is touched and nothing lies half-written under its name."""
 
-from __future__ import annotations
-
 import os
 import random
 import signal

@@ -1,7 +1,5 @@
 """Names and things that are no ordinary files: one sentence each, and nothing written over."""
 
-from __future__ import annotations
-
 import os
 import stat
 import tempfile

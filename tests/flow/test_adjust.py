@@ -1,7 +1,5 @@
 """A block that absorbed refraction, adjusted from files and through every door."""
 
-from __future__ import annotations
-
 import json
 
 import laspy

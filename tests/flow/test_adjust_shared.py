@@ -1,7 +1,5 @@
 """A rendered block that ordinary software bent, mended with tie points and without."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import laspy

@@ -1,7 +1,5 @@
 """Whatever the cloud, the cameras, the water and the options: what a correction may never do."""
 
-from __future__ import annotations
-
 import tempfile
 from dataclasses import replace
 from pathlib import Path

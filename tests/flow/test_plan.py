@@ -1,7 +1,5 @@
 """What a plan predicts is what the correction of such a block says, and what its errors are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """All steps in one call: what it leaves, and how it resumes."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -4,8 +4,6 @@ The block is traced by the simulator and adjusted without a word of the water, a
 does it; the cloud is where straight rays of these poses meet.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

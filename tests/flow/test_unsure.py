@@ -1,7 +1,5 @@
 """Points seen only by oblique images: found, withheld, restored."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from functools import cache
 

@@ -1,7 +1,5 @@
 """One reading of damaged files: a sentence, or a result that is fit for use, else a finding."""
 
-from __future__ import annotations
-
 import io
 import resource
 import signal

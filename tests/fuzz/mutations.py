@@ -1,7 +1,5 @@
 """Damage to the bytes of a file, each kind as it happens: to disks, in transfers, by hand."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Every reader of files that people give, and small files for it, which are damaged."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

@@ -1,7 +1,5 @@
 """Damaged files of every reader: one sentence each, or a result that is fit for use."""
 
-from __future__ import annotations
-
 import random
 import struct
 

@@ -1,7 +1,5 @@
 """Small clouds to grid."""
 
-from __future__ import annotations
-
 import laspy
 import numpy as np
 from pyproj import CRS

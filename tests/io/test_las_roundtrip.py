@@ -1,12 +1,11 @@
 """What goes in comes out: every bit of a LAS file that a correction has no business with."""
 
-from __future__ import annotations
-
 import re
 import struct
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import laspy
 import numpy as np
@@ -41,9 +40,6 @@ from tests.utils.clouds import (
     xyz_of,
 )
 from tests.utils.codes import refused
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 pytestmark = [BEYOND_FRAMES, DEEP]
 

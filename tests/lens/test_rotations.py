@@ -1,7 +1,5 @@
 """Rotations from angles are those of scipy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -18,8 +18,6 @@ the point on the vertical through the true point that lies 1/s as deep, with
     s = tan a / tan b = sqrt(n^2 + (n^2 - 1) tan^2 a),    tan a = R / (Z_o - Z / s).
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 from pathlib import Path

@@ -1,9 +1,8 @@
 """The stage and its recipes in a real PDAL: the program, and ``pdal.Pipeline`` in Python."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
@@ -17,9 +16,6 @@ from tests.utils.codes import warned
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
 from tests.utils.real_pdal import ROOT, needs_pdal, pdal, python
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 RECIPES = sorted((ROOT / "pipelines").glob("*.json"))
 SCENE = ROOT / "samples" / "scene"

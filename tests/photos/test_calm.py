@@ -1,7 +1,5 @@
 """Sequences through waves, against the same bed through calm water."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -48,23 +48,6 @@ def test_twin(plane):
     assert checked == 60
 
 
-def test_equation_11():
-    cameras = pcfix.Cameras(("a", "b"), np.array([[-30.0, 5, 80], [25.0, -10, 75]]))
-    point = np.array([3.0, -2.0, -4.0])
-    anchors, directions = [], []
-    for centre in cameras.centres:
-        down = (point - centre) / np.linalg.norm(point - centre)
-        anchors.append(centre - down * centre[2] / down[2])
-        incidence = math.acos(-down[2])
-        refraction = math.asin(math.sin(incidence) / 1.34)
-        plan = down[:2] / np.linalg.norm(down[:2])
-        directions.append(np.array([*(math.sin(refraction) * plan), -math.cos(refraction)]))
-    expected = stacked_intersection(anchors, directions)
-    result = pcfix.correct_points([point], cameras, 0.0)
-    assert result.xyz[0] == pytest.approx(expected, abs=NANOMETRE)
-    assert result.ray_count[0] == 2
-
-
 @given(
     x=st.floats(-40, 40),
     y=st.floats(-40, 40),

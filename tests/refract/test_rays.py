@@ -1,7 +1,5 @@
 """The derivatives of the light's direction, against differences of a bisection on Snell's law."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

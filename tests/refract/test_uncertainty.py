@@ -6,8 +6,6 @@ is added to the images, and straight rays are intersected there with the poses t
 None of it is shared with the correction.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

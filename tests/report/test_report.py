@@ -1,7 +1,5 @@
 """The page of a run: self-contained, with the right values, and a script that works."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

@@ -1,7 +1,5 @@
 """Standard errors in the terms of IHO S-44."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, replace
 from functools import reduce

@@ -1,24 +1,16 @@
 """A block that swallowed the water, as the files that its user has."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import laspy
 import numpy as np
 from pyproj import CRS
 
 from pcfix.io.cameras.colmap import write_colmap
-from tests.utils.tie_points import simulate_tie_points
-from tests.utils.unaware_blocks import apparent_cloud, parted, unaware
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcfix.model import FloatArray
-    from tests.utils.tie_points import TieScene
-    from tests.utils.unaware_blocks import Unaware
+from pcfix.model import FloatArray
+from tests.utils.tie_points import TieScene, simulate_tie_points
+from tests.utils.unaware_blocks import Unaware, apparent_cloud, parted, unaware
 
 EPSG = "EPSG:32633"
 IMAGE_PX = 0.3

@@ -6,7 +6,7 @@ Light is traced by `pcfix.simulate.tracing`, which shares nothing with the adjus
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,17 +16,21 @@ from pcfix.adjust.problem import prepare, solved_cameras
 from pcfix.adjust.solve import solve
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.lens.imaging import unproject
-from pcfix.model import Cameras, GnssPositions, Lens, TiePoints, Views
+from pcfix.model import (
+    BoolArray,
+    Cameras,
+    FloatArray,
+    GnssPositions,
+    Lens,
+    TiePoints,
+    Views,
+    WaterPlane,
+)
 from pcfix.simulate.scene import ORIGIN_M
 from pcfix.simulate.tracing import triangulate
 from tests.utils.adjust_files import EPSG, write_gnss, write_las
 from tests.utils.bed_rays import piercing_points
 from tests.utils.unaware_blocks import similarity
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcfix.model import BoolArray, FloatArray, WaterPlane
 
 GNSS_M, NOISE_PX = 0.025, 0.5
 HEIGHT_M, DEPTH_M = 75.0, 6.0

@@ -1,10 +1,9 @@
 """Clouds that use all that LAS allows, and a reader of LAS files that knows only the standard."""
 
-from __future__ import annotations
-
 import struct
 from datetime import date
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 from uuid import UUID
 
 import laspy
@@ -13,9 +12,6 @@ from laspy.vlrs.vlrlist import VLRList
 from pyproj import CRS
 
 from pcfix import Cameras, Lens
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 WATER_M = 12.40005
 """No coordinate of `random_cloud` lies on it."""

@@ -1,7 +1,5 @@
 """Axes and places about the earth, written out."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,18 +1,14 @@
 """OPF, by its published specification: a project, its parts, and tracks in a glTF model."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 from uuid import NAMESPACE_URL, uuid5
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcfix.model import Cameras
+from pcfix.model import Cameras
 
 FIRST_ID, SENSOR_ID = 18_000_000_000_000_000_000, 7  # ids are unsigned numbers of 64 bits
 FLOAT, UNSIGNED = 5126, 5125
