@@ -14,12 +14,10 @@ from laspy.vlrs.vlrlist import VLRList
 
 import pcfix
 from pcfix import PcfixError
-from pcfix.errors import GeometryError
 from pcfix.flow.plausibility import CloudSample
 from pcfix.io.las.columns import COLUMNS, UNSURE, UPGRADE
 from tests.utils.beyond_frames import BEYOND_FRAMES, DEEP
 from tests.utils.clouds import (
-    CAMERA_HEIGHT_M,
     EAST_M,
     NORTH_M,
     SIDE_M,
@@ -449,14 +447,6 @@ class TestUncorrectedPoints:
         assert summary.corrected == summary.submerged - stuck.sum()
 
 
-def test_parallel_rays(tmp_path: Path) -> None:
-    source = write_cloud(tmp_path / "cloud.las", 3)
-    one = block().centres[4]
-    with pytest.raises(GeometryError):
-        round_trip(source, cameras=Cameras(("a", "b"), np.array([one, one])))
-    assert [path.name for path in tmp_path.iterdir()] == ["cloud.las"]
-
-
 @pytest.mark.parametrize("number", [2, 7])
 @pytest.mark.parametrize(
     ("dimensions", "names"), [("minimal", ["ShiftZ", "RayCount"]), ("none", [])]
@@ -492,30 +482,6 @@ def test_large_shifts(tmp_path: Path) -> None:
     assert moved.min() < np.iinfo(np.int16).min
     np.testing.assert_array_equal(added(trip.before, trip.after)["ShiftZ"], moved)
     assert trip.back.read_bytes() == trip.source.read_bytes()
-
-
-EARLIER = {
-    "narrow": {"ShiftX": "i2", "ShiftY": "i2", "ShiftZ": "i2", "WaterDepth": "u2"},
-    "wide": {"RayMiss": "u4", "SigmaZ": "u4"},
-}
-
-
-@pytest.mark.parametrize("kind", EARLIER)
-def test_types_of_earlier_versions(tmp_path: Path, kind: str) -> None:
-    trip = round_trip(write_cloud(tmp_path / "cloud.las", 6))
-    las = laspy.read(trip.output)
-    for name, dtype in EARLIER[kind].items():
-        dimension, values = las.point_format.dimension_by_name(name), las.points.array[name].copy()
-        las.remove_extra_dim(name)
-        las.add_extra_dim(laspy.ExtraBytesParams(
-            name, dtype, dimension.description, dimension.offsets, dimension.scales,
-        ))  # fmt: skip
-        las.points.array[name] = values
-        assert (las.points.array[name] == values).all()
-    las.write(tmp_path / "earlier.las")
-    pcfix.restore_file(tmp_path / "earlier.las", tmp_path / "again.las")
-    back = laspy.read(tmp_path / "again.las")
-    assert back.points.array.tobytes() == laspy.read(trip.source).points.array.tobytes()
 
 
 EDGE = {
@@ -589,18 +555,6 @@ def test_any_chunk_size(
     pieces = round_trip(again)
     assert pieces.output.read_bytes() == expected[0]
     assert pieces.back.read_bytes() == expected[1]
-
-
-def test_incidence_below_a_pair(tmp_path: Path) -> None:
-    """The largest angle in air is that of the line from the farther camera."""
-    source = write_cloud(tmp_path / "cloud.las", 0)
-    trip = round_trip(source)
-    wet = submerged(trip.before)
-    away = block().centres - xyz_of(trip.before)[wet][:, None]
-    assert (away[..., 2] > CAMERA_HEIGHT_M).all()
-    angle = np.degrees(np.arctan2(np.hypot(away[..., 0], away[..., 1]), away[..., 2])).max(axis=1)
-    found = added(trip.before, trip.after)["Incidence"][wet] * 0.1
-    np.testing.assert_allclose(found, angle, atol=0.051)  # half a step of 0.1 degrees
 
 
 def test_documented_dimensions() -> None:

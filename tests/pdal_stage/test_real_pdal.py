@@ -292,21 +292,6 @@ def mistaken_job(folder: Path, options: dict[str, Any]) -> list[Any]:
 
 
 @needs_pdal
-@pytest.mark.parametrize("options", mostly_nightly(MISTAKES, MISTAKES[1], MISTAKES[3]), ids=str)
-def test_mistakes(tmp_path: Path, options: dict[str, Any]) -> None:
-    """The program prints one sentence and writes nothing; a process stays usable."""
-    job = mistaken_job(tmp_path, options)
-    done = run_pipeline("program", job, tmp_path)
-    assert done.returncode != 0
-    (line,) = (line for line in done.stderr.splitlines() if line.startswith("pcfix: "))
-    assert done.stderr.count(line.removeprefix("pcfix: ")) == 1
-    assert not (tmp_path / "out.las").exists()
-    done = python(SURVIVE, "job.json", WATER_M, folder=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert line.removeprefix("pcfix: ") in done.stdout
-
-
-@needs_pdal
 def test_fault_of_pcfix(tmp_path: Path) -> None:
     (tmp_path / "job.json").write_text(json.dumps(mistaken_job(tmp_path, {})))
     breaking = (
