@@ -154,21 +154,6 @@ def test_restore_after_cleaning(tmp_path: Path, uncorrected: str) -> None:
     assert (tmp_path / "c.las").read_bytes() == (tmp_path / "a.las").read_bytes()
 
 
-def test_weak_intersections(tmp_path: Path) -> None:
-    write_cloud(tmp_path / "in.las", 7)
-    pcfix.correct_file(tmp_path / "in.las", tmp_path / "a.las", cameras=block(), water=WATER_M)
-    las = laspy.read(tmp_path / "a.las")
-    limit = float(np.median(las.Incidence[las.RayCount > 0]))
-    result = clean_file(
-        tmp_path / "a.las", tmp_path / "b.las", deviations=None, below=None, floating=None,
-        max_incidence=limit, max_ray_miss=9.0,
-    )  # fmt: skip
-    aside = _before(read_raw(tmp_path / "a.las"))
-    weak = (las.RayCount > 0) & (np.array(las.Incidence) > limit) & ~aside
-    assert result.reasons["incidence"] == weak.sum() > 50
-    assert result.submerged == 0
-
-
 def test_command(tmp_path: Path) -> None:
     s = spoilt_scene(20_000, 100)
     source = _plain(tmp_path / "in.laz", s.xyz)

@@ -26,7 +26,6 @@ from pcfix.io.rasters import values_at
 from pcfix.report.summary import Summary
 from pcfix.report.text import tvu_sentence
 from tests.utils.program import run_pcfix
-from tests.utils.rasters import HAS_STATISTICS
 from tests.utils.tiles import finished as finished_in
 from tests.utils.tiles import records, write
 
@@ -96,19 +95,6 @@ def test_dod(finished):
     # float32 heights of about 10 m are stored to 1e-6 m
     np.testing.assert_allclose(found[both], expected[both], atol=2e-6)
     assert abs(np.median(found.compressed())) < 0.02  # a bed gridded at 2 m, noise of 4 cm
-
-
-def test_rasters(finished):
-    units = {"surface": "height", "bed": "height", "depth": "depth", "uncertainty": "uncertainty"}
-    for name, what in units.items():
-        with rasterio.open(finished[0] / f"{name}.tif") as raster:
-            assert (raster.count, raster.nodata, raster.units) == (1, -9999.0, ("metre",))
-            assert raster.descriptions == (what,)
-            assert raster.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
-            assert ("STATISTICS_MEAN" in raster.tags(1)) is HAS_STATISTICS
-            assert raster.crs.to_epsg() == 32633, "no vertical datum was stated"
-    with rasterio.open(finished[0] / "surface_counts.tif") as counts:
-        assert counts.descriptions == ("count", "spread")
 
 
 def test_depth_and_bed(finished):
@@ -451,21 +437,3 @@ def test_refused(tmp_path):
         (tmp_path / "run.json").write_text(text)
         assert run(tmp_path, "new", "--config", "run.json").code == "run.record"
     assert not (tmp_path / "new").exists()
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_shoreline(tmp_path):
-    pytest.importorskip("pyogrio")
-    words = [*WORDS[:6], "--method", "snell", "--max-angle", "none", "--shoreline"]
-    words += ["out/shore.gpkg"]
-    done = run(tmp_path, *words)
-    assert (done.returncode, done.stderr) == (0, "")
-    written = (tmp_path / "out" / "shore.gpkg").stat().st_mtime_ns
-    again = run(tmp_path, *words)
-    assert again.stdout.count("done before") == len(again.stdout.splitlines())
-    assert (tmp_path / "out" / "shore.gpkg").stat().st_mtime_ns == written
-    (tmp_path / "mine.gpkg").write_bytes(b"work")
-    words[1], words[-1] = "other", "mine.gpkg"
-    done = run(tmp_path, *words)
-    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
-    assert (tmp_path / "mine.gpkg").read_bytes() == b"work"

@@ -89,43 +89,6 @@ def test_stage_and_command(tmp_path: Path, number: int, door: str) -> None:
     assert_same(tmp_path / "cli.las", tmp_path / "stage.las")
 
 
-CALLS = (
-    {"uncorrected": "drop", "max_angle": 20.0},
-    {"uncorrected": "keep", "max_cameras": 3, "index": 1.333},
-    {"dimensions": "minimal", "jobs": 1},
-    {"dimensions": "none"},
-)
-
-
-@needs_pdal
-@pytest.mark.parametrize(
-    "more",
-    mostly_nightly(CALLS, CALLS[0], CALLS[1]),
-    ids=lambda more: " ".join(map(str, more.values())),
-)
-def test_pipeline_of_a_call(tmp_path: Path, more: dict[str, Any]) -> None:
-    write_cloud(tmp_path / "cloud.las", 7, plain=True)
-    cameras_csv(tmp_path / "cameras.csv", block())
-    words = [
-        word for name, value in more.items() for word in ("--" + name.replace("_", "-"), value)
-    ]
-    words += ["--cameras", "cameras.csv", "--water", WATER_M]
-    done = run_pipeline(
-        "program", pipeline_of(tmp_path, "cloud.las", "stage.las", *words), tmp_path
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    pcfix.correct_file(
-        tmp_path / "cloud.las", tmp_path / "cli.las",
-        cameras=tmp_path / "cameras.csv", water=WATER_M, **more,
-    )  # fmt: skip
-    cli, stage = laspy.read(tmp_path / "cli.las"), laspy.read(tmp_path / "stage.las")
-    for name in [*"XYZ", "classification", "withheld"]:
-        np.testing.assert_array_equal(np.array(stage[name]), np.array(cli[name]), name)
-    assert list(stage.point_format.extra_dimension_names) == list(
-        cli.point_format.extra_dimension_names
-    )
-
-
 @needs_pdal
 @pytest.mark.parametrize("door", mostly_nightly(["program", "python"], "python"))
 def test_water_of_a_dimension(tmp_path: Path, door: str) -> None:
@@ -256,9 +219,6 @@ def test_options_of_recipes(path: Path) -> None:
 
 
 # Mistakes
-
-
-MISTAKES = ({"watre": 1}, {"index": 1.6}, {"cameras": "none.csv"}, {"water": "dim:w_surf"})
 
 
 SURVIVE = """

@@ -8,7 +8,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pcfix.errors import SettingError
-from pcfix.lens.imaging import coefficients, image_and_gradients
 from pcfix.model import Cameras, Lens, Outcome, Views, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.intersect import check_consistent, consistent, intersect
@@ -17,7 +16,6 @@ from pcfix.simulate.tracing import triangulate
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
 from tests.utils.codes import refused, warned
-from tests.utils.compiled import compiled
 from tests.utils.consistent_twin import (
     image_in,
     images_through_level,
@@ -28,9 +26,6 @@ from tests.utils.consistent_twin import (
 )
 from tests.utils.depth_map_twin import looking
 from tests.utils.nightly import mostly_nightly
-from tests.utils.twins import image_slowly
-
-image_and_gradients = compiled(image_and_gradients)
 
 UTM = np.array([512_345.0, 4_987_654.0, 0.0])
 MICROMETRE, NANOMETRE = 1e-6, 1e-9
@@ -365,46 +360,3 @@ def test_no_orientation():
     bare = replace(cameras, lenses=None, rotations=None)
     with refused("cameras.no_orientation", SettingError, missing=["angles", "lenses"]):
         run(np.array([[0.0, 0, -3]]), bare, WaterPlane(0.0), views_of([[0, 1]]))
-
-
-# derivatives of lenses
-
-BROWN = {
-    "radial": (-0.05, 0.02),
-    "tangential": (1e-3, -6e-4, 0.1),
-    "b1": 2.0,
-    "b2": -1.0,
-    "b3": 0.5,
-}
-LENSES = {
-    "perspective": PLAIN,
-    "brown": replace(PLAIN, **BROWN, denominator=(0.01,), thin_prism=(1e-3, 0.0, -1e-3, 2e-4)),
-    "inverse": replace(PLAIN, **BROWN, inverse=True),
-    "off centre": replace(PLAIN, **BROWN, distortion_centre=(0.01, -0.02)),
-    "in turn": replace(PLAIN, projection="equidistant", **BROWN, in_turn=True),
-    "equidistant": replace(PLAIN, projection="equidistant"),
-    "equisolid": replace(PLAIN, projection="equisolid", **BROWN),
-    "polynomial": replace(PLAIN, projection="polynomial", shape=(0.0, 1.5, 0.1, -0.05)),
-    "fov": replace(PLAIN, projection="fov", shape=(0.9,)),
-    "dual": replace(PLAIN, projection="dual", shape=(0.6,)),
-    "division": replace(PLAIN, projection="division", shape=(-0.2,)),
-    "division, beyond": replace(PLAIN, projection="division", shape=(0.1,)),
-    "eucm": replace(PLAIN, projection="eucm", shape=(0.55, 1.1)),
-}
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_image_gradients(name):
-    lens, step = LENSES[name], 1e-5
-    ahead = np.array([0.0, 0.0, 1.0])
-    for direction in ahead + np.random.default_rng(4).uniform(-0.4, 0.4, (6, 3)):
-        u, v, gradients = image_and_gradients(coefficients(lens), *direction)
-        # the formulas are in pixels of thousands
-        assert (u, v) == pytest.approx(image_slowly(lens, direction), abs=1e-6)
-        for axis in range(3):
-            aside = np.zeros(3)
-            aside[axis] = step
-            ends = [image_slowly(lens, direction + way * aside) for way in (1, -1)]
-            slope = np.subtract(*ends) / (2 * step)
-            # differences of 1e-5: 1e-10 by curvature, 1e-11 / 1e-5 by rounding, of thousands
-            assert [gradients[axis], gradients[3 + axis]] == pytest.approx(slope, abs=2e-4)

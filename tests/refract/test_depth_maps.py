@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import lru_cache
 
-import numba
 import numpy as np
 import pytest
 
@@ -12,16 +11,14 @@ from pcfix.io.views import ViewMatch, read_views
 from pcfix.lens.frames import frames_of
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import Batch, Chosen, Learned, Survey, images_of
-from pcfix.refract.depth_maps import BED, DEPTH, Block, look, room_of_tile, start_tile
+from pcfix.refract.batch import Batch, Learned, Survey
 from pcfix.refract.learning import learn_of_sample
-from pcfix.refract.matcher import Bed, Matcher, bed_of
+from pcfix.refract.matcher import Matcher, bed_of
 from pcfix.refract.methods import correct
-from pcfix.refract.tiling import TILE
 from pcfix.running import threads
 from pcfix.water.surface import is_submerged, surface_above
 from tests.utils.batches import batch_of
-from tests.utils.depth_map_twin import LENS, costs_of, fused_slowly, looking, on_bed, slow_depth
+from tests.utils.depth_map_twin import LENS, fused_slowly, looking
 from tests.utils.matchers import matched_scene
 from tests.utils.nightly import mostly_nightly
 from tests.utils.shared import needs
@@ -67,40 +64,6 @@ def listed(lists, weights=None):
 
 
 # one depth
-
-
-@numba.njit(error_model="numpy")
-def depth_of(block, c, bed):
-    """Return the depth of a bed, at a height over the one point of a block, in the map of c."""
-    tile = room_of_tile(1, block.matcher.matched.shape[1])
-    start_tile(tile, np.zeros(1, np.int64), np.zeros(0), block)
-    tile.room[BED * TILE] = bed
-    look(tile, np.full(1, c), np.ones((1, 1)), block)
-    return tile.looks[0, DEPTH * TILE]
-
-
-@pytest.mark.parametrize("c", [0, 2, 4, 5, 7])
-def test_depth_as_twin(c):
-    """The same costs, minimised by scipy; the light traced by other means."""
-    p, plane, bed = np.array([3.0, 4.0, -4.5]), (0.3, 0.004, -0.003), (-6.5, 0.0, 0.0)
-    offset = np.array([0.0, 0.05, -0.03, 0.02, 0.0, 0.04, 0.0, -0.05])
-    planes = [(plane[0] + up, *plane[1:]) for up in offset]
-    length = np.linalg.norm(p - CAMERAS.centres[c])
-    u = (p - CAMERAS.centres[c]) / length
-    q = on_bed(CAMERAS.centres[c], p, planes[c], bed, N_WATER)
-    partners = [j for j in MATCHED[c] if j >= 0]
-    costs = costs_of(p, u, q, CAMERAS, partners, planes, N_WATER, "angles")
-    height = plane[0] + plane[1] * p[0] + plane[2] * p[1]
-    nothing = np.zeros(0, np.int64)
-    points = Chosen(
-        p[None], p[None], np.array([height]), np.array([plane[1:]]), CAMERAS.centres, offset,
-        nothing, nothing, N_WATER,
-    )  # fmt: skip
-    block = Block(points, images_of(None, CAMERAS), matcher(), offset.mean())
-    # 0.3 to 1 m, in single precision; scipy's least values are flat within 1e-6 m
-    assert length * depth_of(block, c, q[2] - p[2]) == pytest.approx(
-        slow_depth(costs, TOLERANCE), abs=2e-5
-    )
 
 
 def test_depth_needs_partner():
@@ -262,20 +225,6 @@ def test_bed_of_groups():
     # heights are tried at every GSD, and cells fall by 1 cm
     close = np.abs(found.height_at(xyz[:, :2]) - bed) < 0.1
     assert close.mean() > 0.97
-
-
-def test_unknown_bed():
-    found = Bed(np.array([[1.0, np.nan], [3.0, 4.0]]), 10.0, 20.0, 2.0)
-    xy = np.array(
-        [[10.0, 20.0], [13.9, 20.1], [11, 23.9], [13, 22], [9.9, 21], [11, 24.1], [99, 0]]
-    )
-    assert found.height_at(xy).tolist()[:1] == [1.0]
-    assert found.height_at(xy)[2:4].tolist() == [3.0, 4.0]
-    assert np.isnan(found.height_at(xy)[[1, 4, 5, 6]]).all()
-    xyz = np.repeat([[0.0, 0, 0], [50, 0, 0]], 40, axis=0)
-    likely = np.repeat([[-1.0], [np.nan]], 40, axis=0).astype(np.float32)
-    heights = bed_of(xyz, likely, 0.05).height_at(xyz[:, :2])
-    assert (heights[:40] == -1.0).all() and np.isnan(heights[40:]).all()
 
 
 def test_any_chunk():

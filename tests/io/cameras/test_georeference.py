@@ -93,11 +93,6 @@ def test_tie_points_go_the_same_way_and_unknown_ones_stay_unknown():
 # ---- rotations ----
 
 
-def convergence_rad(lon, lat, meridian):
-    """Return the angle from true to grid north on a transverse Mercator map (sphere)."""
-    return np.arctan(np.tan(np.radians(lon - meridian)) * np.sin(np.radians(lat)))
-
-
 def frames_of_a_place(kind, lon, lat, h):
     """Return CRS, centre, axes (east, north, up, one a row) of a frame, and its way to a map."""
     f84 = 1 / 298.257223563
