@@ -47,6 +47,7 @@ from pcfix.model import Views, WaterPlane
 from pcfix.options.correct import BudgetOptions, ScienceOptions
 from pcfix.simulate.tracing import piercing_points_of_planes, project
 from pcfix.water.surface import surface_above
+from tests.utils.consistent_twin import least_squares_points
 from tests.utils.matchers import matched_scene
 from tests.utils.shared import needs
 
@@ -146,11 +147,10 @@ def measured_of(scene: Any) -> np.ndarray:
 def triangulated_again(scene: Any, rows: np.ndarray, rng: Any) -> np.ndarray:
     """Return the points whose images through the plane water are nearest to noisy ones, (m, 3).
 
-    Gauss-Newton for all points at once, from the truth. Nothing of `pcfix.refract` is used: light
-    takes Fermat's path (`pcfix.simulate.tracing`), and the derivatives are differences.
+    Nothing of `pcfix.refract` is used: light takes Fermat's path (`pcfix.simulate.tracing`).
     """
     truth, views, cameras = scene.true_xyz[rows], scene.views.take(rows), scene.true_cameras
-    owner, water, aside = np.repeat(np.arange(len(truth)), np.diff(views.start)), scene.water, 1e-4
+    owner, water = np.repeat(np.arange(len(truth)), np.diff(views.start)), scene.water
     x, y = truth[:, :2].mean(axis=0)
     # near the points, as digits are lost far away
     anchor = np.array([x, y, water.a + water.b * x + water.c * y])
@@ -165,18 +165,7 @@ def triangulated_again(scene: Any, rows: np.ndarray, rng: Any) -> np.ndarray:
 
     seen = images(truth)
     seen = seen + rng.normal(0.0, scene.settings["image_noise"], seen.shape)
-    points = truth.copy()
-    for _ in range(10):
-        steps = aside * np.eye(3)
-        slopes = [(images(points + d) - images(points - d)) / (2.0 * aside) for d in steps]
-        slope, residual = np.stack(slopes, axis=2), seen - images(points)
-        left = np.add.reduceat(np.einsum("rki,rkj->rij", slope, slope), views.start[:-1])
-        right = np.add.reduceat(np.einsum("rki,rk->ri", slope, residual), views.start[:-1])
-        step = np.linalg.solve(left, right[:, :, None])[:, :, 0]
-        points = points + step
-        if np.abs(step).max() < 1e-6:
-            return points
-    raise ArithmeticError("the triangulation through the water does not converge")
+    return least_squares_points(images, seen, views.start, truth)
 
 
 def rendered(name: str, points: int) -> Case | None:

@@ -31,7 +31,8 @@ from pathlib import Path
 import laspy
 import numpy as np
 
-SCENE = Path(__file__).parents[2] / "samples" / "scene"
+from tests.utils.shared import SCENE
+
 PYTHON, PCFIX = [sys.executable, "-c"], [sys.executable, "-m", "pcfix"]
 MAKE = """
 from pcfix.io.scenes import write_scene

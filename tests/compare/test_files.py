@@ -17,33 +17,15 @@ import pcfix
 from pcfix.compare.statistics import own_of, statistics_of
 from pcfix.flow.compare import compare_clouds
 from pcfix.report.comparison import in_a_sentence
+from tests.utils.clouds import write_las
 from tests.utils.codes import refused
-from tests.utils.shared import ROOT
+from tests.utils.shared import SCENE
 
-SCENE = ROOT / "samples" / "scene"
 LIDAR = SCENE / "lidar.laz"
 EAST_M, NORTH_M = 410_000.0, 4_650_000.0
 py4dgeo = pytest.mark.skipif(
     importlib.util.find_spec("py4dgeo") is None, reason="needs the extra m3c2"
 )
-
-
-def write_las(path, xyz, classes=0, crs=32633, withheld=0, **extra):
-    """Write a cloud of mm steps and return its path."""
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    header.scales, header.offsets = np.full(3, 0.001), np.floor(np.min(xyz, axis=0))
-    for name in extra:
-        header.add_extra_dim(laspy.ExtraBytesParams(name, "float64"))
-    if crs is not None:
-        header.add_crs(CRS.from_user_input(crs))
-    las = laspy.LasData(header)
-    las.xyz = np.asarray(xyz)
-    las.classification = np.broadcast_to(classes, len(xyz))
-    las.withheld = np.broadcast_to(withheld, len(xyz))
-    for name, values in extra.items():
-        las[name] = values
-    las.write(path)
-    return path
 
 
 def plane(count, seed, side_m=60.0, noise_m=0.01):

@@ -1,14 +1,13 @@
 """Damaged clouds: one sentence each, no traceback, no end of the process, nothing left behind."""
 
 import struct
-from pathlib import Path
 
 import laspy
 import pytest
 
 import pcfix
+from tests.utils.shared import SCENE
 
-SCENE = Path(__file__).parents[2] / "samples" / "scene"
 # Places in the header (LAS 1.4 R15, table 3).
 VERSION, POINTS_START, SCALE_X, OFFSET_X, EVLRS, COUNT = 24, 96, 131, 155, 235, 247
 

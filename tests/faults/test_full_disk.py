@@ -16,8 +16,8 @@ import rasterio
 
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
+from tests.utils.shared import SCENE
 
-SCENE = Path(__file__).parents[2] / "samples" / "scene"
 PAGE = 4096
 
 

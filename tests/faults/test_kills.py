@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import laspy
 import pytest
@@ -13,8 +12,8 @@ import pytest
 import pcfix
 from pcfix.io.atomic import temporary_output
 from tests.utils.codes import refused
+from tests.utils.shared import SCENE
 
-SCENE = Path(__file__).parents[2] / "samples" / "scene"
 LONGEST_S = 0.1
 """After its first file a command gets a signal at the latest; it has ended by then, or nearly."""
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import laspy
 import numpy as np
 import pytest
-from pyproj import CRS, Transformer
+from pyproj import Transformer
 
 import pcfix
 from pcfix.flow.cameras import cameras_text, check_cameras, sensors_of
@@ -15,10 +15,10 @@ from pcfix.flow.inputs import Inputs, both_models
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.lens.imaging import project
 from pcfix.model import Cameras, Lens
+from tests.utils.clouds import write_las
 from tests.utils.program import run_pcfix
-from tests.utils.shared import ROOT, needs
+from tests.utils.shared import SCENE, needs
 
-SCENE = ROOT / "samples" / "scene"
 CLOUD, CAMERAS, SENSOR = SCENE / "cloud.laz", SCENE / "cameras.csv", SCENE / "sensor.csv"
 RENDERED, rendered = needs("rendered_a")
 SOROLLA, sorolla = needs("cameras", "metashape", "uclm_sorolla")
@@ -105,13 +105,9 @@ def test_heights_off_by_the_geoid(tmp_path):
 
     The points are in the frames all the same, as cameras that are too high see more.
     """
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    header.scales, header.offsets = [0.001] * 3, [725_000.0, 4_369_000.0, 0.0]
-    header.add_crs(CRS("EPSG:25830+5782"))
-    cloud = laspy.LasData(header)
     x, y = (side.ravel() for side in np.mgrid[725_440:725_525:3, 4_369_105:4_369_170:3])
-    cloud.x, cloud.y, cloud.z = x, y, np.full(len(x), 84.0)
-    cloud.write(tmp_path / "cloud.las")
+    xyz = np.column_stack([x, y, np.full(len(x), 84.0)])
+    write_las(tmp_path / "cloud.las", xyz, crs="EPSG:25830+5782")
     with pytest.warns(pcfix.PcfixWarning, match="51.5 m above"):
         report = check_cameras(
             SOROLLA / "markers.xml", cloud=tmp_path / "cloud.las", cameras_crs="EPSG:25830"

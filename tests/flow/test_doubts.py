@@ -19,6 +19,7 @@ from pcfix.refract.patches import grid_m
 from pcfix.refract.reconstructions import IN_FRAME, hint_of
 from pcfix.water.surface import surface_above
 from tests.io.test_views import write_ply, write_vis
+from tests.utils.clouds import write_las
 from tests.utils.matchers import matched_scene
 from tests.utils.nightly import mostly_nightly
 
@@ -89,13 +90,10 @@ def test_unlisted_points():
     assert seen.any() and (found.outcome[seen] == Outcome.CORRECTED).all()
 
 
-def as_file(path, xyz, sources, gsd_m=0.001):
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    header.scales, header.offsets = np.full(3, gsd_m), np.floor(xyz.min(axis=0))
-    cloud = laspy.LasData(header)
-    cloud.xyz = xyz
-    cloud.point_source_id = np.broadcast_to(sources, len(xyz))
-    cloud.write(path)
+def as_file(path, xyz, sources):
+    las = laspy.read(write_las(path, xyz, crs=None))
+    las.point_source_id = np.broadcast_to(sources, len(xyz))
+    las.write(path)
     return path
 
 

@@ -18,6 +18,7 @@ from tests.utils.clouds import (
     fields,
     read_raw,
     write_cloud,
+    write_las,
 )
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
@@ -159,13 +160,10 @@ def test_corrects_what_is_labelled(path, tmp_path, mask, choices):
 
 
 def test_separate_pools(tmp_path):
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    header.scales, header.offsets = np.full(3, 0.001), np.array([EAST_M, NORTH_M, 0.0])
-    las = laspy.LasData(header)
     x, y = (grid.ravel() for grid in np.meshgrid(np.arange(0, 60, 0.5), np.arange(0, 40, 0.5)))
     pit = np.hypot(x - 50, y - 20) < 3
-    las.x, las.y, las.z = EAST_M + x, NORTH_M + y, np.where((x < 30) | pit, -1.0, 1.0)
-    las.write(tmp_path / "in.las")
+    z = np.where((x < 30) | pit, -1.0, 1.0)
+    write_las(tmp_path / "in.las", np.column_stack([EAST_M + x, NORTH_M + y, z]), crs=None)
     found = label_file(tmp_path / "in.las", tmp_path / "out.las", water=0, connected=True)
     separate = found.labelling["separate"]
     assert (separate["pools"], separate["points"]) == (1, pit.sum())

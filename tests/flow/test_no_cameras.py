@@ -1,7 +1,6 @@
 """Methods that need depths only work without cameras, from Python, command line and PDAL."""
 
 import json
-from pathlib import Path
 
 import laspy
 import numpy as np
@@ -16,8 +15,8 @@ from tests.pdal_stage.test_arrays import run as stage
 from tests.utils.clouds import WATER_M, block, cameras_csv, random_cloud, write_cloud
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
+from tests.utils.shared import SCENE
 
-SCENE = Path(__file__).parents[2] / "samples" / "scene"
 NONE = {"water": WATER_M}
 
 

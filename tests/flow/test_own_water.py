@@ -9,6 +9,7 @@ from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.correction import OWN_WATER
 from pcfix.io.water import write_water_raster
 from pcfix.model import Lens, WaterRaster
+from tests.utils.clouds import write_las
 from tests.utils.waves import Sea, bed_seen
 
 PLACE = np.array([512_000.0, 4_987_000.0, 0.0])
@@ -154,10 +155,7 @@ def test_standard_error(seen, tmp_path, method):
 
 
 def test_file(seen, waters, tmp_path):
-    las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
-    las.header.offsets, las.header.scales = PLACE, np.full(3, MILLIMETRE)
-    las.xyz = seen[1]
-    las.write(tmp_path / "cloud.las")
+    write_las(tmp_path / "cloud.las", seen[1], crs=None, offsets=PLACE)
     rows = [
         f"{label},{x},{y},{z},0,0,0"
         for label, (x, y, z) in zip(block().labels, block().centres, strict=True)

@@ -14,9 +14,8 @@ from pcfix.flow.plausibility import SAMPLE_POINTS, CloudSample, plausible
 from pcfix.flow.surfaces import view_of
 from pcfix.io.las.source import read_xyz
 from tests.utils.codes import refused, warned
-from tests.utils.shared import ROOT, needs
+from tests.utils.shared import SCENE, needs
 
-SCENE = ROOT / "samples" / "scene"
 RENDERED, rendered = needs("rendered_a")
 LEVEL_M = 0.37
 

@@ -8,7 +8,6 @@ import sqlite3
 import warnings
 from contextlib import closing, nullcontext
 from dataclasses import replace
-from pathlib import Path
 from xml.etree import ElementTree
 
 import laspy
@@ -26,10 +25,10 @@ from pcfix.io.rasters import values_at
 from pcfix.report.summary import Summary
 from pcfix.report.text import tvu_sentence
 from tests.utils.program import run_pcfix
+from tests.utils.shared import SCENE
 from tests.utils.tiles import finished as finished_in
 from tests.utils.tiles import records, write
 
-SCENE = Path(__file__).parents[2] / "samples" / "scene"
 WORDS = [
     str(SCENE / "cloud.laz"), "out", "--cameras", str(SCENE / "cameras.csv"), "--water", "0.37",
     "--reference", str(SCENE / "lidar.laz"),

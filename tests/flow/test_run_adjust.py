@@ -18,8 +18,8 @@ from pcfix.flow.inputs import Inputs
 from pcfix.flow.request import Request
 from pcfix.flow.run import adjust_first, run_all
 from pcfix.model import GnssPositions
-from tests.utils.adjust_files import write_las
 from tests.utils.block_kinds import GSD_M, write_kind
+from tests.utils.clouds import write_las
 from tests.utils.codes import refused, warned
 from tests.utils.program import run_pcfix
 

@@ -11,9 +11,8 @@ import pcfix
 from pcfix.flow.water import check_water
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
-from tests.utils.shared import ROOT
+from tests.utils.shared import SCENE
 
-SCENE = ROOT / "samples" / "scene"
 CLOUD, CAMERAS = SCENE / "cloud.laz", SCENE / "cameras.csv"
 LEVEL_M = 0.37
 CRS = "EPSG:32633"

@@ -17,9 +17,8 @@ from tests.grid.clouds import EAST, NORTH, awkward, scattered, write
 from tests.utils.codes import refused
 from tests.utils.nightly import mostly_nightly
 from tests.utils.rasters import HAS_STATISTICS, read_raster
-from tests.utils.shared import ROOT
+from tests.utils.shared import SCENE
 
-SCENE = ROOT / "samples" / "scene"
 METHODS = ("mean", "median", "min", "max", "idw", "tin")
 
 

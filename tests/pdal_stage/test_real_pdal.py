@@ -16,9 +16,9 @@ from tests.utils.codes import warned
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
 from tests.utils.real_pdal import ROOT, needs_pdal, pdal, python
+from tests.utils.shared import SCENE
 
 RECIPES = sorted((ROOT / "pipelines").glob("*.json"))
-SCENE = ROOT / "samples" / "scene"
 
 EXECUTE = """
 import json, sys, pdal

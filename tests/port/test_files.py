@@ -12,6 +12,7 @@ from pcfix.options.correct import ScienceOptions
 from pcfix.port.methods import correct_through_port
 from pcfix.port.shapes import FlatPort
 from pcfix.report.text import summary_text
+from tests.utils.clouds import write_las
 from tests.utils.port_scenes import simulate_port
 from tests.utils.program import run_pcfix
 
@@ -25,14 +26,9 @@ def scene():
 
 @pytest.fixture(scope="module")
 def cloud(scene, tmp_path_factory):
-    header = laspy.LasHeader(point_format=6, version="1.4")
-    header.scales, header.offsets = [0.0001] * 3, scene.apparent[0].round()
-    las = laspy.LasData(header)
-    las.xyz = scene.apparent
-    las.classification = np.where(np.arange(len(las)) % 10 == 0, 7, 2)
     path = tmp_path_factory.mktemp("port") / "cloud.las"
-    las.write(path)
-    return path
+    classes = np.where(np.arange(len(scene.apparent)) % 10 == 0, 7, 2)
+    return write_las(path, scene.apparent, classes, crs=None, scale=0.0001)
 
 
 def test_file(scene, cloud, tmp_path):

@@ -19,8 +19,8 @@ from tests.utils.codes import refused, warned
 from tests.utils.consistent_twin import (
     image_in,
     images_through_level,
+    least_squares_points,
     path_under,
-    refractive_least_squares,
     seen_through_water,
     triangulated_straight,
 )
@@ -268,8 +268,12 @@ def noisy(block):
     views, pixels = every_view(truth, cameras, 0.0, rng, 0.5)
     apparent = triangulate(pixels, cameras, views.camera, views.start, PLAIN, truth)
     start = views.start[: SAMPLE + 1]
-    sample = (pixels[: start[-1]], start, views.camera[: start[-1]])
-    floor = refractive_least_squares(*sample, cameras, 0.0, N_WATER, truth[:SAMPLE])
+    owner, camera = np.repeat(np.arange(SAMPLE), np.diff(start)), views.camera[: start[-1]]
+
+    def images(points):
+        return images_through_level(points[owner], cameras, camera, 0.0, N_WATER)
+
+    floor = least_squares_points(images, pixels[: start[-1]], start, truth[:SAMPLE])
     return cameras, truth, apparent, views, floor
 
 

@@ -6,7 +6,6 @@ import re
 import zlib
 from html.parser import HTMLParser
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,8 +17,7 @@ from pcfix.report.map_data import Layer
 from pcfix.report.page import Report, Table, Tile, render
 from pcfix.report.run import RunResults
 from tests.utils.browser import needs_browser, open_page
-
-SCENE = Path(__file__).parents[2] / "samples" / "scene"
+from tests.utils.shared import SCENE
 
 
 @pytest.fixture(scope="module")

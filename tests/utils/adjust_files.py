@@ -3,12 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import laspy
-import numpy as np
-from pyproj import CRS
-
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.model import FloatArray
+from tests.utils.clouds import write_las
 from tests.utils.tie_points import TieScene, simulate_tie_points
 from tests.utils.unaware_blocks import Unaware, apparent_cloud, parted, unaware
 
@@ -59,15 +56,6 @@ def write_block(folder: Path, points: int = 1600, **settings: object) -> Files:
         f"{lens.principal_x!r},{lens.principal_y!r}\n"
     )
     return Files(folder, made, others.truth)
-
-
-def write_las(path: Path, xyz: FloatArray) -> None:
-    header = laspy.LasHeader(point_format=3, version="1.4")
-    header.scales, header.offsets = np.full(3, 0.001), np.floor(xyz.min(axis=0))
-    header.add_crs(CRS(EPSG))
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = xyz.T
-    las.write(path)
 
 
 def write_gnss(path: Path, labels: tuple[str, ...], xyz: FloatArray, sigma: FloatArray) -> None:

@@ -28,8 +28,9 @@ from pcfix.model import (
 )
 from pcfix.simulate.scene import ORIGIN_M
 from pcfix.simulate.tracing import triangulate
-from tests.utils.adjust_files import EPSG, write_gnss, write_las
+from tests.utils.adjust_files import EPSG, write_gnss
 from tests.utils.bed_rays import piercing_points
+from tests.utils.clouds import write_las
 from tests.utils.unaware_blocks import similarity
 
 GNSS_M, NOISE_PX = 0.025, 0.5

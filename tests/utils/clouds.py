@@ -245,6 +245,35 @@ def write_cloud(path: Path, point_format: int, **choices: object) -> Path:
     return path
 
 
+def write_las(
+    path: Path,
+    xyz: np.ndarray,
+    classes: object = 0,
+    *,
+    crs: object = 32633,
+    withheld: object = 0,
+    scale: float = 0.001,
+    offsets: object = None,
+    **extra: np.ndarray,
+) -> Path:
+    """Write points, by default in steps of a millimetre, and return the path."""
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales = np.full(3, scale)
+    header.offsets = np.floor(np.min(xyz, axis=0)) if offsets is None else np.array(offsets)
+    for name in extra:
+        header.add_extra_dim(laspy.ExtraBytesParams(name, "float64"))
+    if crs is not None:
+        header.add_crs(CRS.from_user_input(crs))
+    las = laspy.LasData(header)
+    las.xyz = np.asarray(xyz)
+    las.classification = np.broadcast_to(classes, len(xyz))
+    las.withheld = np.broadcast_to(withheld, len(xyz))
+    for name, values in extra.items():
+        las[name] = values
+    las.write(path)
+    return path
+
+
 def block(side: int = 3) -> Cameras:
     """Return side x side projection centres over the cloud, without angles."""
     steps = np.linspace(0.1, 0.9, side) * SIDE_M
