@@ -9,7 +9,7 @@ from pcfix.compare.match import heights_at
 from pcfix.compare.sections import parse_line, section_along
 from pcfix.compare.statistics import binned, fit_line, statistics_of
 
-pytestmark = pytest.mark.quick_but("test_c2c")
+pytestmark = pytest.mark.quick
 
 EAST_M, NORTH_M = 456_000.0, 5_432_000.0
 

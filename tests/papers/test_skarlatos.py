@@ -15,11 +15,9 @@ from tests.papers.refraction_effect import (
     StereoPair,
     effect,
     shan_iterations,
-    true_points,
     write_all,
 )
 from tests.papers.test_equations import pierced, refracted
-from tests.utils.bed_rays import piercing_points
 
 PAIR = StereoPair(SWINGLETCAM, 100.0)
 PAIRS = [
@@ -101,27 +99,6 @@ def test_shan_of_the_correction():
     apparent = [[0.0, 0.0, -(15.0 + start.mean_m)]]
     corrected = pcfix.correct_points(apparent, cameras, 0.0, method="shan").xyz
     assert -corrected[0, 2] == pytest.approx(15.0 + end.mean_m, abs=1e-6)  # m; it stops at 1e-9
-
-
-def test_light_from_true_point():
-    """Fermat's path from the true point: where two rays meet, straight lines meet as well."""
-    apparent = np.array([[0.0, y, -15.0] for y in (0.0, 20.0, 60.0)])  # on the plane of symmetry
-    true = true_points(apparent, PAIR.centres, 1.34)
-    for centre in PAIR.centres:
-        surface = piercing_points(true, np.tile(centre, (3, 1)), 0.0, 1.34)
-        sight, straight = surface - centre, apparent - centre
-        lengths = np.linalg.norm(sight, axis=1) * np.linalg.norm(straight, axis=1)
-        sine = np.cross(sight, straight) / lengths[:, None]  # of two lines of about 120 m
-        assert np.abs(sine).max() < 1e-9
-
-
-def test_correction_agrees():
-    model = effect(PAIR, 15.0, nodes=9)
-    x, y = (side.ravel() for side in np.meshgrid(model.x_m, model.y_m))
-    apparent = np.column_stack([x, y, np.full(len(x), -15.0)])
-    cameras = pcfix.Cameras(("left", "right"), PAIR.centres)
-    corrected = pcfix.correct_points(apparent, cameras, 0.0, index=1.34).xyz
-    assert corrected[:, 2] == pytest.approx(model.error_m.ravel() - 15.0, abs=1e-8)  # m
 
 
 def test_files(tmp_path):
