@@ -117,18 +117,6 @@ def test_marks_are_no_outliers():
     assert worst.rms_px > 10.0
 
 
-@pytest.mark.parametrize(
-    ("gnss", "unknowns"),
-    [(0, FOCAL), (2, FOCAL), (0, replace(FOCAL, fixed_images=("IMG_0001.JPG",)))],
-)
-def test_no_datum(gnss, unknowns):
-    whole = block(scene())
-    few = whole.gnss_xyz.copy()
-    few[gnss:] = np.nan
-    with refused("adjust.no_datum", gnss=gnss, control=0):
-        check_datum(replace(whole, gnss_xyz=few), unknowns)
-
-
 def test_datum():
     made = scene()
     labels = made.cameras.labels

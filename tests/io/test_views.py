@@ -1,7 +1,6 @@
 """View lists: the cameras that contributed to each point."""
 
 import operator
-import shutil
 import struct
 from dataclasses import replace
 from functools import reduce
@@ -156,21 +155,6 @@ def test_real_vis_and_ply():
     assert codes(report) == ["views.unmatched"]
     with refused("views.other_images", path=RENDERED / "dense.ply", share=0.0):
         read_views(RENDERED / "dense.ply", cameras)
-
-
-@rendered
-def test_cameras_in_another_order(tmp_path):
-    file = pcfix.read_cameras(RENDERED / "cameras.csv")
-    order = np.roll(np.arange(len(file)), 1)
-    labels, lenses = (tuple(one[i] for i in order) for one in (file.labels, file.lenses))
-    cameras = Cameras(labels, file.centres[order], file.rotations[order], lenses)
-    xyz = cloud(RENDERED)
-    with refused("views.other_images") as caught:
-        match_of(RENDERED / "dense.vis", cameras, len(xyz)).views_of(xyz, 0)
-    assert 0.7 < caught.value.values["share"] < 0.8
-    write_model(tmp_path, list(enumerate(file.labels)))
-    match = match_of(shutil.copy(RENDERED / "dense.vis", tmp_path), cameras, len(xyz))
-    assert given(match, xyz, 250_000)[0][0] == [12, 13, 14, 23, 30]
 
 
 # --- small lists by the definition -----------------------------------------------------------

@@ -106,28 +106,6 @@ def test_slow_implementation(name, points):
     same(result, snell(some, cameras, 0.0, views=views))
 
 
-def boxes(rng, count=200):
-    """Return upright boxes of all sizes below and above the block."""
-    middle = rng.uniform((-100, -100, -20), (200, 200, 150), (count, 3))
-    half = 10 ** rng.uniform(-2, 1.5, (count, 1)) * rng.uniform(0.05, 1, (count, 3))
-    return middle - half, middle + half
-
-
-@pytest.mark.parametrize("name", mostly_nightly(LENSES, "everything"))
-def test_may_hold(name):
-    rng = np.random.default_rng(5)
-    cameras = block(LENSES[name], k=8, seed=3)
-    frames, excluded = frames_of(cameras), 0
-    for low, high in zip(*boxes(rng), strict=True):
-        inside = rng.uniform(low, high, (20, 3))
-        inside[:8] = np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high)
-        for c, centre in enumerate(cameras.centres):
-            if not may_hold(frames, c, centre, low, high):
-                excluded += 1
-                assert not any(holds(frames, c, tuple(row)) for row in centre - inside)
-    assert excluded > 0
-
-
 def test_different_lenses(points):
     """Coefficients of unequal number share one table."""
     names = ["barrel", "everything", "fisheye", "wide fisheye"]
