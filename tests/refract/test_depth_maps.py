@@ -13,7 +13,7 @@ from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Learned, Survey
 from pcfix.refract.learning import learn_of_sample
-from pcfix.refract.matcher import Matcher, bed_of
+from pcfix.refract.matcher import Matcher
 from pcfix.refract.methods import correct
 from pcfix.running import threads
 from pcfix.water.surface import is_submerged, surface_above
@@ -210,21 +210,6 @@ def test_block_without_list(name, most, monkeypatch):
 
 
 # the bed of the surroundings
-
-
-def test_bed_of_groups():
-    rng = np.random.default_rng(6)
-    xyz = np.column_stack([rng.uniform(0, 30, (60_000, 2)), rng.normal(-4, 0.5, 60_000)])
-    bed = -6.0 - 0.02 * xyz[:, 0]
-    likely = rng.uniform(-4, 2, (60_000, 6)).astype(np.float32)
-    right = rng.integers(0, 6, 60_000)
-    likely[np.arange(60_000), right] = bed - xyz[:, 2]
-    likely[rng.uniform(0, 1, likely.shape) < 0.1] = np.nan  # also some of the right ones
-    found = bed_of(xyz, likely, 0.05)
-    assert 9 < 60_000 / 30**2 * found.cell_m**2 < 15  # points a cell
-    # heights are tried at every GSD, and cells fall by 1 cm
-    close = np.abs(found.height_at(xyz[:, :2]) - bed) < 0.1
-    assert close.mean() > 0.97
 
 
 def test_any_chunk():
