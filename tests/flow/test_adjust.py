@@ -13,7 +13,7 @@ from pcfix.lens.imaging import straight_images
 from pcfix.options.survey import AdjustOptions
 from pcfix.running import threads
 from tests.utils.adjust_files import IMAGE_PX, write_block
-from tests.utils.codes import refused, warned
+from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
 
 pytestmark = pytest.mark.filterwarnings("default::pcfix.errors.PcfixWarning")
@@ -67,18 +67,6 @@ def home(files, new, **more):
         overwrite=True, **{"water": files.water, **SNELL, **more},
     )  # fmt: skip
     return heights_rms_m(files, out)
-
-
-def test_absorbed(files):
-    """Land lies metres off, and the correction alone makes nothing better."""
-    with warned("poses.absorbed"):
-        pcfix.correct_file(
-            files.folder / "cloud.las", files.folder / "alone.las", water=files.water,
-            cameras=files.folder / "model",
-        )  # fmt: skip
-    bed, land = heights_rms_m(files, files.folder / "alone.las")
-    assert min(bed, land) > 1.0
-    assert centre_rms_m(files, files.made.cameras) > 0.1
 
 
 def test_tie_points(files, written):

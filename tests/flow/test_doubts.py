@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 import pcfix
 from pcfix.flow import planning
-from pcfix.model import Outcome, TiePoints, Views
+from pcfix.model import TiePoints
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract import patches
 from pcfix.refract.batch import Batch, Survey
@@ -66,28 +66,6 @@ def test_coverage_of_a_wrong_list():
     as_tracks = replace(scene.views, kind="tracks")
     found = pcfix.correct_points(scene.apparent_xyz, scene.cameras, scene.water, views=as_tracks)
     assert covered(scene, found) >= 0.90
-
-
-def half(views):
-    """Return a list without its first half, and those points."""
-    counts = np.diff(views.start)
-    first = np.arange(len(counts)) < len(counts) // 2
-    kept = np.repeat(~first, counts)
-    start = np.concatenate([[0], np.cumsum(np.where(first, 0, counts))])
-    return Views(start, views.camera[kept], None, views.kind), first
-
-
-def test_unlisted_points():
-    scene = scene_of()
-    views, first = half(scene.views)
-    given = (scene.apparent_xyz, scene.cameras, scene.water)
-    found = pcfix.correct_points(*given, views=views)
-    alone, listed = pcfix.correct_points(*given), pcfix.correct_points(*given, views=scene.views)
-    np.testing.assert_array_equal(found.xyz[first], alone.xyz[first])
-    made = ~first & (np.diff(scene.views.start) > 1)
-    np.testing.assert_allclose(found.xyz[made], listed.xyz[made], atol=0.05 * scene.gsd_m)
-    seen = first & alone.corrected
-    assert seen.any() and (found.outcome[seen] == Outcome.CORRECTED).all()
 
 
 def as_file(path, xyz, sources):

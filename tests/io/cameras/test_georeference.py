@@ -383,12 +383,3 @@ def test_heights_that_cannot_be_compared_leave_the_plan(crs, gnss_crs, reason):
     assert np.isnan(enu_m[:, 2]).all()
     lengths = np.hypot(*enu_m[:2, :2].T)
     assert lengths == pytest.approx(np.hypot(*ENU_M[:2, :2].T), rel=5e-4)
-
-
-@pytest.mark.parametrize("crs", [None, "local"])
-def test_a_local_block_cannot_be_compared(crs):
-    gnss = GnssPositions(np.array([[LON, LAT, H]]), np.full((1, 3), np.nan), "EPSG:4326")
-    cameras = Cameras(("a",), np.zeros((1, 3)), crs=crs, gnss=gnss)
-    enu_m, why = adjusted_minus_gnss(cameras, "a.xml")
-    assert np.isnan(enu_m).all()
-    assert "they are not compared" in why
