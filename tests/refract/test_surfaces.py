@@ -136,11 +136,6 @@ def test_beyond_edge():
     assert one.xyz == pytest.approx(other.xyz, abs=MICROMETRE)
 
 
-def test_camera_under_raster():
-    with pytest.raises(pcfix.GeometryError):
-        pcfix.correct_points(bed(), cameras(), raster(plane(90.0, 0, 0)))
-
-
 # A level that moves
 
 
