@@ -1,7 +1,5 @@
 """A user's mistake with an adjustment gives one line, exit code 1, and nothing left behind."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 

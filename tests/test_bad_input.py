@@ -1,7 +1,5 @@
 """A user's mistake gives one line with a code, exit code 1, and nothing is written."""
 
-from __future__ import annotations
-
 import os
 import struct
 

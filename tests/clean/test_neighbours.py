@@ -1,7 +1,5 @@
 """Neighbours against brute force over all pairs, and outliers against open3d."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -66,18 +64,6 @@ def test_statistics_of_all_pairs(make) -> None:
     np.testing.assert_allclose(whole[:, 1:], twin_quartiles, rtol=0, atol=1e-12)
     for points in (2, 20, 90, 400):
         assert np.array_equal(_statistics(xyz, points), whole)
-
-
-def test_tiles_hold_every_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    xyz = _clustered()
-    used = np.random.default_rng(1).random(len(xyz)) < 0.7
-    cut = make_tiles(xyz, used, 10)
-    assert len(cut) > 20
-    assert np.array_equal(np.sort(cut.row), np.flatnonzero(used))
-    assert np.array_equal(cut.xyz, xyz[cut.row])
-    assert (np.diff(cut.start) > 0).all()
-    monkeypatch.setattr("pcfix.blocks.ROWS", 77)
-    assert np.array_equal(make_tiles(xyz, used, 10).row, cut.row)
 
 
 @pytest.mark.parametrize("points", mostly_nightly([100, 1000, 5000], 100))

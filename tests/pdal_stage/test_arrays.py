@@ -1,7 +1,5 @@
 """The stage as a function of arrays; no PDAL is needed for it."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

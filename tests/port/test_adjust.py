@@ -1,7 +1,5 @@
 """Images through a housing port, adjusted from files: poses, points and the program."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,24 +1,13 @@
 """A block that swallowed the water, as the files that its user has."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
-
-import laspy
-import numpy as np
-from pyproj import CRS
+from pathlib import Path
 
 from pcfix.io.cameras.colmap import write_colmap
-from tests.utils.tie_points import simulate_tie_points
-from tests.utils.unaware_blocks import apparent_cloud, parted, unaware
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcfix.model import FloatArray
-    from tests.utils.tie_points import TieScene
-    from tests.utils.unaware_blocks import Unaware
+from pcfix.model import FloatArray
+from tests.utils.clouds import write_las
+from tests.utils.tie_points import TieScene, simulate_tie_points
+from tests.utils.unaware_blocks import Unaware, apparent_cloud, parted, unaware
 
 EPSG = "EPSG:32633"
 IMAGE_PX = 0.3
@@ -68,15 +57,6 @@ def write_block(folder: Path, points: int = 1600, **settings: object) -> Files:
         f"{lens.principal_x!r},{lens.principal_y!r}\n"
     )
     return Files(folder, made, others.truth)
-
-
-def write_las(path: Path, xyz: FloatArray) -> None:
-    header = laspy.LasHeader(point_format=3, version="1.4")
-    header.scales, header.offsets = np.full(3, 0.001), np.floor(xyz.min(axis=0))
-    header.add_crs(CRS(EPSG))
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = xyz.T
-    las.write(path)
 
 
 def write_gnss(path: Path, labels: tuple[str, ...], xyz: FloatArray, sigma: FloatArray) -> None:

@@ -117,6 +117,7 @@ def test_folder(tmp_path):
     assert cameras.labels == ("a.jpg", "b.TIF")
     assert cameras.centres.tolist() == [[1, 2, 3], [10, 20, 30]]
     assert cameras.unposed == ("lost.jpg",)
+    assert cameras.rotations[0] == pytest.approx(TURN)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from pyproj import CRS
+from scipy.spatial.transform import Rotation
 
 import pcfix
 from pcfix.io.cameras import table
@@ -174,6 +175,15 @@ def test_omega_phi_kappa(tmp_path, header, per_degree):
     row = ",".join(repr(float(a)) for a in angles * per_degree)
     cameras = plain(tmp_path, f"{header}\na,1,2,3,{row}\n")
     assert cameras.rotations[0] == pytest.approx(photogrammetric(*np.radians(angles)), abs=1e-12)
+
+
+@pytest.mark.parametrize("names", ["qw,qx,qy,qz", "r11,r12,r13,r21,r22,r23,r31,r32,r33"])
+def test_turns_are_from_world_to_camera(tmp_path, names):
+    turn = Rotation.from_euler("xyz", [170.0, 12.0, 34.0], degrees=True)
+    numbers = np.roll(turn.as_quat(), 1) if "q" in names else turn.as_matrix().ravel()
+    row = ",".join(map(repr, numbers.tolist()))
+    cameras = plain(tmp_path, f"label,x,y,z,{names}\na,1,2,3,{row}\n")
+    assert cameras.rotations[0] == pytest.approx(turn.as_matrix(), abs=1e-12)
 
 
 GIMBAL = "label,x,y,z,{}\na,1,2,3,10,-90,0\nb,1,2,3,20,-60,0\n"
