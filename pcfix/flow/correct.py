@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import fields, replace
-from functools import partial
 from itertools import compress
 from os import PathLike
 from typing import TYPE_CHECKING, Any
@@ -16,26 +15,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError, coded
+from pcfix.errors import GeometryError, PcfixWarning, SettingError, coded
 from pcfix.flow.correction import CloudTally, Plan, correct_chunk
 from pcfix.flow.inputs import CameraInputs, Inputs, paths_in, transfer_between
 from pcfix.flow.planning import plan_correction, plan_of, read_inputs
 from pcfix.flow.plausibility import CloudSample, Plausible, plausible
-from pcfix.flow.runner import (
-    Chunk,
-    Command,
-    FileTask,
-    FileWork,
-    Finish,
-    Progress,
-    run_command,
-    stream,
-)
+from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps, part_report
 from pcfix.io.las.writing import corrected_header
-from pcfix.io.tiles import Clouds, open_cloud
+from pcfix.io.tiles import Clouds
 from pcfix.label.labelling import Labelling
 from pcfix.model import (
     BATHYMETRIC_POINT,
@@ -111,36 +101,16 @@ def correct_file(
         """Return the plan for a file, or for many as one cloud."""
         return plan_correction(read_inputs(given, view_of(task.source, given.jobs, task.cached)))
 
-    command = Command("correct", plan, _correct_cloud, finish)
-    return run_command(command, input, output, given, reads=paths_in(given), progress=progress)
+    return run_command(
+        "correct", input, output, given, plan=plan, work=_correcting, finish=finish,
+        reads=paths_in(given), progress=progress,
+    )  # fmt: skip
 
 
-def _correct_cloud(plan: Plan, task: FileTask, finish: Finish) -> Any:
-    """Correct a file; see `stream`.
-
-    It is written with the offsets of the input, and again if a coordinate does not fit: with
-    offsets in the middle of the cloud.
-    """
-    steps = tuple[int, ...]((0, 0, 0))
-    while True:
-        try:
-            return stream(partial(_correcting, steps=steps), plan, task, finish)
-        except columns.OutOfRangeError as axis:
-            old = steps
-            with open_cloud(task.source, task.jobs) as source:
-                steps = centring_steps(source)
-            if steps == old:
-                raise InputError(
-                    "cloud.scale",
-                    f"{task.source}: the scale of {axis} is too fine for the result in 32 bits."
-                    " Write the cloud with a coarser scale first.",
-                    path=str(task.source),
-                ) from axis
-
-
-def _correcting(plan: Plan, source: LasSource, steps: tuple[int, ...]) -> FileWork:
+def _correcting(plan: Plan, source: LasSource) -> FileWork:
     """Return the correction of one file: its header, and each chunk."""
     written = columns.columns_for(plan.options.dimensions, plan.options.unsure)
+    steps = centring_steps(source.header)
     header = corrected_header(source, written, plan.provenance(), steps)
     uncorrected = plan.options.uncorrected
 
@@ -159,7 +129,7 @@ def _correcting(plan: Plan, source: LasSource, steps: tuple[int, ...]) -> FileWo
             changes = columns.changes_of(
                 written, part, classes, withheld, some.scales, withhold=uncorrected == "withhold"
             )
-            columns.move(some, changes.steps + np.array(steps))
+            columns.move(some, changes.steps + np.array(steps), source.path)
             columns.fill(some, changes)
             some.array["classification"][part.corrected] = BATHYMETRIC_POINT
             some["withheld"][:] = (withheld | changes.flagged).astype(np.uint8)

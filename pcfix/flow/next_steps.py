@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from pcfix.flow.inputs import Inputs
 from pcfix.model import Cameras, WaterPlane
 from pcfix.options.declare import File, OptionSet
-from pcfix.options.shared import CameraFileOptions, ViewOptions, WaterOptions
+from pcfix.options.shared import CameraFileOptions, MaskOption, ViewOptions, WaterOptions
 from pcfix.options.survey import AdjustOptions
 from pcfix.port.shapes import spec_of
 
@@ -40,8 +40,6 @@ def adjust_words(
     model = "MODEL" if isinstance(inputs.cameras, Cameras) else str(inputs.cameras)
     words = ["pcfix", "adjust", model, "OUT", "--water", _water(inputs.water), "--cloud", cloud]
     words += _flags(inputs)
-    if inputs.water_mask is not None:
-        words += ["--water-mask", str(inputs.water_mask)]
     remark = "" if has_datum or more.get("gcps") or more.get("gnss") else NO_DATUM
     if remark:
         more["gnss"] = "GNSS.csv"
@@ -64,13 +62,10 @@ def correct_words(found: Adjusted, model: File, out_dir: File, options: AdjustOp
     if isinstance(found.water, WaterPlane) or (out / WATER).exists():
         water, plane = str(out / WATER), found.water
         if isinstance(plane, WaterPlane):
-            is_level = plane.b == plane.c == 0.0
-            tilted = f"plane:{plane.a:.15g},{plane.b:.15g},{plane.c:.15g}"
-            water = f"{plane.a:.3f}" if is_level else tilted
+            water = f"plane:{plane.a:.15g},{plane.b:.15g},{plane.c:.15g}"
+            water = f"{plane.a:.3f}" if plane.b == plane.c == 0.0 else water
         options = replace(options, water_model="auto", water_crs=None)
     words += ["--adjusted-from", str(model), "--water", water]
-    if options.water_mask is not None:
-        words += ["--water-mask", str(options.water_mask)]
     if "index" in options.free or options.sigma_index is not None:
         words += ["--index", f"{found.refractive_index:.6g}"]
     elif options.index is not None:
@@ -87,7 +82,7 @@ def _water(given: Any) -> str:
 def _flags(given: OptionSet) -> list[str]:
     """Return the options that `pcfix correct` and `pcfix adjust` have in common, as given."""
     words = []
-    for kind in (WaterOptions, CameraFileOptions, ViewOptions):
+    for kind in (WaterOptions, CameraFileOptions, ViewOptions, MaskOption):
         for name, text in given.part(kind).plain().items():
             words += [f"--{name.replace('_', '-')}", str(text)]
     return words

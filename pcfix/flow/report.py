@@ -61,16 +61,15 @@ def report_run(
 ) -> Plain:
     """Write the page of a run, and return what it says in short."""
     pictures, tables, dod, verdict = list[Picture](), list[Table](), None, ""
-    if first["adjusted"]:
-        verdict = f" The cameras were adjusted first, as {first['why']}."
-    elif first["is_shown"]:
-        verdict = f" The cameras were not adjusted: {first['why']}."
+    if first["why"]:
+        how = "not adjusted:" if first["model"] is None else "adjusted first, as"
+        verdict = f" The cameras were {how} {first['why']}."
     request, summary = run.request, Summary(**corrected)
     if compared:
         dod = preview(run.dod, MOST_CELLS) if request.has_surface else None
         pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
         verdict += in_a_sentence(compared["figures"])
-    if first["adjusted"]:
+    if first["model"] is not None:
         figures = read_json(run.folder / FOLDER / SUMMARY)
         tables += adjustment_tables(figures, f"{FOLDER}/report.html")
     if (summary.water_fit or {}).get("model") == "auto":  # the water was sought in the cloud

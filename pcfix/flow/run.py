@@ -5,7 +5,6 @@ The results are opened as rasters, lines and tables (`RunResults`).
 
 from __future__ import annotations
 
-import math
 import os
 import warnings
 from collections.abc import Callable, Iterable
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from pcfix.adjust.diagnosis import MOST_STATED_M
 from pcfix.compare.m3c2 import load_py4dgeo
-from pcfix.errors import PcfixError, PcfixWarning, SettingError, bad_file
+from pcfix.errors import PcfixError, PcfixWarning, SettingError, bad_file, plain
 from pcfix.flow.adjust import SUMMARY, adjust_into
 from pcfix.flow.clean import clean_file
 from pcfix.flow.compare import compare_clouds
@@ -174,12 +173,12 @@ def run_all(
     first, done = step(
         "adjust", "Adjusting", outputs, lambda _: adjust_first(asked, out_dir, inputs)
     )
-    if first["adjusted"]:
+    if first["model"] is not None:
         figures = read_json(out_dir / FOLDER / SUMMARY)
         say(f"{done}{outputs[0]}")
         for words in (adjustment_sentence(figures), *all_notes(figures)):
             say(f"{'':<9} {words}")
-    elif first["is_shown"]:
+    elif first["why"]:
         say(f"{'adjust':<9} not done: {first['why']}")
     request = request.with_adjusted(out_dir, first)
     run = RunFolder(out_dir, request)
@@ -189,13 +188,10 @@ def run_all(
     outputs += [] if request.shoreline is None else [Path(request.shoreline)]
     corrected, done = step("correct", "Correcting", outputs, partial(_correct, run))
     poses = corrected["poses"]
-    if first["is_fine"] and poses is not None and poses["absorbed"] is None:
+    if first["absorbed"] is False and poses is not None and poses["absorbed"] is None:
         # the first step has surveys that the correction has not
         words = "did not absorb the refraction, as the first step found"
         corrected = {**corrected, "poses": {**poses, "absorbed": False, "words": words}}
-    if not first["is_shown"] and first["why"] and (poses or {}).get("absorbed"):
-        first = {**first, "is_shown": True}
-        say(f"{'adjust':<9} not done: {first['why']}")
     say(f"{done}{run.corrected}")
 
     # the corrected cloud marks which points are below the water
@@ -271,62 +267,54 @@ def adjust_first(request: Request, folder: Path, files: list[Path]) -> Plain:
     Returns
     -------
     dict
-        `adjusted`, a bool; `model`, the file or folder with the cameras in that of the adjustment;
-        `why`; `is_shown`, whether that is worth a line; `is_fine`, whether the poses are known to
-        be right.
+        `model`, the file or folder with the cameras in that of the adjustment, None without one;
+        `why`; and `absorbed`, whether the poses absorbed refraction, None if that is not known.
     """
-    found = {"adjusted": False, "model": None, "why": "", "is_shown": False, "is_fine": False}
+    model, why, absorbed = None, "", None
     try:
-        found |= _decide(request)
-        if found["adjusted"]:
-            found["model"] = _adjust(request, folder / FOLDER, files)
+        why, absorbed = _decide(request)
+        if absorbed or request.adjust == "yes":
+            model = _adjust(request, folder / FOLDER, files)
     except PcfixError as error:
         if request.adjust == "yes" or request.only_to_adjust:
             raise
-        # a file that cannot be read will stop the correction, with the same message
-        found |= {"adjusted": False, "why": str(error), "is_shown": found["adjusted"]}
-    return found
+        why = str(error)  # of a file that cannot be read, which stops the correction too
+    return {"model": model, "why": why, "absorbed": absorbed}
 
 
-def _decide(request: Request) -> Plain:
-    """Return whether to adjust: if asked, or if the poses absorbed refraction and there is a datum.
+def _decide(request: Request) -> tuple[str, bool | None]:
+    """Return why the cameras are adjusted, or not; and whether their poses absorbed refraction.
 
-    Signs of absorbed refraction do not include the survey with which the result is compared: the
-    cloud must not depend on it.
+    Without a datum that is not asked. Signs of absorbed refraction do not include the survey with
+    which the result is compared: the cloud must not depend on it.
     """
-    if request.adjust == "yes":
-        return {"adjusted": True, "why": "that was asked for", "is_shown": True}
-    if request.adjust == "no":
-        return {}
-    inputs, is_shown = request.part(Inputs), bool(request.only_to_adjust)
+    if request.adjust != "auto":
+        return ("that was asked for" if request.adjust == "yes" else ""), None
     if request.why_not_adjust:
-        return {"why": request.why_not_adjust, "is_shown": is_shown}
-    view = view_of(request.source)
+        return request.why_not_adjust, None
+    inputs, view = request.part(Inputs), view_of(request.source)
     # the correction shows the warnings
     with warnings.catch_warnings(action="ignore", category=PcfixWarning):
         cameras = inputs.block(view.crs)[0]
         if request.gnss is not None:
             cameras = read_gnss(request.gnss, cameras)
         elif request.gcps is None and not has_datum(cameras, str(request.cameras)):
-            why = (
+            return (
                 "there is no datum: no --gcps, no --gnss, and no GNSS positions better than"
                 f" {MOST_STATED_M:g} m in the camera file"
-            )
-            return {"why": why, "is_shown": is_shown}
+            ), None
         water = inputs.surface(view).surface
         if isinstance(water, WaterDimension):
-            why = f"the water {water} is known at points of the cloud only"
-            return {"why": why, "is_shown": True}
-        index = with_index(request).refractive_index
+            return f"the water {water} is known at points of the cloud only", None
         sign = diagnose_inputs(
-            inputs, cameras, view, water, index, gcps=request.gcps, in_passing=not is_shown
-        ).decided_by
+            inputs, cameras, view, water, with_index(request).refractive_index, gcps=request.gcps,
+            in_passing=not request.only_to_adjust,
+        ).decided_by  # fmt: skip
     if sign is None:
         why = "nothing shows whether the poses absorbed the refraction; --adjust yes adjusts anyway"
-        return {"why": why, "is_shown": True}
+        return why, None
     did = "absorbed" if sign.speaks else "did not absorb"
-    why = f"the poses {did} the refraction: {sign.words}"
-    return {"adjusted": sign.speaks, "why": why, "is_shown": True, "is_fine": not sign.speaks}
+    return f"the poses {did} the refraction: {sign.words}", sign.speaks
 
 
 def _adjust(request: Request, target: Path, files: list[Path]) -> str:
@@ -352,8 +340,7 @@ def _correct(run: RunFolder, progress: Progress | None) -> Plain:
 
 def _compare(run: RunFolder) -> Plain:
     """Compare the cleaned cloud with the reference, and write a raster of differences."""
-    request = run.request
-    reference = request.surveyed
+    request, reference = run.request, run.request.surveyed
     result = compare_clouds(
         run.cleaned_cloud, reference, out_dir=run.compare, sections=SECTIONS, overwrite=True,
         **{one.name: getattr(request, one.name) for one in options_of(DistanceOptions)},
@@ -367,17 +354,10 @@ def _compare(run: RunFolder) -> Plain:
                 grid_dsm(reference, heights, resolution=run.resolution_m, overwrite=True)
         rasters.write_dod(run.folder / SURFACE, heights, run.dod, overwrite=True)
     sections = [
-        {
-            "distance_m": section.distance_m.tolist(),
-            "heights_m": {
-                name: [None if math.isnan(value) else value for value in heights_m.tolist()]
-                for name, heights_m in section.heights_m.items()
-            },
-        }
-        for section in result.sections
+        {"distance_m": one.distance_m, "heights_m": one.heights_m} for one in result.sections
     ]
-    points = [] if result.check_points is None else result.check_points.tolist()
-    return {"figures": result.as_dict(), "sections": sections, "check_points": points}
+    points = [] if result.check_points is None else result.check_points
+    return {"figures": result.as_dict(), **plain({"sections": sections, "check_points": points})}
 
 
 @dataclass(frozen=True)
