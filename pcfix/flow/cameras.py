@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_SENSORS = 8
-"""Lines on lenses; if there are more, they are grouped by sensor and frame, or by kind."""
+"""Sensors in the text; the others are counted."""
 SAMPLE_POINTS = 50_000
 """Points of the cloud that are tested in the frames, evenly spread."""
 MOST_FOOTPRINTS = 400
@@ -141,58 +140,42 @@ class CamerasReport:
 
 
 def sensors_of(cameras: Cameras, above_m: FloatArray | None) -> list[Plain]:
-    """Return the lenses of a block: each separately, or grouped by frame or kind if many."""
-    lenses = cameras.lenses or ()
-    keys: list[Callable[[Lens], Any]] = [
-        lambda lens: lens,
-        lambda lens: (lens.sensor, lens.width, lens.height, lens.unit, lens.projection),
-        lambda lens: (lens.unit, lens.projection, _is_distorted(lens)),
-    ]
+    """Return the sensors of a block; values are None where not stated.
+
+    Images of one sensor have its name, frame and projection. ``lenses`` counts the lenses that
+    differ, and ``folded`` is the share of the frame beyond the fold of the distortion.
+    """
     groups: dict[Any, list[int]] = {}
-    for key in keys:
-        groups = {}
-        for row, lens in enumerate(lenses):
-            groups.setdefault(key(lens), []).append(row)
-        # separately only if most lenses have several images
-        if len(groups) <= MOST_SENSORS and (key is not keys[0] or len(groups) <= len(lenses) // 2):
-            break
-    above = np.full(len(lenses), np.nan) if above_m is None else above_m
-    return [
-        _sensor([lenses[row] for row in rows], float(np.mean(above[rows])))
-        for rows in groups.values()
-    ]
+    for row, lens in enumerate(cameras.lenses or ()):
+        key = lens.sensor, lens.width, lens.height, lens.unit, lens.projection
+        groups.setdefault(key, []).append(row)
+    sensors = []
+    for rows in groups.values():
+        lenses = list(dict.fromkeys((cameras.lenses or ())[row] for row in rows))
+        lens, pixel = lenses[0], lenses[0].pixel_size_mm
+        focal_px = lens.focal_px if lens.unit == "px" or pixel else None
+        height_m = 0.0 if above_m is None else float(np.mean(above_m[rows]))
+        sensors.append({
+            "name": lens.sensor,
+            "images": len(rows),
+            "width": lens.width,
+            "height": lens.height,
+            "focal": min(one.focal for one in lenses),
+            "focal_most": max(one.focal for one in lenses),
+            "unit": lens.unit,
+            "focal_mm": lens.focal if lens.unit == "mm" else pixel and lens.focal * pixel,
+            "pixel_size_um": pixel and 1000.0 * pixel,
+            "projection": lens.projection,
+            "distorted": _is_distorted(lens),
+            "gsd_m": height_m / focal_px if height_m > 0.0 and focal_px else None,
+            "lenses": len(lenses),
+            "folded": max(_folded(one) for one in lenses[:: 1 + len(lenses) // 20]),
+        })  # fmt: skip
+    return sensors
 
 
 def _is_distorted(lens: Lens) -> bool:
     return any((*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism))
-
-
-def _sensor(lenses: list[Lens], above_m: float) -> Plain:
-    """Return a sensor from the lenses of its images, `above_m` the water on average.
-
-    Values are None where not stated. ``lenses`` and ``frames`` count those that differ, and
-    ``folded`` is the share of the frame beyond the fold of the distortion.
-    """
-    lens, alike = lenses[0], list(dict.fromkeys(lenses))
-    pixel = lens.pixel_size_mm
-    focal_px = lens.focal if lens.unit == "px" else None if pixel is None else lens.focal / pixel
-    return {
-        "name": lens.sensor if all(one.sensor == lens.sensor for one in alike) else "several",
-        "images": len(lenses),
-        "width": lens.width,
-        "height": lens.height,
-        "focal": min(one.focal for one in alike),
-        "focal_most": max(one.focal for one in alike),
-        "unit": lens.unit,
-        "focal_mm": lens.focal if lens.unit == "mm" else pixel and lens.focal * pixel,
-        "pixel_size_um": pixel and 1000.0 * pixel,
-        "projection": lens.projection,
-        "distorted": _is_distorted(lens),
-        "gsd_m": above_m / focal_px if above_m > 0.0 and focal_px else None,
-        "lenses": len(alike),
-        "frames": len({(one.width, one.height) for one in alike}),
-        "folded": max(_folded(one) for one in alike[:: 1 + len(alike) // 20]),
-    }
 
 
 def _folded(lens: Lens) -> float:
@@ -272,8 +255,11 @@ def cameras_text(report: CamerasReport) -> str:
     if missing:
         more = ", ..." if len(missing) > SHOWN_NAMES else ""
         images += f", {len(missing):,} without: {', '.join(missing[:SHOWN_NAMES])}{more}"
-    rows = [("Images", images), *(row for one in r["sensors"] for row in _sensor_rows(one))]
-    if not r["sensors"]:
+    sensors = r["sensors"]
+    rows = [("Images", images), *(row for s in sensors[:MOST_SENSORS] for row in _sensor_rows(s))]
+    if len(sensors) > MOST_SENSORS:
+        rows.append(("", f"and {len(sensors) - MOST_SENSORS} more"))
+    if not sensors:
         rows.append(("Sensor", "none: the frames are not known"))
     if cameras.rotations is None:
         rows.append(("Angles", "none: every camera counts as visible from every point"))
@@ -321,11 +307,10 @@ def cameras_text(report: CamerasReport) -> str:
 def _sensor_rows(s: Plain) -> Rows:
     """Return frame, focal length and pixel size of a sensor, and what is wrong with its lens."""
     low, high = f"{s['focal']:.6g}", f"{s['focal_most']:.6g}"
-    frame = f"{s['width']:g} x {s['height']:g} {s['unit']}"
     words = [
         f"{s['name'] or 'unnamed'}: {s['images']:,} images",
         f" with {s['lenses']:,} different lenses" if s["lenses"] > 1 else "",
-        f", {s['frames']} sizes as {frame}" if s["frames"] > 1 else f", {frame}",
+        f", {s['width']:g} x {s['height']:g} {s['unit']}",
         f", focal length {low if low == high else f'{low} to {high}'} {s['unit']}",
     ]
     if s["pixel_size_um"] is not None:

@@ -48,7 +48,6 @@ from pcfix.options.correct import (
 )
 from pcfix.options.declare import File, taken
 from pcfix.refract.batch import UNLISTED
-from pcfix.refract.reconstructions import CAUSES
 from pcfix.refract.tally import Tally
 from pcfix.report.summary import Summary
 from pcfix.version import __version__
@@ -143,8 +142,13 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
 
     Warns of what is uncertain, and writes the shoreline and the line of a regression if asked.
     """
-    water_notes = _check_counts(plan, tally)
-    tested, poses, absorbed, shoreline, options = None, None, None, None, plan.options
+    options, figures, transfer = plan.options, tally.figures, plan.transfer
+    report = None
+    if tally.views is not None and plan.match is not None:
+        report = replace(tally.views, notes=plan.match.notes)
+    water_notes = _check_counts(plan, tally, report)
+    counts, uncertainty = figures.as_dict(), figures.uncertainty(plan.made)
+    tested, poses, absorbed, shoreline = None, None, None, None
     if plan.inputs.port is None:
         from pcfix.flow.diagnosis import diagnose_in_passing, quick_ties
 
@@ -158,39 +162,34 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
                 options.shoreline, tally.shore, plan.found, plan.view.crs,
                 overwrite=options.overwrite, sigma_level_m=options.sigma_level,
             )  # fmt: skip
+        water, moved = str(plan.found.surface), plan.survey.level_offset_m
+        if moved is not None:
+            times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
+            water = f"{water}, {times}"
+        by_poses = plan.survey.learned.poses
+        if uncertainty is not None and by_poses is not None:
+            uncertainty["poses_m"] = round(by_poses.middle_m, 4)
+    else:  # no depths, and no orders by depth
+        counts["depth_m"], uncertainty = {}, None
+        water = f"all around, seen through a {plan.inputs.port}"
     path, line = options.save_regression, plan.regression
     if path is not None and line is not None:
         from pcfix.io.regressions import write_regression
 
         write_regression(path, line, overwrite=options.overwrite)
-    figures, report = tally.figures, _view_report(plan, tally)
-    unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
-    counts = figures.as_dict()
     if options.unsure != "withhold":
         counts["unsure"] = None
+    unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
     not_moved = sum(counts["uncorrected"].values()) + int(figures.outcomes[Outcome.NOT_CARRIED])
-    transfer, moved = plan.transfer, plan.survey.level_offset_m
-    made, detected, water = plan.made, _detected(plan, tally), str(plan.found.surface)
-    uncertainty = figures.uncertainty(made)
-    by_poses = plan.survey.learned.poses
-    if plan.inputs.port is not None:  # no depths, and no orders by depth
-        counts["depth_m"], uncertainty = {}, None
-        water = f"all around, seen through a {plan.inputs.port}"
-    if uncertainty is not None and by_poses is not None:
-        uncertainty["poses_m"] = round(by_poses.middle_m, 4)
-    if moved is not None:
-        times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
-        water = f"{water}, {times}"
+    made, detected = plan.made, _detected(plan, tally)
     notes = [
-        *plan.cameras.notes,
+        *plan.input_notes,
         *([] if report is None else report.warnings()),
         *coded("cloud.labels", plan.labelling.notes),
         *(() if tested is None else tested.doubts),
         *detected,
-        *coded("water.surface", plan.found.notes),
-        *coded("water.images", plan.own_notes),
         *coded("water.extent", water_notes),
-        *coded("cameras.poses", filter(None, [absorbed, plan.no_poses])),
+        *([] if absorbed is None else [absorbed]),
     ]
     return Summary(
         input=str(task.source),
@@ -220,12 +219,11 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     )
 
 
-def _check_counts(plan: Plan, tally: CloudTally) -> tuple[str, ...]:
+def _check_counts(plan: Plan, tally: CloudTally, report: ViewReport | None) -> list[str]:
     """Refuse a cloud of which nothing can be corrected; return notes on the extent of the water."""
     # From the general to the particular: a view list of another cloud, or a mask elsewhere, would
     # also leave points without cameras.
     name, figures = plan.view.name, tally.figures
-    report = _view_report(plan, tally)
     if report is not None:
         report.check()
         for note in report.warnings():
@@ -260,14 +258,7 @@ def _check_counts(plan: Plan, tally: CloudTally) -> tuple[str, ...]:
             " Check that cameras and cloud belong together.",
             reasons=reasons,
         )
-    return tuple(water_notes)
-
-
-def _view_report(plan: Plan, tally: CloudTally) -> ViewReport | None:
-    """Return how the view list fitted, with the notes of reading it."""
-    if tally.views is None or plan.match is None:
-        return None
-    return replace(tally.views, notes=plan.match.notes)
+    return water_notes
 
 
 def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
@@ -299,9 +290,8 @@ def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> P
     tested = plausible(
         plan.cameras, sample.xyz, ties, () if sought else sample.level_doubts(),
         file="" if isinstance(given, Cameras) else given or "", water_m=sample.water_m,
-        listed=plan.views is not None, every=sample.every,
+        listed=plan.kind is not None, every=sample.every,
     )  # fmt: skip
-    tested = tested._replace(noted=CAUSES in map(str, _detected(plan, tally)))
     for warning in tested.doubts:
         warnings.warn(warning, stacklevel=3)
     return tested
@@ -439,7 +429,7 @@ def correct_points(
             sentence = f"may_be_submerged must be {len(xyz)} booleans, not {allowed.dtype}."
             raise SettingError("array.shape", sentence, shape=allowed.shape)
         classes[~allowed] = NOT_SUBMERGED
-    points = Points(xyz, heights, classes)
+    points = Points(xyz, heights, classes, views=views)
     view = CloudView(
         "xyz", None, *corners(*xyz[:, :2].T), len(xyz), lambda water=None: iter([points])
     )
@@ -456,8 +446,8 @@ def correct_points(
         view,
         CameraInputs(cameras, None, original, transfer),
         FoundSurface(surface),
-        views,
         offset,
+        views,
         Labelling(LabelRules(respect_classes=(NOT_SUBMERGED,))),
         line,
     )
@@ -468,8 +458,8 @@ def correct_points(
     check_fit(plan, tally)
     if line is not None and line is not regression and tally.beyond is not None:
         notes += tally.beyond.notes(line)
-    for note in (*plan.own_notes, *notes):
-        warnings.warn(PcfixWarning("points.note", note), stacklevel=2)
+    for note in (*plan.input_notes, *coded("points.note", notes)):
+        warnings.warn(note, stacklevel=2)
     return correction
 
 

@@ -26,7 +26,6 @@ from pcfix.model import (
     IntArray,
     Outcome,
     ViewKind,
-    Views,
     WaterPlane,
 )
 from pcfix.options.correct import CorrectOptions, ScienceOptions
@@ -59,16 +58,16 @@ class Plan:
     survey: Survey  # cameras, water, and options; once planned without ``auto``
     found: FoundSurface  # the water and its origin; infinitely high in front of a port
     labelling: Labelling  # which points may be submerged
-    views: ViewMatch | Views | None = None  # the view list; `Views` are of all points, in order
-    kind: ViewKind | None = None  # its type
+    match: ViewMatch | None = None  # the view list of a file
+    kind: ViewKind | None = None  # the type of the view list, which the points may have themselves
+    some_unlisted: bool = False  # whether points have no images in it
     transfer: CloudTransfer | None = None  # from the original to the adjusted cameras
     members: Members | None = None  # of an adjustment, for the errors of the poses
     settings: dict[str, Any] = field(default_factory=dict)  # more settings for the summary
     verdicts: tuple[Verdict, ...] = ()  # on the reconstruction type
     of_unlisted: tuple[Verdict, ...] = ()  # the same for points in no view list
+    input_notes: tuple[PcfixWarning, ...] = ()  # what was noted on reading the inputs
     notes: tuple[PcfixWarning, ...] = ()  # what the cloud shows
-    own_notes: tuple[str, ...] = ()  # on the water of single images
-    no_poses: str = ""  # why SigmaZ has no errors of the poses, if there is an adjustment
 
     @property
     def cameras(self) -> Cameras:
@@ -79,11 +78,6 @@ class Plan:
     def original(self) -> Cameras | None:
         """The cameras that made the cloud, if they were adjusted since."""
         return None if self.transfer is None else self.transfer.original
-
-    @property
-    def match(self) -> ViewMatch | None:
-        """The view list of a file."""
-        return None if isinstance(self.views, Views) else self.views
 
     @property
     def regression(self) -> DepthRegression | None:
@@ -103,8 +97,8 @@ class Plan:
             return None
         elif settings.method == "snell":
             because = "The cameras have no lenses or no angles: corrected by snell."
-        elif self.views is not None:
-            because = f"The view list is one of {kind_of(self.views)}: corrected as such."
+        elif self.kind is not None:
+            because = f"The view list is one of {self.kind}: corrected as such."
         else:
             because = "Too few points to detect the reconstruction type: tracks assumed."
         return {
@@ -152,30 +146,21 @@ class CloudTally(Sums):
     port_miss_m: float = 0.0
 
 
-def kind_of(views: ViewMatch | Views | None) -> ViewKind | None:
-    """Return the type of a view list."""
-    if views is None or isinstance(views, Views):
-        return None if views is None else views.kind
-    return views.view_list.listed.kind
-
-
 def transferred(
     plan: Plan, points: Points, row: int
-) -> tuple[Points, Views | None, ViewReport | None, Transferred | None]:
-    """Return points that begin at a row of the cloud, transferred to the adjusted cameras.
+) -> tuple[Points, ViewReport | None, Transferred | None]:
+    """Return points that begin at a row of the cloud, with their views, at the adjusted cameras.
 
-    Then their views, the counts of these, and the transfer; None where there is none.
+    Then the counts of the views of a file, and the transfer; None where there is none.
     """
-    views, counts, step = plan.views, None, None
+    counts, step = None, None
     if plan.match is not None:
         views, counts = plan.match.views_of(points.xyz, row)
-    elif isinstance(views, Views) and len(views.start) != len(points.xyz) + 1:
-        views = views.take(np.arange(row, row + len(points.xyz)))
-    listed = views if isinstance(views, Views) else None
+        points = points._replace(views=views)
     if plan.transfer is not None:
-        step = plan.transfer.step(points.xyz, listed)
-        points, listed = points._replace(xyz=step.xyz, original_xyz=points.xyz), step.views
-    return points, listed, counts, step
+        step = plan.transfer.step(points.xyz, points.views)
+        points = points._replace(xyz=step.xyz, original_xyz=points.xyz, views=step.views)
+    return points, counts, step
 
 
 def batch_of(points: Points, survey: Survey, original: Cameras | None) -> Batch:
@@ -194,10 +179,10 @@ def correct_chunk(
 
     `covariances` are of all coordinates; files hold the standard error of Z only.
     """
-    points, views, counts, step = transferred(plan, points, row)
+    points, counts, step = transferred(plan, points, row)
     batch = batch_of(points, plan.survey, plan.original)
-    if views is not None:
-        batch = replace(batch, views=replace(views, kind=plan.kind or views.kind))
+    if points.views is not None and plan.kind is not None:
+        batch = replace(batch, views=replace(points.views, kind=plan.kind))
     xyz, above = points.xyz, batch.surface
     submerged, labels = plan.labelling.submerged(xyz, above, points.classes)
     if plan.inputs.port is not None:

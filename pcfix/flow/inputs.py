@@ -16,14 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import (
-    GeometryError,
-    InputError,
-    NoTiePointsError,
-    PcfixError,
-    PcfixWarning,
-    SettingError,
-)
+from pcfix.errors import GeometryError, InputError, NoTiePointsError, PcfixWarning, SettingError
 from pcfix.flow.surfaces import CloudView, find_surface
 from pcfix.io.cameras import read_cameras, read_tie_points, takes_sensor
 from pcfix.io.labels import match_labels
@@ -44,8 +37,6 @@ if TYPE_CHECKING:
     from pcfix.io.views import ViewList
 
 LOCAL = "local"
-TIMED = (".json", ".geojson")
-"""Camera files that may hold the time of each image."""
 
 
 class Inputs(MaskOption, InputOptions):
@@ -97,20 +88,6 @@ class Inputs(MaskOption, InputOptions):
         offset, notes = level_offsets(read_tide(self.tide), times, cameras.labels)
         _warn(notes)
         return offset
-
-    def dates(self, cameras: Cameras) -> str:
-        """Return the first and last day of the images; empty if unknown."""
-        from pcfix.io.tides import read_image_times
-
-        given = self.image_times or self.adjusted_from or self.cameras
-        if self.image_times is None and Path(str(given)).suffix.lower() not in TIMED:
-            return ""
-        try:
-            days = read_image_times(given, cameras.labels).time_s.astype("datetime64[s]")
-        except PcfixError:  # only the report shows them
-            return ""
-        first, last = (str(day.astype("datetime64[D]")) for day in (days.min(), days.max()))
-        return first if first == last else f"{first} to {last}"
 
     def read(self) -> Cameras:
         """Return the cameras in the frame of their file."""

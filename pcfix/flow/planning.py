@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.errors import PcfixWarning, SettingError, coded
-from pcfix.flow.correction import Plan, batch_of, kind_of, transferred
+from pcfix.flow.correction import Plan, batch_of, transferred
 from pcfix.flow.inputs import (
     CameraInputs,
     Inputs,
@@ -57,7 +57,6 @@ from pcfix.water.index import with_index
 from pcfix.water.surface import FoundSurface, is_submerged, surface_above
 
 if TYPE_CHECKING:
-    from pcfix.io.views import ViewMatch
     from pcfix.label.labelling import Labelling
     from pcfix.refract.occlusion import Occluder
     from pcfix.refract.regression import DepthRegression
@@ -81,20 +80,22 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
         _check_port(options)
     elif not options.cameras:
         options.check_no_cameras()
-    blocks, match = read_blocks(inputs, view.crs), None
+    blocks, match, listed = read_blocks(inputs, view.crs), None, None
     if blocks.views is not None:
         from pcfix.io.views import ViewMatch
 
         match = ViewMatch(blocks.views, blocks.listed, points=view.points, step_m=view.step_m)
+        listed = blocks.views.listed
     if inputs.port is not None:
-        cameras, settings = blocks.cameras, options
+        cameras, method = blocks.cameras, options.method
         require_orientation(cameras, "A port")
-        if options.method == "auto":
-            settings = replace(options, method="consistent")
-        survey, port = Survey(WaterPlane(np.inf), cameras, settings), {"port": asdict(inputs.port)}
-        found = FoundSurface(survey.water)
-        return Plan(options, inputs, view, survey, found, labelling_of(options, view), match,
-                    kind_of(match), settings=port)  # fmt: skip
+        how = replace(options, method="consistent" if method == "auto" else method)
+        survey = Survey(WaterPlane(np.inf), cameras, how)
+        return Plan(
+            options, inputs, view, survey, FoundSurface(survey.water), labelling_of(options, view),
+            match, None if listed is None else listed.kind, input_notes=cameras.notes,
+            settings={"port": asdict(inputs.port)},
+        )  # fmt: skip
     if options.shoreline is not None:
         from pcfix.flow.shore import check_shoreline
 
@@ -102,43 +103,49 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
         check_shoreline(options.shoreline, overwrite=options.overwrite, inputs=reads)
     found = inputs.surface(view)
     offset = inputs.level_offset_m(blocks.cameras)
-    plan = plan_of(options, inputs, view, blocks, found, match, offset)
+    plan = plan_of(
+        options, inputs, view, blocks, found, offset, listed, labelling_of(options, view)
+    )
     check_tilt(found.surface)
     method = plan.survey.settings.method
     if method == "regression":
         from pcfix.flow.check_depths import check_regression
 
         check_regression(inputs)
+    settings, notes, members = plan.settings, [*blocks.cameras.notes, *plan.input_notes], None
     if inputs.regression is not None:
-        plan = replace(plan, settings={"regression": str(inputs.regression), **plan.settings})
+        settings = {"regression": str(inputs.regression), **settings}
     if options.dimensions == "all" and method != "regression" and len(blocks.cameras):
         from pcfix.flow.pose_errors import members_of
 
         members, no_poses = members_of(inputs.cameras, blocks.cameras)
-        plan = replace(plan, members=members, no_poses=no_poses)
-    return plan
+        notes += coded("cameras.poses", filter(None, [no_poses]))
+    return replace(plan, match=match, settings=settings, members=members, input_notes=tuple(notes))
 
 
 def plan_of(
     options: CorrectOptions, inputs: Inputs, view: CloudView, blocks: CameraInputs,
-    found: FoundSurface, views: ViewMatch | Views | None, offset: FloatArray | None,
-    labelling: Labelling | None = None, line: DepthRegression | None = None,
+    found: FoundSurface, offset: FloatArray | None, listed: Views | None, labelling: Labelling,
+    line: DepthRegression | None = None,
 ) -> Plan:  # fmt: skip
     """Return the plan of a correction through a water surface, with nothing estimated yet.
 
-    `offset`, shape (k,), is how much higher the water stood when each image was taken, and `line`
-    that of a regression if it is known.
+    `offset`, shape (k,), is how much higher the water stood when each image was taken, `listed` are
+    the view lists, and `line` is that of a regression if it is known.
     """
-    cameras, kind = blocks.cameras, kind_of(views)
+    cameras, kind, some_unlisted = blocks.cameras, None, False
+    if listed is not None:
+        kind, start = listed.kind, listed.start
+        some_unlisted = len(start) <= view.points or not bool((np.diff(start) > 0).all())
     check_above_water(cameras, found.surface, offset)
     folder = options.water_per_image
     settings = resolved(options, cameras, kind, own_water=folder is not None)
     own, notes = own_water_of(folder, cameras, found.surface, view, offset)
     survey = Survey(found.surface, cameras, settings, offset, Learned(line), own_water=own)
     return Plan(
-        options, inputs, view, survey, found, labelling or labelling_of(options, view), views, kind,
-        blocks.transfer, own_notes=notes,
+        options, inputs, view, survey, found, labelling, None, kind, some_unlisted, blocks.transfer,
         settings={} if folder is None else {"water_per_image": str(folder)},
+        input_notes=(*coded("water.surface", found.notes), *coded("water.images", notes)),
     )  # fmt: skip
 
 
@@ -167,14 +174,13 @@ def plan_correction(plan: Plan) -> Plan:
     """
     if plan.inputs.port is not None:
         return plan
-    inputs, view, transfer, match = plan.inputs, plan.view, plan.transfer, plan.match
+    inputs, view, transfer = plan.inputs, plan.view, plan.transfer
     water, first = plan.found.surface, None
-    if plan.views is not None or transfer is not None:
+    if plan.kind is not None or transfer is not None:
         # the first points show whether the list is in the order of the cloud, or has coordinates
         first = sample_of(view, np.arange(min(CHUNK_POINTS, view.points)), water)
-        if match is not None:
-            match = match.settled(first.xyz)
-            plan = replace(plan, views=match)
+        if plan.match is not None:
+            plan = replace(plan, match=plan.match.settled(first.xyz))
         if transfer is not None:
             transfer.check_models(first.xyz)
     chunks = partial(_whole_cloud, plan)
@@ -198,10 +204,10 @@ def plan_correction(plan: Plan) -> Plan:
         from pcfix.flow.pose_errors import SAMPLE_POINTS, pose_errors, with_poses
 
         rows = np.arange(0, view.points, 1 + view.points // SAMPLE_POINTS)
-        sample = sample_of(view, rows, water, match)
+        sample = sample_of(view, rows, water, plan.match)
         errors = pose_errors(sample, plan.survey, plan.members, transfer)
         plan = replace(plan, survey=with_poses(plan.survey, errors))
-    return plan if first is None or plan.views is None else _with_type_of_list(plan, first)
+    return plan if first is None or plan.kind is None else _with_type_of_list(plan, first)
 
 
 def _whole_cloud(plan: Plan) -> Iterator[Points]:
@@ -214,8 +220,8 @@ def _whole_cloud(plan: Plan) -> Iterator[Points]:
 
 def _with_type_of_list(plan: Plan, first: Points) -> Plan:
     """Return the plan with the type of its view list, as the first points show it."""
-    points, views, *_ = transferred(plan, first, 0)
-    batch = replace(batch_of(points, plan.survey, plan.original), views=views)
+    points = transferred(plan, first, 0)[0]
+    batch = replace(batch_of(points, plan.survey, plan.original), views=points.views)
     is_open = plan.inputs.views_are == "auto" and plan.kind == "depth-maps"
     verdict = weigh_lists(submerged_of(batch), is_open=is_open and plan.match is not None)
     if verdict is None:
@@ -226,16 +232,14 @@ def _with_type_of_list(plan: Plan, first: Points) -> Plan:
 
 def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
     """Resolve every option that is ``auto``, and estimate what the points have in common."""
-    survey, view, views = plan.survey, plan.view, plan.views
+    survey, view, some_unlisted = plan.survey, plan.view, plan.some_unlisted
     given = survey.settings if survey.own_water is not None else plan.options
-    some_listed = False
-    if views is not None:
-        start = views.start if isinstance(views, Views) else views.view_list.listed.start
-        some_listed = len(start) <= view.points or not bool((np.diff(start) > 0).all())
     # listed cameras saw their points, so that nothing hides them
-    may_hide = views is None or survey.settings.occlusion != "auto"
-    wants = some_listed or wants_sample(survey, plan.kind)
-    sample, near, occluder = _scanned(plan, chunks, sample=wants, occluder=may_hide or some_listed)
+    may_hide = plan.kind is None or survey.settings.occlusion != "auto"
+    sample, near, occluder = _scanned(
+        plan, chunks, sample=some_unlisted or wants_sample(survey, plan.kind),
+        occluder=may_hide or some_unlisted,
+    )  # fmt: skip
     if may_hide:
         survey = replace(survey, learned=survey.learned._replace(occluder=occluder))
     plan = replace(plan, survey=survey)
@@ -255,12 +259,12 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
         )
         notes.append(PcfixWarning("cloud.corrected_before", sentence, ratio=ratio))
     hint = hint_of((plan.options.software or view.software,))
-    if views is None:
+    if plan.kind is None:
         survey, verdicts = learn_of_sample(sample, view.points, ties, hint, near)
         notes += _note_flat(sample, survey)
         return replace(plan, survey=survey, verdicts=verdicts, notes=tuple(notes))
     survey, of_unlisted = with_matcher(sample, ties), plan.of_unlisted
-    if some_listed:
+    if some_unlisted:
         learned = plan.survey.learned._replace(occluder=occluder)
         settings = resolved(given, plan.cameras, None)
         bare = replace(survey, settings=settings, learned=learned)
@@ -321,7 +325,7 @@ def _scanned(
         squares = Squares(PATCH_WIDTH * (float(np.median(above)) if len(above) else HEIGHT_M))
 
     def every(step: int, row: int, points: Points) -> Batch:
-        some = points.take(slice(-row % step, None, step))
+        some = points._replace(views=None).take(slice(-row % step, None, step))
         noise = np.isin(some.classes, NOISE_CLASSES)
         if noise.any():
             some = some.take(np.flatnonzero(~noise))

@@ -52,14 +52,11 @@ class Plausible(NamedTuple):
     fits: tuple[str, ...] = ()  # tests that were passed
     doubts: tuple[PcfixWarning, ...] = ()  # tests that were not
     unchecked: tuple[str, ...] = ()  # what could not be tested
-    noted: bool = False  # whether the discontinuities of the cloud raised doubts too
 
     def __str__(self) -> str:
         """Return a line that claims no more than was tested."""
-        if self.doubts or self.noted:
-            found = "in doubt, see the warnings" if self.doubts else "in doubt, see the notes"
-        else:
-            found = "cameras and cloud fit" if self.fits else "nothing was tested"
+        found = "cameras and cloud fit" if self.fits else "nothing was tested"
+        found = "in doubt, see the warnings" if self.doubts else found
         found += f"; tested: {', '.join(self.fits)}" if self.fits else ""
         return found + (f"; not checked: {', '.join(self.unchecked)}" if self.unchecked else "")
 

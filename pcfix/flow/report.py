@@ -76,7 +76,7 @@ def report_run(
         pictures.append(found_picture(run.inputs.surface(view_of(request.source))))
     results = RunResults(
         summary, run.cameras, **read_cloud(run.cleaned_cloud, run.resolution_m),
-        project=request.project or "", date=request.date or run.inputs.dates(run.cameras),
+        project=request.project or "", date=request.date or "",
         pictures=pictures, tables=tables, verdict=verdict, compared=compared.get("figures", {}),
         difference=dod,
     )  # fmt: skip

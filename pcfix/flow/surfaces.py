@@ -115,7 +115,10 @@ def file_points(
 
 
 def joined_points(parts: Iterable[Points]) -> Points:
-    """Return consecutive points as one, with what all of them have, but no weights of views."""
+    """Return consecutive points as one, with what all of them have; several without weights."""
+    parts = list(parts)
+    if len(parts) == 1:
+        return parts[0]
     *columns, views = [
         None if any(v is None for v in one) else one for one in zip(*parts, strict=True)
     ]
