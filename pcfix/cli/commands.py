@@ -86,7 +86,7 @@ def adjust(
 ) -> None:
     """Refine camera poses and lens by a refractive bundle adjustment."""
     from pcfix.adjust.result import adjustment_dict, before_of
-    from pcfix.flow.next_steps import correct_words
+    from pcfix.flow.adjust import correct_words
     from pcfix.report.adjustment import adjustment_text
     from pcfix.running import threads
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,8 +31,8 @@ from pcfix.adjust.methods import (
 )
 from pcfix.adjust.result import Adjusted
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError, bad_file
+from pcfix.flow.diagnosis import flags_of, water_word
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
-from pcfix.flow.next_steps import WATER as WATER_FILE
 from pcfix.flow.runner import check_folder
 from pcfix.flow.surfaces import sample_of, view_of
 from pcfix.io.atomic import temporary_folder
@@ -59,13 +60,19 @@ from pcfix.model import (
 )
 from pcfix.options.declare import File, taken
 from pcfix.options.survey import WATER_UNKNOWNS, AdjustOptions
-from pcfix.port.shapes import FlatPort, Port
+from pcfix.port.shapes import FlatPort, Port, spec_of
 from pcfix.water.index import index_of
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
 SUMMARY = "adjustment.json"
+FOLDER = "adjusted"
+"""The folder of an adjustment in that of a run."""
+MODELS = ("colmap", "opensfm/reconstruction.json", "cameras.csv")
+"""The models that an adjustment writes, the preferred one first."""
+WATER_FILE = "water.tif"
+"""The water of an adjustment, where it is not a plane and was adjusted."""
 
 CLOUD_POINTS = 6000
 """Points of the cloud that stand for tie points."""
@@ -102,10 +109,6 @@ def adjust_cameras(
         lens_unknowns are given) and others.
     progress : callable, optional
         Called with the `LogRow` of each step.
-
-    Returns
-    -------
-    Adjusted
 
     Raises
     ------
@@ -322,3 +325,28 @@ def _write_models(folder: Path, found: Adjusted) -> None:
         raise InputError(
             "output.format", "No camera format can hold these lenses: " + " ".join(failed)
         )
+
+
+def correct_words(found: Adjusted, model: File, out_dir: File, options: AdjustOptions) -> str:
+    """Return the command that transfers the cloud to the adjusted poses, and corrects it."""
+    out = Path(out_dir)
+    cameras = next((one for one in MODELS if (out / one).exists()), MODELS[0])
+    head = ["pcfix", "correct", str(options.cloud or "CLOUD.laz"), "corrected.laz"]
+    words = [*head, "--cameras", str(out / cameras)]
+    if options.port is not None:  # before a port no cloud is transferred: it is reconstructed
+        moved = found.port if {"distance", "centre"} & set(options.free) else None
+        words[2] = "CLOUD.laz"
+        return shlex.join([*words, "--port", spec_of(moved) if moved else str(options.port)])
+    water = water_word(options.water)
+    if isinstance(found.water, WaterPlane) or (out / WATER_FILE).exists():
+        water, plane = str(out / WATER_FILE), found.water
+        if isinstance(plane, WaterPlane):
+            water = f"plane:{plane.a:.15g},{plane.b:.15g},{plane.c:.15g}"
+            water = f"{plane.a:.3f}" if plane.b == plane.c == 0.0 else water
+        options = replace(options, water_model="auto", water_crs=None)
+    words += ["--adjusted-from", str(model), "--water", water]
+    if "index" in options.free or options.sigma_index is not None:
+        words += ["--index", f"{found.refractive_index:.6g}"]
+    elif options.index is not None:
+        words += ["--index", f"{options.index}"]
+    return shlex.join([*words, *flags_of(options)])

@@ -9,9 +9,8 @@ import numpy as np
 
 from pcfix.adjust.diagnosis import EXPORT, Diagnosis
 from pcfix.errors import InputError, SettingError, plain, shown_once
-from pcfix.flow.diagnosis import diagnose_inputs, has_datum, quick_ties
+from pcfix.flow.diagnosis import adjust_words, diagnose_inputs, has_datum, quick_ties
 from pcfix.flow.inputs import Inputs, paths_in
-from pcfix.flow.next_steps import adjust_words
 from pcfix.flow.plausibility import plausible
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import CloudView, sample_of, view_of
@@ -51,8 +50,8 @@ def check_cameras(
     ----------
     path : path
         See `pcfix.read_cameras`.
-    options : CamerasCheckOptions, optional
-        Or its attributes as keywords. With a cloud and water it is tested whether the poses have
+    options
+        See `pcfix.correct_file`. With a cloud and water it is tested whether the poses have
         absorbed refraction, see `pcfix.adjust.diagnosis`.
     """
     given = taken(CamerasCheckOptions, options, keywords, "check_cameras")

@@ -52,19 +52,8 @@ def clean_file(
         The names end in ``.las`` or ``.laz``; the output is LAS 1.4, see `correct_file`. The
         search needs 90 bytes per point of disk beside the output. Or many files and a folder, see
         `pcfix.correct_file`: neighbours are those of the whole cloud.
-    options : CleanOptions, optional
-        Or its attributes as keywords: the options of ``pcfix clean``.
-    progress : callable, optional
-        Called with (points done, all points), over all passes.
-
-    Returns
-    -------
-    Figures
-
-    Raises
-    ------
-    PcfixError
-        If a file, an option or the cloud cannot be used; no output is left behind.
+    options, progress
+        See `pcfix.correct_file`.
     """
     given = taken(CleanOptions, options, keywords, "clean_file")
     last = None

@@ -69,11 +69,6 @@ def label_points(
     -------
     array of uint8, shape (n,)
 
-    Raises
-    ------
-    PcfixError
-        If an argument breaks its rule, or the mask cannot be used.
-
     Examples
     --------
     >>> from pcfix.flow.label import label_points
@@ -116,20 +111,9 @@ def label_file(
     input, output : path
         The names end in ``.las`` or ``.laz``; the output is LAS 1.4. Or many files and a folder,
         see `pcfix.correct_file`.
-    options : LabelOptions, optional
-        Or its attributes as keywords: the options of ``pcfix label``. With a dead band or
-        connectivity the cloud is read twice. A point on the border of the mask is inside.
-    progress : callable, optional
-        See `pcfix.correct_file`.
-
-    Returns
-    -------
-    Figures
-
-    Raises
-    ------
-    PcfixError
-        If a file, an option or the water cannot be used; no output is left behind.
+    options, progress
+        See `pcfix.correct_file`. With a dead band or connectivity the cloud is read twice. A point
+        on the border of the mask is inside.
     """
     given = taken(LabelOptions, options, keywords, "label_file")
     return run_command(

@@ -69,17 +69,11 @@ def rebuild_rounds(
         Folder, created if needed. Each round writes ``images``, ``cloud.laz``, ``dsm.tif`` and
         ``difference.tif`` (from the DSM before) in a folder ``round1``, ``round2`` ... Rounds that
         an equal call has finished are skipped.
-    options : PhotosOptions, optional
-        Or its attributes as keywords, rebuild among them.
-    progress : callable, optional
-        Called with (photographs or pairs done, those in all).
+    options, progress
+        See `pcfix.correct_file`; progress is in photographs or pairs. After an error finished
+        rounds stay.
     say : callable, optional
         Called with a line for each round.
-
-    Raises
-    ------
-    PcfixError
-        Finished rounds stay.
     """
     started = time.perf_counter()
     given = taken(PhotosOptions, options, keywords, "rebuild_rounds")

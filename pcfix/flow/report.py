@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import bad_file
-from pcfix.flow.adjust import SUMMARY
-from pcfix.flow.next_steps import FOLDER
+from pcfix.flow.adjust import FOLDER, SUMMARY
 from pcfix.flow.request import RunFolder
 from pcfix.flow.surfaces import view_of
 from pcfix.flow.water import found_picture

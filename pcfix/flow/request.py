@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from pcfix.errors import InputError, PcfixWarning, SettingError, bad_file
+from pcfix.flow.adjust import FOLDER
 from pcfix.flow.inputs import Inputs, paths_in, read_blocks
-from pcfix.flow.next_steps import FOLDER
 from pcfix.flow.runner import HOW, json_text
 from pcfix.flow.surfaces import view_of
 from pcfix.io.clouds import is_cloud, own_water, reference_of

@@ -34,9 +34,7 @@ def restore_file(
         output; see `pcfix.correct_file`.
     output : path
         The cloud as it was: coordinates, classes, flags, point format, version.
-    options : TileOptions, optional
-        Or its attributes as keywords: overwrite, jobs, scheduler.
-    progress : callable, optional
+    options, progress
         See `pcfix.correct_file`.
 
     Returns

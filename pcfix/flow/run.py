@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from pcfix.adjust.diagnosis import MOST_STATED_M
 from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.errors import PcfixError, PcfixWarning, SettingError, bad_file, plain
-from pcfix.flow.adjust import SUMMARY, adjust_into
+from pcfix.flow.adjust import FOLDER, MODELS, SUMMARY, adjust_into
 from pcfix.flow.clean import clean_file
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.correct import correct_file
@@ -34,12 +34,10 @@ from pcfix.flow.maps import (
     write_map,
     write_rasters,
 )
-from pcfix.flow.next_steps import FOLDER, MODELS
 from pcfix.flow.report import PAGE, report_run
 from pcfix.flow.request import SURFACE, Record, Request, RunFolder, read_record
 from pcfix.flow.runner import Bar, Progress, check_folder, no_bar
-from pcfix.flow.shore import check_shoreline
-from pcfix.flow.surfaces import view_of
+from pcfix.flow.surfaces import check_shoreline, view_of
 from pcfix.io import rasters, vectors
 from pcfix.io.clouds import is_cloud
 from pcfix.io.files import read_json
@@ -95,22 +93,17 @@ def run(
     out_dir : path
         Folder for all results, made where its parent exists. Called again with the same options it
         resumes, and a finished run is opened at once.
-    options : RunOptions, optional
-        Or its attributes as keywords, as of ``pcfix run``: cameras, water, reference, resolution,
-        overwrite and so on. Cameras and water are files or text, as ``run.json`` keeps them.
+    options
+        See `pcfix.correct_file`. Cameras and water are files or text, as ``run.json`` keeps them.
     say : callable, optional
         Called with a line on each step, as ``print``.
     bar : callable, optional
         Shows the progress of a step; see `pcfix.flow.runner.Bar`.
 
-    Returns
-    -------
-    RunResults
-
     Raises
     ------
     PcfixError
-        With one sentence on what to do; the steps before it stay done.
+        The steps before it stay done.
 
     Examples
     --------
@@ -470,19 +463,8 @@ class RunResults:
 def open_run(folder: File) -> RunResults:
     """Open the results of a finished run.
 
-    Parameters
-    ----------
-    folder : path
-        The OUT_DIR of ``pcfix run``.
-
-    Returns
-    -------
-    RunResults
-
-    Raises
-    ------
-    InputError
-        If the folder holds no run, or an unfinished one.
+    The folder is the OUT_DIR of ``pcfix run``. An `InputError` if it holds no run, or an unfinished
+    one.
     """
     found = RunResults(Path(folder))
     _ = found.summary

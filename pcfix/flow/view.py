@@ -91,8 +91,8 @@ def view_clouds(
     ----------
     clouds : sequence of path
         LAS or LAZ, in one CRS.
-    options : ViewerOptions, optional
-        Or its attributes as keywords: colour, reference, cameras, water, image and others.
+    options
+        See `pcfix.correct_file`.
 
     Returns
     -------
