@@ -8,7 +8,7 @@ a water surface: all points are below it, whatever their height, and have no dep
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, field, fields, replace
+from dataclasses import asdict, astuple, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -63,7 +63,6 @@ class Plan:
     some_unlisted: bool = False  # whether points have no images in it
     transfer: CloudTransfer | None = None  # from the original to the adjusted cameras
     members: Members | None = None  # of an adjustment, for the errors of the poses
-    settings: dict[str, Any] = field(default_factory=dict)  # more settings for the summary
     verdicts: tuple[Verdict, ...] = ()  # on the reconstruction type
     of_unlisted: tuple[Verdict, ...] = ()  # the same for points in no view list
     input_notes: tuple[PcfixWarning, ...] = ()  # what was noted on reading the inputs
@@ -83,6 +82,20 @@ class Plan:
     def regression(self) -> DepthRegression | None:
         """The line of the method regression."""
         return self.survey.learned.regression
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the summary and the output file say of the settings besides the options."""
+        options, port = self.options, self.inputs.port
+        files = {name: getattr(options, name) for name in ("regression", "water_per_image")}
+        more: dict[str, Any] = {name: str(one) for name, one in files.items() if one is not None}
+        if port is not None:
+            return {"port": asdict(port)}
+        if options.depth_factor == "auto":
+            more["depth_factor"] = self.survey.settings.depth_factor
+        if options.max_angle == "auto":
+            more["max_angle"] = self.survey.limit_deg
+        return more
 
     @property
     def made(self) -> dict[str, Any] | None:

@@ -6,10 +6,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from itertools import compress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -101,7 +101,6 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
         return Plan(
             options, inputs, view, survey, FoundSurface(survey.water), labelling_of(options, view),
             match, None if listed is None else listed.kind, input_notes=cameras.notes,
-            settings={"port": asdict(inputs.port)},
         )  # fmt: skip
     check_shoreline(options.shoreline, overwrite=options.overwrite, inputs=paths_in(options))
     found = inputs.surface(view)
@@ -115,15 +114,13 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
         from pcfix.flow.check_depths import check_regression
 
         check_regression(inputs)
-    settings, notes, members = plan.settings, [*blocks.cameras.notes, *plan.input_notes], None
-    if inputs.regression is not None:
-        settings = {"regression": str(inputs.regression), **settings}
+    notes, members = [*blocks.cameras.notes, *plan.input_notes], None
     if options.dimensions == "all" and method != "regression" and len(blocks.cameras):
         from pcfix.flow.pose_errors import members_of
 
         members, no_poses = members_of(inputs.cameras, blocks.cameras)
         notes += coded("cameras.poses", filter(None, [no_poses]))
-    return replace(plan, match=match, settings=settings, members=members, input_notes=tuple(notes))
+    return replace(plan, match=match, members=members, input_notes=tuple(notes))
 
 
 def plan_of(
@@ -147,7 +144,6 @@ def plan_of(
     survey = Survey(found.surface, cameras, settings, offset, Learned(line), own_water=own)
     return Plan(
         options, inputs, view, survey, found, labelling, None, kind, some_unlisted, blocks.transfer,
-        settings={} if folder is None else {"water_per_image": str(folder)},
         input_notes=(*coded("water.surface", found.notes), *coded("water.images", notes)),
     )  # fmt: skip
 
@@ -196,13 +192,6 @@ def plan_correction(plan: Plan) -> Plan:
         survey = replace(plan.survey, learned=plan.survey.learned._replace(regression=line))
         plan = replace(plan, survey=survey, notes=tuple(coded("regression.fit", notes)))
     plan = _estimated_from_cloud(plan, chunks)
-    options, survey = plan.options, plan.survey
-    found = dict[str, Any]()
-    if options.depth_factor == "auto":
-        found["depth_factor"] = survey.settings.depth_factor
-    if options.max_angle == "auto":
-        found["max_angle"] = survey.limit_deg
-    plan = replace(plan, settings={**plan.settings, **found})
     if plan.members is not None:
         from pcfix.flow.pose_errors import SAMPLE_POINTS, pose_errors, with_poses
 

@@ -12,13 +12,13 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from pcfix.errors import InputError, PcfixWarning, SettingError, bad_file
+from pcfix.errors import PcfixWarning, SettingError, bad_file
 from pcfix.flow.adjust import FOLDER
 from pcfix.flow.inputs import Inputs, paths_in, read_blocks
 from pcfix.flow.runner import HOW, json_text
 from pcfix.flow.surfaces import view_of
 from pcfix.io.clouds import is_cloud, own_water, reference_of
-from pcfix.io.files import belonging, file_state, files_in, read_json, write_text
+from pcfix.io.files import belonging, file_state, files_in, read_json, refusing, write_text
 from pcfix.io.rasters import open_raster
 from pcfix.io.tiles import Tiles, cloud_of, inputs_of, open_cloud, tiles_from, tiles_of
 from pcfix.model import Cameras, WaterSurface
@@ -192,17 +192,13 @@ class Record:
 
 def read_record(path: Path) -> dict[str, Any]:
     """Return the content of a record."""
-    try:
+    with refusing(path, "run.record", _NO_RECORD):
         content: dict[str, Any] = read_json(path)
         _ = content["request"], content["inputs"], content["steps"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise _bad_record(path, error) from error
     return content
 
 
-def _bad_record(path: Path, error: Exception) -> InputError:
-    sentence = f"is not the record of a run ({error}). Give the run.json of an earlier run, or"
-    return bad_file(path, "run.record", f"{sentence} remove it.")
+_NO_RECORD = "is not the record of a run ({}). Give the run.json of an earlier run, or remove it."
 
 
 def request_of(record: Path) -> Request:
@@ -215,7 +211,7 @@ def request_of(record: Path) -> Request:
         values = named(asked, options_of(RunOptions), str(record))
         return Request(input=tuple(input) if isinstance(input, list) else input, **values)
     except (SettingError, TypeError) as error:
-        raise _bad_record(record, error) from error
+        raise bad_file(record, "run.record", _NO_RECORD.replace("{}", str(error))) from error
 
 
 class RunFolder:

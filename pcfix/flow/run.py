@@ -69,11 +69,6 @@ COLMAP = ("cameras.bin", "images.bin", "points3D.bin", "georeference.json")
 ADJUSTED = ("report.html", SUMMARY, MEMBERS, *(f"colmap/{name}" for name in COLMAP), *MODELS[1:])
 """The files that an adjustment may leave, its report first."""
 
-_WHY = {
-    UNCERTAINTY: "the points have no standard errors",
-    "map.gpkg": "lines need pyogrio; run: pip install 'pcfix[analysis]', then run again",
-}
-
 
 def run(
     input: File | Iterable[File],
@@ -112,19 +107,17 @@ def run(
     >>> float(result.depth.max())  # doctest: +SKIP
     12.25
     """
-    given, values = taken(RunOptions, options, keywords, "run"), {}
-    for one in options_of(RunOptions):
-        value = getattr(given, one.name)
-        if one.type is Any and value is not None:
-            if not isinstance(value, str | os.PathLike | Real):
-                raise SettingError(
-                    "option.type",
-                    f"run: {one.name} is a {type(value).__name__}. Give a file or text, which"
-                    " run.json can keep, or use correct_file.",
-                    option=one.name,
-                )
-            value = str(value)
-        values[one.name] = value
+    given = taken(RunOptions, options, keywords, "run")
+    values = {one.name: getattr(given, one.name) for one in options_of(RunOptions)}
+    for name in ("cameras", "water", "adjusted_from", "gcps"):
+        if not isinstance(values[name], str | os.PathLike | Real | None):
+            raise SettingError(
+                "option.type",
+                f"run: {name} is a {type(values[name]).__name__}. Give a file or text, which"
+                " run.json can keep, or use correct_file.",
+                option=name,
+            )
+        values[name] = None if values[name] is None else str(values[name])
     cloud = str(input) if isinstance(input, str | os.PathLike) else tuple(map(str, input))
     run_all(Request(input=cloud, **values), Path(out_dir), say=say, bar=bar)
     return RunResults(Path(out_dir))
@@ -455,8 +448,7 @@ class RunResults:
     def _file(self, name: str) -> Path:
         path = self.folder / name
         if not path.is_file():
-            why = f": {_WHY[name]}" if name in _WHY else ""
-            raise bad_file(path, "run.no_file", f"the run has not written it{why}.")
+            raise bad_file(path, "run.no_file", "the run has not written it.")
         return path
 
 
