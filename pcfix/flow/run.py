@@ -24,18 +24,19 @@ from pcfix.flow.correct import correct_file
 from pcfix.flow.diagnosis import diagnose_inputs, has_datum
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.maps import (
+from pcfix.flow.request import SURFACE, Record, Request, RunFolder, read_record
+from pcfix.flow.results import (
     BED,
     DEPTH,
+    PAGE,
     SECTIONS,
     UNCERTAINTY,
     contours_layer,
     raster_files,
+    report_run,
     write_map,
     write_rasters,
 )
-from pcfix.flow.report import PAGE, report_run
-from pcfix.flow.request import SURFACE, Record, Request, RunFolder, read_record
 from pcfix.flow.runner import Bar, Progress, check_folder, no_bar
 from pcfix.flow.surfaces import check_shoreline, view_of
 from pcfix.io import rasters, vectors
