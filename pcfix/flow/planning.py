@@ -34,6 +34,7 @@ from pcfix.flow.surfaces import (
 from pcfix.io.las.source import CHUNK_POINTS
 from pcfix.model import NOISE_CLASSES, FloatArray, Views, WaterPlane
 from pcfix.options.correct import CorrectOptions
+from pcfix.refract import learning
 from pcfix.refract.batch import (
     FLAT_DEG,
     UNLISTED,
@@ -42,19 +43,6 @@ from pcfix.refract.batch import (
     Survey,
     require_orientation,
     stacked,
-)
-from pcfix.refract.learning import (
-    CORRECTED_RATIO,
-    Near,
-    depth_ratio,
-    learn_of_sample,
-    resolved,
-    submerged_of,
-    wants_sample,
-    weigh_lists,
-    with_factor,
-    with_matcher,
-    with_verdict,
 )
 from pcfix.refract.methods import with_rays
 from pcfix.refract.patches import PATCH_WIDTH, Squares
@@ -139,7 +127,7 @@ def plan_of(
         some_unlisted = len(start) <= view.points or not bool((np.diff(start) > 0).all())
     check_above_water(cameras, found.surface, offset)
     folder = options.water_per_image
-    settings = resolved(options, cameras, kind, own_water=folder is not None)
+    settings = learning.resolved(options, cameras, kind, own_water=folder is not None)
     own, notes = own_water_of(folder, cameras, found.surface, view, offset)
     survey = Survey(found.surface, cameras, settings, offset, Learned(line), own_water=own)
     return Plan(
@@ -215,11 +203,12 @@ def _with_type_of_list(plan: Plan, first: Points) -> Plan:
     points = transferred(plan, first, 0)[0]
     batch = replace(batch_of(points, plan.survey, plan.original), views=points.views)
     is_open = plan.inputs.views_are == "auto" and plan.kind == "depth-maps"
-    verdict = weigh_lists(submerged_of(batch), is_open=is_open and plan.match is not None)
+    is_open = is_open and plan.match is not None
+    verdict = learning.weigh_lists(learning.submerged_of(batch), is_open=is_open)
     if verdict is None:
         return plan
-    kind = verdict.chosen.kind or plan.kind
-    return replace(plan, survey=with_verdict(plan.survey, verdict), kind=kind, verdicts=(verdict,))
+    survey, kind = learning.with_verdict(plan.survey, verdict), verdict.chosen.kind or plan.kind
+    return replace(plan, survey=survey, kind=kind, verdicts=(verdict,))
 
 
 def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
@@ -229,7 +218,7 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
     # listed cameras saw their points, so that nothing hides them
     may_hide = plan.kind is None or survey.settings.occlusion != "auto"
     sample, near, occluder = _scanned(
-        plan, chunks, sample=some_unlisted or wants_sample(survey, plan.kind),
+        plan, chunks, sample=some_unlisted or learning.wants_sample(survey, plan.kind),
         occluder=may_hide or some_unlisted,
     )  # fmt: skip
     if may_hide:
@@ -239,12 +228,12 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
         return plan
     sample = replace(sample, survey=survey)
     ties = original_ties(plan.inputs, plan.transfer, view.crs)
-    sample, factor = with_factor(sample)
+    sample, factor = learning.with_factor(sample)
     notes = [*plan.notes, *coded("cloud.depth_factor", [] if factor is None else [factor])]
     if factor is not None:
         survey, given = sample.survey, replace(given, depth_factor=factor.factor)
-    ratio = None if ties is None else depth_ratio(submerged_of(sample), ties)
-    if ratio is not None and ratio > CORRECTED_RATIO:
+    ratio = None if ties is None else learning.depth_ratio(learning.submerged_of(sample), ties)
+    if ratio is not None and ratio > learning.CORRECTED_RATIO:
         sentence = (
             f"The cloud is {ratio:.2f} times as deep as the tie points of its cameras, as if it"
             " had been corrected before. Give the cloud as the matcher wrote it."
@@ -252,15 +241,15 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
         notes.append(PcfixWarning("cloud.corrected_before", sentence, ratio=ratio))
     hint = hint_of((plan.options.software or view.software,))
     if plan.kind is None:
-        survey, verdicts = learn_of_sample(sample, view.points, ties, hint, near)
+        survey, verdicts = learning.learn_of_sample(sample, view.points, ties, hint, near)
         notes += _note_flat(sample, survey)
         return replace(plan, survey=survey, verdicts=verdicts, notes=tuple(notes))
-    survey, of_unlisted = with_matcher(sample, ties), plan.of_unlisted
+    survey, of_unlisted = learning.with_matcher(sample, ties), plan.of_unlisted
     if some_unlisted:
         learned = plan.survey.learned._replace(occluder=occluder)
-        settings = resolved(given, plan.cameras, None)
+        settings = learning.resolved(given, plan.cameras, None)
         bare = replace(survey, settings=settings, learned=learned)
-        unlisted, of_unlisted = learn_of_sample(
+        unlisted, of_unlisted = learning.learn_of_sample(
             replace(sample, survey=bare), view.points, ties, hint, near
         )
         survey = replace(survey, parts={UNLISTED: unlisted})
@@ -287,7 +276,7 @@ def _note_flat(sample: Batch, survey: Survey) -> list[PcfixWarning]:
 
 def _scanned(
     plan: Plan, chunks: Chunks, *, sample: bool, occluder: bool
-) -> tuple[Batch | None, Near | None, Occluder | None]:
+) -> tuple[Batch | None, learning.Near | None, Occluder | None]:
     """Read the whole cloud once, for a sample of it and for the surface that hides points.
 
     The sample is evenly spread over the order of the cloud, without noise. If its points may be too
@@ -330,10 +319,10 @@ def _scanned(
         if sample:
             taken.append(every(step, row, points))
         if squares is not None:
-            squares.add(submerged_of(every(near_step, row, points)))
+            squares.add(learning.submerged_of(every(near_step, row, points)))
         row += len(points.xyz)
     return (
         stacked(taken) if sample else None,
-        None if squares is None else Near(squares.all(), near_step),
+        None if squares is None else learning.Near(squares.all(), near_step),
         None if builder is None else builder.build(),
     )

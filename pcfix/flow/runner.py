@@ -30,18 +30,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar, cast
 
 from pcfix import version
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
+from pcfix.io import files
 from pcfix.io.atomic import all_or_none
-from pcfix.io.files import (
-    belonging,
-    check_input,
-    check_output,
-    file_state,
-    path_of,
-    read_tally,
-    write_bytes,
-    write_tally,
-    write_text,
-)
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix, corrected_identity, las_writer
 from pcfix.io.tiles import Clouds, Tiles, check_one_file, inputs_of, open_cloud, part_of, tiles_of
@@ -123,12 +113,12 @@ class FileTask:
     @property
     def is_finished(self) -> bool:
         """Whether the output exists, with the same key."""
-        return self.target.is_file() and read_tally(self.record)[0] == self.key
+        return self.target.is_file() and files.read_tally(self.record)[0] == self.key
 
     def keep(self, tally: Any) -> None:
         """Write the statistics; an older output must not be taken for the one that follows."""
         self.target.unlink(missing_ok=True)
-        write_tally(self.record, self.key, tally)
+        files.write_tally(self.record, self.key, tally)
 
 
 def run_command(
@@ -172,7 +162,7 @@ def run_command(
             result: Result = stream(work, planned, task, partial(finish, planned, task))
             write_summary(options, result)
         return result
-    folder = path_of(output)
+    folder = files.path_of(output)
     task = FileTask(tiles, folder)
     check_one_file(tiles, options)
     check_folder(folder, tiles.paths)
@@ -208,7 +198,7 @@ def run_command(
                 failed=failed,
             )
         # in the order of the files, so that no sum depends on which was first
-        tallies = [read_tally(one.record)[1] for one in tasks]
+        tallies = [files.read_tally(one.record)[1] for one in tasks]
         tally = reduce(add, tallies) if tallies[0] is not None else None
         # Only the statistics of all points show whether cameras and water fit.
         try:
@@ -288,7 +278,7 @@ def key_of(
         for one in options_of(type(options))
         if one.name not in ignored
     }
-    depends = [version.__version__, name, asked, [file_state(path) for path in inputs]]
+    depends = [version.__version__, name, asked, [files.file_state(path) for path in inputs]]
     return sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
 
 
@@ -296,7 +286,8 @@ def _plain(value: Any) -> Any:
     """Return an option as JSON holds it; of files their size and time."""
     if isinstance(value, str) or hasattr(value, "joinpath"):
         path = Path(str(value).partition(LAYER_MARK)[0])
-        return [file_state(one) for one in belonging(path)] if path.exists() else str(value)
+        found = files.belonging(path) if path.exists() else []
+        return [files.file_state(one) for one in found] or str(value)
     if value is None or isinstance(value, int | float | tuple):
         return value
     return sha256(pickle.dumps(value)).hexdigest()
@@ -430,7 +421,7 @@ def check_summary(options: Any, inputs: Iterable[File] = ()) -> None:
     for name in ("plot", "summary", "save_regression"):
         path = getattr(options, name, None)
         if path is not None:
-            known.append(check_output(path, overwrite=options.overwrite, inputs=known))
+            known.append(files.check_output(path, overwrite=options.overwrite, inputs=known))
 
 
 def write_summary(options: Any, summary: Any, figure: Callable[[], Figure] | None = None) -> None:
@@ -441,16 +432,16 @@ def write_summary(options: Any, summary: Any, figure: Callable[[], Figure] | Non
     if figure is not None and options.plot is not None:
         from pcfix.report.page import png_of
 
-        write_bytes(options.plot, png_of(figure()), overwrite=options.overwrite)
+        files.write_bytes(options.plot, png_of(figure()), overwrite=options.overwrite)
     path = getattr(options, "summary", None)
     if path is not None:
         values = summary if isinstance(summary, dict) else summary.as_dict()
-        write_text(path, json_text(values), overwrite=options.overwrite)
+        files.write_text(path, json_text(values), overwrite=options.overwrite)
 
 
 def check_cloud(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
     """Return the path of a cloud that may be written, by its suffix and `check_output`."""
-    target = check_output(path, overwrite=overwrite, inputs=inputs)
+    target = files.check_output(path, overwrite=overwrite, inputs=inputs)
     check_suffix(target)
     return target
 
@@ -500,7 +491,7 @@ def file_task(
     """
     started = time.perf_counter()
     check_one_file(input, options)
-    source: Any = input if isinstance(input, Tiles) else check_input(input)
+    source: Any = input if isinstance(input, Tiles) else files.check_input(input)
     known = [one for one in (*inputs_of(input), *reads) if isinstance(one, str | PathLike)]
     for path in (output, *more):
         known.append(check(path, overwrite=options.overwrite, inputs=known))
