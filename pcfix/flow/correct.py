@@ -47,7 +47,6 @@ from pcfix.options.correct import (
     ScienceOptions,
 )
 from pcfix.options.declare import File, taken
-from pcfix.refract.batch import UNLISTED
 from pcfix.refract.tally import Tally
 from pcfix.report.summary import Summary
 from pcfix.version import __version__
@@ -175,7 +174,12 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         counts["unsure"] = None
     unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
     not_moved = sum(counts["uncorrected"].values()) + int(figures.outcomes[Outcome.NOT_CARRIED])
-    made, detected = plan.made, _detected(plan, tally)
+    made, detected = plan.made, [*plan.notes]
+    if tally.beyond is not None and line is not None:
+        from pcfix.refract.regression import LEAST_BEYOND
+
+        least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
+        detected += coded("regression.range", tally.beyond.notes(line, least))
     notes = [
         *plan.input_notes,
         *([] if report is None else report.warnings()),
@@ -289,37 +293,6 @@ def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> P
     for warning in tested.doubts:
         warnings.warn(warning, stacklevel=3)
     return tested
-
-
-def _detected(plan: Plan, tally: CloudTally) -> list[PcfixWarning]:
-    """Return the notes on what was detected from the cloud."""
-    verdicts = {str(note): note for one in plan.verdicts for note in one.warnings()}
-    beyond, line = list[str](), plan.regression
-    if tally.beyond is not None and line is not None:
-        from pcfix.refract.regression import LEAST_BEYOND
-
-        least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
-        beyond = tally.beyond.notes(line, least)
-    corrected, rays = tally.figures.corrected, list[PcfixWarning]()
-    if plan.inputs.port is not None and plan.survey.settings.method == "snell" and corrected:
-        mean = tally.port_miss_m / corrected
-        sentence = (
-            "The refracted rays of the apparent points miss each other behind the port by"
-            f" {mean:.3f} m on average. --method consistent takes this into account, best with"
-            " --views."
-        )
-        rays.append(PcfixWarning("port.ray_distance", sentence, mean_m=mean))
-    unlisted = []
-    if UNLISTED in plan.survey.parts:
-        so = " ".join(map(str, plan.of_unlisted))
-        unlisted = [f"Points in no view list are corrected as without a list. {so}"]
-    return [
-        *plan.notes,
-        *rays,
-        *coded("regression.range", beyond),
-        *coded("cloud.reconstruction", verdicts.values()),
-        *coded("views.unlisted", unlisted),
-    ]
 
 
 def correct_points(

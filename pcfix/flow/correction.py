@@ -39,7 +39,6 @@ from pcfix.water.checks import WaterMeeting
 from pcfix.water.surface import FoundSurface, surface_above
 
 if TYPE_CHECKING:
-    from pcfix.adjust.precision import Members
     from pcfix.adjust.transfer import CloudTransfer, TransferCounts, Transferred
     from pcfix.grid.shoreline import NearWater
     from pcfix.io.views import ViewMatch, ViewReport
@@ -62,9 +61,7 @@ class Plan:
     kind: ViewKind | None = None  # the type of the view list, which the points may have themselves
     some_unlisted: bool = False  # whether points have no images in it
     transfer: CloudTransfer | None = None  # from the original to the adjusted cameras
-    members: Members | None = None  # of an adjustment, for the errors of the poses
     verdicts: tuple[Verdict, ...] = ()  # on the reconstruction type
-    of_unlisted: tuple[Verdict, ...] = ()  # the same for points in no view list
     input_notes: tuple[PcfixWarning, ...] = ()  # what was noted on reading the inputs
     notes: tuple[PcfixWarning, ...] = ()  # what the cloud shows
 
@@ -156,7 +153,6 @@ class CloudTally(Sums):
     beyond: BeyondRange | None = None
     shore: NearWater | None = None
     transfer: TransferCounts | None = None
-    port_miss_m: float = 0.0
 
 
 def transferred(
@@ -205,8 +201,7 @@ def correct_chunk(
         wet, n = batch.take(rows), len(batch)
         found = correct_through_port(wet.xyz, plan.cameras, plan.inputs.port, settings, wet.views)
         correction = _spread(batch, rows, found, np.zeros(n), np.ones(n, np.bool_))
-        miss_m = float(correction.ray_miss_m[submerged].sum())
-        return correction, CloudTally(Tally.of(correction), labels, counts, port_miss_m=miss_m)
+        return correction, CloudTally(Tally.of(correction), labels, counts)
     if step is not None:
         submerged &= step.moved  # a point without a place in the adjusted block is left where it is
     correction = _through_water(plan, batch, np.flatnonzero(submerged), covariances=covariances)

@@ -86,9 +86,15 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
         require_orientation(cameras, "A port")
         how = replace(options, method="consistent" if method == "auto" else method)
         survey = Survey(WaterPlane(np.inf), cameras, how)
+        words = (
+            "Method snell ignores that the refracted rays of the apparent points miss each other"
+            " behind the port. Use --method consistent, best with --views."
+        )
+        notes = coded("port.ray_distance", [words] if method == "snell" else [])
         return Plan(
             options, inputs, view, survey, FoundSurface(survey.water), labelling_of(options, view),
             match, None if listed is None else listed.kind, input_notes=cameras.notes,
+            notes=tuple(notes),
         )  # fmt: skip
     check_shoreline(options.shoreline, overwrite=options.overwrite, inputs=paths_in(options))
     found = inputs.surface(view)
@@ -97,18 +103,11 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
         options, inputs, view, blocks, found, offset, listed, labelling_of(options, view)
     )
     check_tilt(found.surface)
-    method = plan.survey.settings.method
-    if method == "regression":
+    if plan.survey.settings.method == "regression":
         from pcfix.flow.check_depths import check_regression
 
         check_regression(inputs)
-    notes, members = [*blocks.cameras.notes, *plan.input_notes], None
-    if options.dimensions == "all" and method != "regression" and len(blocks.cameras):
-        from pcfix.flow.pose_errors import members_of
-
-        members, no_poses = members_of(inputs.cameras, blocks.cameras)
-        notes += coded("cameras.poses", filter(None, [no_poses]))
-    return replace(plan, match=match, members=members, input_notes=tuple(notes))
+    return replace(plan, match=match, input_notes=(*blocks.cameras.notes, *plan.input_notes))
 
 
 def plan_of(
@@ -180,14 +179,26 @@ def plan_correction(plan: Plan) -> Plan:
         survey = replace(plan.survey, learned=plan.survey.learned._replace(regression=line))
         plan = replace(plan, survey=survey, notes=tuple(coded("regression.fit", notes)))
     plan = _estimated_from_cloud(plan, chunks)
-    if plan.members is not None:
-        from pcfix.flow.pose_errors import SAMPLE_POINTS, pose_errors, with_poses
+    if plan.options.dimensions == "all" and plan.regression is None and len(plan.cameras):
+        plan = _with_pose_errors(plan)
+    if first is not None and plan.kind is not None:
+        plan = _with_type_of_list(plan, first)
+    doubts = dict.fromkeys(note for one in plan.verdicts for note in one.warnings())
+    return replace(plan, notes=(*plan.notes, *coded("cloud.reconstruction", doubts)))
 
-        rows = np.arange(0, view.points, 1 + view.points // SAMPLE_POINTS)
-        sample = sample_of(view, rows, water, plan.match)
-        errors = pose_errors(sample, plan.survey, plan.members, transfer)
-        plan = replace(plan, survey=with_poses(plan.survey, errors))
-    return plan if first is None or plan.kind is None else _with_type_of_list(plan, first)
+
+def _with_pose_errors(plan: Plan) -> Plan:
+    """Return the plan with the errors of adjusted poses, if the adjustment left its members."""
+    from pcfix.flow.pose_errors import SAMPLE_POINTS, members_of, pose_errors, with_poses
+
+    members, problem = members_of(plan.inputs.cameras, plan.cameras)
+    if members is None:
+        notes = coded("cameras.poses", filter(None, [problem]))
+        return replace(plan, input_notes=(*plan.input_notes, *notes))
+    rows = np.arange(0, plan.view.points, 1 + plan.view.points // SAMPLE_POINTS)
+    sample = sample_of(plan.view, rows, plan.found.surface, plan.match)
+    errors = pose_errors(sample, plan.survey, members, plan.transfer)
+    return replace(plan, survey=with_poses(plan.survey, errors))
 
 
 def _whole_cloud(plan: Plan) -> Iterator[Points]:
@@ -244,16 +255,18 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
         survey, verdicts = learning.learn_of_sample(sample, view.points, ties, hint, near)
         notes += _note_flat(sample, survey)
         return replace(plan, survey=survey, verdicts=verdicts, notes=tuple(notes))
-    survey, of_unlisted = learning.with_matcher(sample, ties), plan.of_unlisted
+    survey = learning.with_matcher(sample, ties)
     if some_unlisted:
         learned = plan.survey.learned._replace(occluder=occluder)
         settings = learning.resolved(given, plan.cameras, None)
         bare = replace(survey, settings=settings, learned=learned)
-        unlisted, of_unlisted = learning.learn_of_sample(
+        unlisted, verdicts = learning.learn_of_sample(
             replace(sample, survey=bare), view.points, ties, hint, near
         )
         survey = replace(survey, parts={UNLISTED: unlisted})
-    return replace(plan, survey=survey, of_unlisted=of_unlisted, notes=tuple(notes))
+        words = ["Points in no view list are corrected as without a list.", *map(str, verdicts)]
+        notes.append(PcfixWarning("views.unlisted", " ".join(words)))
+    return replace(plan, survey=survey, notes=tuple(notes))
 
 
 def _note_flat(sample: Batch, survey: Survey) -> list[PcfixWarning]:
