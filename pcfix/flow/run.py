@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from pcfix.adjust.diagnosis import MOST_STATED_M
 from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.errors import PcfixError, PcfixWarning, SettingError, bad_file, plain
-from pcfix.flow import results
+from pcfix.flow import maps
 from pcfix.flow.adjust import FOLDER, MODELS, SUMMARY, adjust_into
 from pcfix.flow.clean import clean_file
 from pcfix.flow.compare import compare_clouds
@@ -25,6 +25,7 @@ from pcfix.flow.correct import correct_file
 from pcfix.flow.diagnosis import diagnose_inputs, has_datum
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
+from pcfix.flow.report import PAGE, report_run
 from pcfix.flow.request import SURFACE, Record, Request, RunFolder, read_record
 from pcfix.flow.runner import Bar, Progress, check_folder, no_bar
 from pcfix.flow.surfaces import check_shoreline, view_of
@@ -181,10 +182,10 @@ def run_all(
     say(f"{done}{run.cleaned}")
 
     errors = corrected["uncertainty"] is not None
-    outputs = results.raster_files(out_dir, errors=errors)
+    outputs = maps.raster_files(out_dir, errors=errors)
     gridded, done = step(
         "dsm", "Gridding", outputs,
-        lambda progress: results.write_rasters(run, errors=errors, progress=progress),
+        lambda progress: maps.write_rasters(run, errors=errors, progress=progress),
     )  # fmt: skip
     say(f"{done}{outputs[0]}, cells of {gridded['resolution_m']:g} m")
 
@@ -200,14 +201,14 @@ def run_all(
     except SettingError as error:
         say(f"{'map':<9} not written: {error}")
     else:
-        draw = partial(results.write_map, layers, run, corrected, compared)
+        draw = partial(maps.write_map, layers, run, corrected, compared)
         _, done = step("map", "Drawing the map", [layers], lambda _: draw())
         say(f"{done}{layers}")
 
-    path = out_dir / results.PAGE
+    path = out_dir / PAGE
     page, done = step(
         "report", "Writing the report", [path],
-        lambda _: results.report_run(run, inputs, first, corrected, compared),
+        lambda _: report_run(run, inputs, first, corrected, compared),
     )  # fmt: skip
     say(f"{done}{path}: {page['in_short']}")
     return path
@@ -318,7 +319,7 @@ def _compare(run: RunFolder) -> Plain:
     """Compare the cleaned cloud with the reference, and write a raster of differences."""
     request, reference = run.request, run.request.surveyed
     result = compare_clouds(
-        run.cleaned_cloud, reference, out_dir=run.compare, sections=results.SECTIONS,
+        run.cleaned_cloud, reference, out_dir=run.compare, sections=maps.SECTIONS,
         overwrite=True, **vars(request.part(DistanceOptions)),
     )  # fmt: skip
     if request.has_surface:
@@ -362,7 +363,7 @@ class RunResults:
     @property
     def report(self) -> Path:
         """The page for clients."""
-        return self.folder / results.PAGE
+        return self.folder / PAGE
 
     @property
     def summary(self) -> Summary:
@@ -377,12 +378,12 @@ class RunResults:
     @property
     def depth(self) -> DataArray:
         """Depth of the bed, shape (y, x), metres below the water, positive down; NaN on land."""
-        return rasters.open_array(self._file(results.DEPTH))
+        return rasters.open_array(self._file(maps.DEPTH))
 
     @property
     def bed(self) -> DataArray:
         """Heights of the bed, shape (y, x), metres; NaN on land."""
-        return rasters.open_array(self._file(results.BED))
+        return rasters.open_array(self._file(maps.BED))
 
     @property
     def surface(self) -> DataArray:
@@ -392,7 +393,7 @@ class RunResults:
     @property
     def uncertainty(self) -> DataArray:
         """Vertical uncertainty of the bed at 95 %, shape (y, x), metres, predicted."""
-        return rasters.open_array(self._file(results.UNCERTAINTY))
+        return rasters.open_array(self._file(maps.UNCERTAINTY))
 
     def contours(self, interval: float | None = None) -> GeoDataFrame:
         """Return lines of equal depth, ``depth_m``.
@@ -409,7 +410,7 @@ class RunResults:
                 "option.range", f"interval {interval:g} must be above 0.",
                 option="interval", value=interval, above=0,
             )  # fmt: skip
-        return vectors.frame_of(results.contours_layer(self.folder, interval), self.depth.rio.crs)
+        return vectors.frame_of(maps.contours_layer(self.folder, interval), self.depth.rio.crs)
 
     @property
     def waterline(self) -> GeoDataFrame:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.flow.results import read_cloud, write_report
+from pcfix.flow.report import read_cloud, write_report
 from pcfix.grid.maps import MapsBuilder
 from pcfix.report.map_data import Layer
 from pcfix.report.page import Report, Table, Tile, render
