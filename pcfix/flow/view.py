@@ -20,6 +20,7 @@ from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.files import check_input, check_output, write_bytes
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
+from pcfix.io.styles import limits_of
 from pcfix.lens.imaging import unproject
 from pcfix.libraries import load_open3d
 from pcfix.model import Cameras, FloatArray, WaterDimension, WaterSurface
@@ -44,7 +45,7 @@ AZIMUTH_DEG, ELEVATION_DEG = -119.0, 29.0
 MOST_DOTS = 30_000
 GREY = 0.72
 """Of points without a value, such as land where depths are shown."""
-MOST_PERCENT = 98.0
+SCALES = {"shift": "depth", "error": "depth"}
 COLOURS = {
     "depth": (colours.DEPTH, "Depth below the water (m)",
               "Give --water, or a cloud from 'pcfix correct'."),
@@ -228,7 +229,7 @@ def _sheet(surface: WaterSurface | None, low: FloatArray, high: FloatArray) -> F
 
 
 def scale_of(what: str, values: FloatArray) -> ScalarMappable:
-    """Return the colour scale of values, NaN where unknown; it leaves out 2 % at the ends.
+    """Return the colour scale of values, NaN where unknown.
 
     Its ``to_rgba`` gives colours; those of NaN are grey.
     """
@@ -236,13 +237,9 @@ def scale_of(what: str, values: FloatArray) -> ScalarMappable:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    known = values[np.isfinite(values)]
-    if what == "error":
-        high = max(float(np.percentile(np.abs(known), MOST_PERCENT)), 1e-3)
-        low = -high
-    else:
-        low = float(np.percentile(known, 100.0 - MOST_PERCENT)) if what == "height" else 0.0
-        high = max(float(np.percentile(known, MOST_PERCENT)), low + 1e-3)
+    # a shift begins at zero as a depth does; errors lie on both sides of it
+    low, high = limits_of(np.abs(values) if what == "error" else values, SCALES.get(what, what))
+    low = -high if what == "error" else low
     ramp = colormaps[COLOURS[what][0]].with_extremes(bad=(GREY, GREY, GREY))
     return ScalarMappable(Normalize(low, high), ramp)
 
