@@ -145,7 +145,7 @@ def adjust_into(
             " model of the software, or --sensor."
         )
         raise InputError("cameras.no_angles", words, path=name)
-    water = None if inputs.water is None else inputs.surface(view).surface
+    water = None if inputs.port is not None else inputs.surface(view).surface
     if isinstance(water, WaterDimension):
         words = (
             f"The water {water} is known at points of the cloud only. For an adjustment, give it as"

@@ -62,8 +62,7 @@ def check_cameras(
             if getattr(given, name) is not None:
                 sentence = f"{name} needs cloud and water, to test for absorbed refraction."
                 raise SettingError("option.needs", sentence, options=[name, "cloud", "water"])
-    water = 0.0 if given.water is None else given.water
-    inputs = replace(replace(given, water=water).part(Inputs), cameras=path)
+    inputs = replace(given.part(Inputs), cameras=path)
     read = shown_once(inputs.read, lambda cameras: cameras.notes)
     view = None if cloud is None else view_of(check_input(cloud))
     surface = None if given.water is None else inputs.surface(view).surface
@@ -213,21 +212,10 @@ def _fit(
     ``seen_by`` are the shares of the points that 0, 1, 2, 3 or more frames hold. The verdict is
     what is likely wrong, empty where cameras and cloud match.
     """
-    from scipy.spatial import cKDTree
-
     visible = np.minimum(cameras_in_sight(xyz, cameras), 3)
     shares = np.bincount(visible, minlength=4) / len(xyz)
-    low, high, centres = xyz.min(axis=0), xyz.max(axis=0), cameras.centres
-    reach = float(np.hypot(*np.ptp(xyz[:, :2], axis=0))) * 0.1 + 1.0
-    distance, row = (np.asarray(one) for one in cKDTree(xyz[:, :2]).query(centres[:, :2]))
-    below = int(np.count_nonzero((distance < reach) & (centres[:, 2] <= xyz[row, 2])))
     found = plausible(cameras, xyz, ties, **flight)
-    verdict = likely_mistake(centres, low, high, view.crs) or ""
-    if not verdict and below:
-        verdict = (
-            f"{below} of {len(cameras)} cameras are below the ground. Check the vertical datum and"
-            " the order of the axes."
-        )
+    verdict = likely_mistake(cameras.centres, xyz.min(axis=0), xyz.max(axis=0), view.crs)
     verdict = verdict or " ".join(map(str, found.doubts))
     if not verdict and abs(up_m) >= UNDULATION_M[0]:
         side = "above" if up_m > 0.0 else "below"

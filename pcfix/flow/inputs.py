@@ -48,13 +48,8 @@ class Inputs(MaskOption, InputOptions):
     """
 
     def check(self) -> None:
-        """Check that there is either a water surface or a housing port."""
+        """Refuse a water surface together with a housing port."""
         super().check()
-        if self.water is None and self.port is None:
-            raise SettingError(
-                "water.missing",
-                "water is missing: give the water surface, or the port of an underwater camera.",
-            )
         if self.water is not None and self.port is not None:
             raise SettingError(
                 "option.conflict",
@@ -70,7 +65,10 @@ class Inputs(MaskOption, InputOptions):
     def surface(self, view: CloudView | None = None) -> FoundSurface:
         """Return the water surface over a cloud; see `pcfix.flow.surfaces.find_surface`."""
         if self.water is None:
-            raise SettingError("water.missing", "there is no water surface in front of a port.")
+            raise SettingError(
+                "water.missing",
+                "water is missing: give the water surface, or the port of an underwater camera.",
+            )
         return find_surface(self.water, self, view)
 
     def level_offset_m(self, cameras: Cameras) -> FloatArray | None:

@@ -65,7 +65,8 @@ class Request(RunOptions):
         if wrong:
             wrong = f"--adjust {self.adjust}: {wrong}"
             raise SettingError("option.conflict", wrong, option="adjust", value=self.adjust)
-        self.part(Inputs)
+        if self.water is None:
+            raise SettingError("water.missing", "water is missing: give the water surface.")
         with_index(self.part(RunOptions))
 
     @property

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -131,8 +130,7 @@ def view_clouds(
     low, high = (end([end(one, axis=0) for one in xyz], axis=0) for end in (np.min, np.max))
     lines = np.zeros((0, 2, 3))
     if given.cameras is not None:
-        inputs = replace(given, water=0.0 if given.water is None else given.water).part(Inputs)
-        lines = _frusta(inputs.block(first.crs)[0], float(high[2]))
+        lines = _frusta(given.part(Inputs).block(first.crs)[0], float(high[2]))
     ends = np.vstack([low, high, lines.reshape(-1, 3)])
     origin = (ends.min(axis=0) + ends.max(axis=0)) / 2.0
     scene = Scene3d(
