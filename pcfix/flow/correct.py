@@ -115,18 +115,16 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
         """Move points, and write their new dimensions, classes and flags."""
         new = columns.convert(points, header.point_format)
         new.offsets = header.offsets
-        for rows, part in correction.parts():
-            some = new[rows]
-            # whole steps of the file's own scale, so that 'pcfix restore' gets back every bit
-            classes = np.array(some["classification"])
-            withheld = np.asarray(some["withheld"]).astype(bool)
-            changes = columns.changes_of(
-                written, part, classes, withheld, some.scales, withhold=uncorrected == "withhold"
-            )
-            columns.move(some, changes.steps + np.array(steps), source.path)
-            columns.fill(some, changes)
-            some.array["classification"][part.corrected] = BATHYMETRIC_POINT
-            some["withheld"][:] = (withheld | changes.flagged).astype(np.uint8)
+        # whole steps of the file's own scale, so that 'pcfix restore' gets back every bit
+        classes = np.array(new["classification"])
+        withheld = np.asarray(new["withheld"]).astype(bool)
+        changes = columns.changes_of(
+            written, correction, classes, withheld, new.scales, withhold=uncorrected == "withhold"
+        )
+        columns.move(new, changes.steps + np.array(steps), source.path)
+        columns.fill(new, changes)
+        new.array["classification"][correction.corrected] = BATHYMETRIC_POINT
+        new["withheld"][:] = (withheld | changes.flagged).astype(np.uint8)
         return new[~correction.uncorrected] if uncorrected == "drop" else new
 
     return FileWork(header, compute, apply)
