@@ -21,7 +21,7 @@ from pcfix.flow.inputs import CameraInputs, Inputs, paths_in, transfer_between
 from pcfix.flow.planning import plan_correction, plan_of, read_inputs
 from pcfix.flow.plausibility import CloudSample, Plausible, plausible
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
-from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of, write_shoreline
+from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps, part_report
 from pcfix.io.las.writing import corrected_header
@@ -149,6 +149,8 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         tested = check_fit(plan, tally, ties)
         poses, absorbed = diagnose_in_passing(plan, ties)
         if tally.shore is not None and options.shoreline is not None:
+            from pcfix.flow.shore import write_shoreline
+
             shoreline = write_shoreline(
                 options.shoreline, tally.shore, plan.found, plan.view.crs,
                 overwrite=options.overwrite, sigma_level_m=options.sigma_level,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import warnings
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,17 +46,22 @@ QUICK_BYTES = 25_000_000
 """Size of a model that is read within a second or two, even if nobody asked."""
 
 
+def diagnose(evidence: Evidence) -> Diagnosis:
+    """Look for every sign that the evidence allows, with the GNSS positions of the cameras."""
+    return diagnosed(replace(evidence, gnss=_gnss_of(evidence.cameras, evidence.name)))
+
+
 def diagnose_inputs(
     inputs: Inputs, cameras: Cameras, view: CloudView, water: WaterSurface, index: float, *,
     gcps: Any = None, reference: Any = None, in_passing: bool = False,
 ) -> Diagnosis:  # fmt: skip
     """Look for signs in a cloud, its cameras with their tie points, and surveys, if given."""
-    return diagnosed(Evidence(
+    evidence = Evidence(
         cameras, str(inputs.cameras), water, index, view=view, reference=reference,
         control=None if gcps is None else read_ground_control(gcps, cameras).surveyed,
-        ties=ties_of(inputs, view.crs), gnss=_gnss_of(cameras, str(inputs.cameras)),
-        in_passing=in_passing,
-    ))  # fmt: skip
+        ties=ties_of(inputs, view.crs), in_passing=in_passing,
+    )  # fmt: skip
+    return diagnose(evidence)
 
 
 def _gnss_of(cameras: Cameras, name: str) -> GnssPositions | None:
@@ -74,26 +80,28 @@ def diagnose_in_passing(
     The ties are `quick_ties`. Returns for the summary whether the poses absorbed it (None if
     unknown), that as a line, and the signs; and the warning.
     """
-    inputs, cameras, n = plan.inputs, plan.cameras, plan.options.refractive_index
+    inputs, cameras = plan.inputs, plan.cameras
     found: dict[str, Any] = {"absorbed": None, "words": "", "signs": []}
     if not len(cameras):
         return found | {"words": "not applicable: no cameras were given"}, None
     if inputs.adjusted_from is not None:
         words = "adjusted with refraction (--adjusted-from)"
         return found | {"absorbed": False, "words": words}, None
-    name = "cameras" if isinstance(inputs.cameras, Cameras) else str(inputs.cameras)
+    path = None if isinstance(inputs.cameras, Cameras) else inputs.cameras
     seen = [(one.straight, one.is_fused) for one in plan.verdicts if one.straight is not None]
+    n = plan.options.refractive_index
     evidence = Evidence(
-        cameras, name, plan.found.surface, n, ties=ties, view=plan.view, in_passing=True,
-        gnss=_gnss_of(cameras, name),
+        cameras, "cameras" if path is None else str(path), plan.found.surface, n, ties=ties,
+        view=plan.view, in_passing=True,
         neighbours=neighbours_sign(*seen[-1][0], is_fused=seen[-1][1]) if seen else None,
     )  # fmt: skip
     try:
-        diagnosis = diagnosed(evidence)
+        is_large = path is not None and _size_of(Path(path)) > QUICK_BYTES
+        diagnosis = diagnose(evidence)
     except (PcfixError, OSError) as error:  # this check stops no correction
         return found | {"words": f"not checked for absorbed refraction: {error}"}, None
     command, because = adjust_words(
-        inputs, plan.view.name, has_datum=has_datum(cameras, name),
+        inputs, plan.view.name, has_datum=has_datum(evidence.cameras, evidence.name),
         index=None if n == DEFAULT_REFRACTIVE_INDEX else n,
     )  # fmt: skip
     sentence, decided, warning = diagnosis.sentence(command, because), diagnosis.decided_by, None
@@ -105,12 +113,11 @@ def diagnose_in_passing(
         did = "absorbed" if diagnosis.absorbed else "did not absorb"
         words = f"{did} the refraction, by {decided.name}{'; see the warning' * bool(sentence)}"
     else:
+        why = f"no tie points and no GNSS positions; {EXPORT}"
         silent = [one.name for one in diagnosis.signs if one.name in ("tie points", "GNSS")]
-        why = (
-            f"no tie points (of up to {QUICK_BYTES / 1e6:g} MB; 'pcfix cameras' reads more) and no"
-            f" GNSS positions; {EXPORT}"
-        )
-        if silent:
+        if is_large:
+            why = f"the file is larger than {QUICK_BYTES / 1e6:g} MB; use 'pcfix cameras'"
+        elif silent:
             why = f"{' and '.join(silent)} of the file tell too little (see 'pcfix cameras')"
         words = f"not checked for absorbed refraction: {why}"
     signs = diagnosis.as_dict()["signs"]

@@ -82,7 +82,7 @@ def map_photos(
         target.mkdir(parents=True, exist_ok=True)
         results = () if given.overwrite else (target / path.name for path in block.paths)
         old = {path.name: path for path in results if path.exists()}
-        check_record(target / RECORD, key_of("photos", given), old.values())
+        open_record(target / RECORD, key_of("photos", given), old.values())
         both = zip(block.paths, block.photos, strict=True)
         todo = {path: photo for path, photo in both if path.name not in old}
 
@@ -132,20 +132,24 @@ def map_photos(
     return summary
 
 
-def check_record(place: Path, key: str, written: Collection[Path]) -> None:
-    """Refuse results in a folder that are not of an equal call, by its record at `place`.
+def open_record(place: Path, key: str, written: Collection[Path]) -> dict[str, Any]:
+    """Return the record of an equal call that wrote to a folder; without results, a new one.
 
-    `key` is that of `key_of`. The record is made where there are no results.
+    `key` is that of `key_of`. `written` are the results in the folder, which another call must not
+    mix with its own.
     """
+    record: dict[str, Any] = read_json(place) if place.exists() else {}
     if not written:
-        write_text(place, json_text({"key": key}), overwrite=True)
-    elif not place.exists() or read_json(place).get("key") != key:
+        record = {"key": key}
+        write_text(place, json_text(record), overwrite=True)
+    elif record.get("key") != key:
         raise SettingError(
             "output.exists",
             f"{min(written)}: exists, and was not written by an equal call. Add --overwrite to"
             " replace it, or give another folder.",
             path=min(written),
         )
+    return record
 
 
 def warn_all(notes: Iterable[PcfixWarning]) -> None:

@@ -23,14 +23,7 @@ from pcfix.flow.inputs import (
     paths_in,
     read_blocks,
 )
-from pcfix.flow.surfaces import (
-    CloudView,
-    Points,
-    check_shoreline,
-    own_water_of,
-    parts_of,
-    sample_of,
-)
+from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
 from pcfix.io.las.source import CHUNK_POINTS
 from pcfix.model import NOISE_CLASSES, FloatArray, Views, WaterPlane
 from pcfix.options.correct import CorrectOptions
@@ -96,7 +89,11 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
             match, None if listed is None else listed.kind, input_notes=cameras.notes,
             notes=tuple(notes),
         )  # fmt: skip
-    check_shoreline(options.shoreline, overwrite=options.overwrite, inputs=paths_in(options))
+    if options.shoreline is not None:
+        from pcfix.flow.shore import check_shoreline
+
+        reads = paths_in(options)
+        check_shoreline(options.shoreline, overwrite=options.overwrite, inputs=reads)
     found = inputs.surface(view)
     offset = inputs.level_offset_m(blocks.cameras)
     plan = plan_of(

@@ -24,9 +24,9 @@ import numpy as np
 from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
-from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, check_record, map_photos
+from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, map_photos, open_record
 from pcfix.flow.runner import Progress, check_summary, json_text, key_of, write_summary
-from pcfix.io.files import check_input, read_json, run_logged, write_text
+from pcfix.io.files import check_input, file_state, run_logged, write_text
 from pcfix.io.las.writing import write_points
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.io.rasters import open_raster, place_of, read_masked, write_dod
@@ -39,8 +39,8 @@ from pcfix.sums import Figures
 from pcfix.water.surface import surface_above
 
 RECORD = "pcfix-rebuild.json"
-FIGURES = "round.json"
-"""The results of a finished round, in its folder."""
+ROUND = ("cloud", "dsm", "cells", "mean_m", "sd_m", "within_gsd")
+"""What is recorded of a round: its DSM minus the one before, over submerged cells."""
 PAPER_ROUNDS = 3
 """Rounds after which the mapping by eq 12 is close to its fixed point, which is not the bed."""
 STEREO_CELL_PIXELS = 2.0
@@ -69,11 +69,17 @@ def rebuild_rounds(
         Folder, created if needed. Each round writes ``images``, ``cloud.laz``, ``dsm.tif`` and
         ``difference.tif`` (from the DSM before) in a folder ``round1``, ``round2`` ... Rounds that
         an equal call has finished are skipped.
-    options, progress
-        See `pcfix.correct_file`; progress is in photographs or pairs. After an error finished
-        rounds stay.
+    options : PhotosOptions, optional
+        Or its attributes as keywords, rebuild among them.
+    progress : callable, optional
+        Called with (photographs or pairs done, those in all).
     say : callable, optional
         Called with a line for each round.
+
+    Raises
+    ------
+    PcfixError
+        Finished rounds stay.
     """
     started = time.perf_counter()
     given = taken(PhotosOptions, options, keywords, "rebuild_rounds")
@@ -88,11 +94,20 @@ def rebuild_rounds(
     folders = list(target.glob("round[0-9]*"))
     while given.overwrite and folders:
         shutil.rmtree(folders.pop())
-    check_record(target / RECORD, key_of("rebuild", given, ignored=COMMAND_ONLY), folders)
+    record = open_record(target / RECORD, key_of("rebuild", given, ignored=COMMAND_ONLY), folders)
+    record.setdefault("rounds", [])
+
+    def note(number: int, noted: dict[str, Any]) -> dict[str, Any]:
+        """Record a round, for a later call to resume."""
+        record["rounds"][number - 1 :] = [noted]
+        write_text(target / RECORD, json_text(record), overwrite=True)
+        return noted
+
     start = str(given.dsm) if Path(given.dsm).suffix.lower() in CLOUDS else None
     if start is not None:  # a cloud is gridded to the folder
         raster = target / "dsm.tif"
-        if given.overwrite or not (raster.exists() and folders):
+        fresh = raster.exists() and raster.stat().st_mtime_ns > Path(start).stat().st_mtime_ns
+        if given.overwrite or not fresh:
             grid_dsm(start, raster, resolution=given.resolution, overwrite=True)
         given = replace(given, dsm=raster, resolution=None)
     with threads(given.jobs), TemporaryDirectory() as scratch:
@@ -102,13 +117,28 @@ def rebuild_rounds(
     notes: list[PcfixWarning] = []
     while len(rounds) < given.most_rounds and not (rounds and abs(rounds[-1].mean_m) < threshold_m):
         number = len(rounds) + 1
-        record = target / f"round{number}" / FIGURES
-        if record.exists():
-            one, done_before = Figures(**read_json(record)), done_before + 1
-        else:
-            before = Path(rounds[-1].dsm if rounds else given.dsm)
-            one = _round(given, block, number, Path(images), before, record.parent, progress)
-            write_text(record, json_text(one.as_dict()), overwrite=True)
+        before = Path(rounds[-1].dsm if rounds else given.dsm)
+        folder = target / f"round{number}"
+        cloud, dsm = folder / "cloud.laz", folder / "dsm.tif"
+        noted = record["rounds"][number - 1] if number <= len(record["rounds"]) else {}
+        has_cloud = cloud.exists() and noted.get("state") == file_state(cloud)
+        is_done = has_cloud and "mean_m" in noted and dsm.exists()
+        done_before += is_done
+        if not has_cloud:
+            how = replace(
+                given, dsm=before, resolution=None, summary=None, **RebuildOptions().as_dict()
+            )
+            with warnings.catch_warnings():
+                if number > 1:  # the DSM is pcfix's own
+                    warnings.filterwarnings("ignore", ".*does not state whether", PcfixWarning)
+                map_photos(images, folder / "images", options=how, progress=progress)
+            with threads(given.jobs):
+                _reconstruct(given, block, number, folder / "images", cloud, progress)
+            noted = note(number, {"command": given.rebuild, "state": file_state(cloud)})
+        if not is_done:
+            grid_dsm(cloud, dsm, resolution=block.scene.ground.cell_m, overwrite=True)
+            noted = note(number, noted | _difference(block, cloud, dsm, before))
+        one = Figures(**{name: noted[name] for name in ROUND})
         rounds.append(one)
         if say is not None:
             say(
@@ -146,25 +176,8 @@ def rebuild_rounds(
         compared=compared,  # folder, where a reference was given
         notes=notes,
     )
-    write_summary(given, summary)
+    write_summary(given, summary.as_dict())
     return summary
-
-
-def _round(
-    given: PhotosOptions, block: PhotoBlock, number: int, images: Path, before: Path, folder: Path,
-    progress: Progress | None,
-) -> Figures:  # fmt: skip
-    """Do a round in a folder, from the DSM of the round before; return how far the bed moved."""
-    cloud, dsm = folder / "cloud.laz", folder / "dsm.tif"
-    how = replace(given, dsm=before, resolution=None, summary=None, **RebuildOptions().as_dict())
-    with warnings.catch_warnings():
-        if number > 1:  # the DSM is pcfix's own
-            warnings.filterwarnings("ignore", ".*does not state whether", PcfixWarning)
-        map_photos(images, folder / "images", options=how, progress=progress)
-    with threads(given.jobs):
-        _reconstruct(given, block, number, folder / "images", cloud, progress)
-    grid_dsm(cloud, dsm, resolution=block.scene.ground.cell_m, overwrite=True)
-    return _difference(block, cloud, dsm, before)
 
 
 def _reconstruct(
@@ -206,8 +219,8 @@ def _reconstruct(
         )  # fmt: skip
 
 
-def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> Figures:
-    """Return the files of a round, and its DSM minus the one before, over submerged cells."""
+def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> dict[str, Any]:
+    """Return by how much the DSM of a round differs from that before, under water."""
     raster = dsm.with_name("difference.tif")
     write_dod(dsm, before, raster, overwrite=True)
     with open_raster(raster) as source, open_raster(dsm) as heights:
@@ -220,12 +233,6 @@ def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> Figu
     x, y = place_of(transform, column + 0.5, row + 0.5)
     wet = surface_above(block.scene.water, np.column_stack([x, y, z])).height_m > z
     moved = moved[wet] if wet.any() else moved
-    return Figures(
-        cloud=str(cloud),
-        dsm=str(dsm),
-        cells=len(moved),
-        mean_m=round(float(moved.mean()), 5),
-        sd_m=round(float(moved.std()), 5),
-        # share that moved by at most a ground pixel
-        within_gsd=round(float((np.abs(moved) <= block.gsd_m).mean()), 5),
-    )
+    within = float((np.abs(moved) <= block.gsd_m).mean())  # moved by at most a ground pixel
+    sizes = round(float(moved.mean()), 5), round(float(moved.std()), 5), round(within, 5)
+    return dict(zip(ROUND, (str(cloud), str(dsm), len(moved), *sizes), strict=True))

@@ -1,9 +1,9 @@
-"""The points of a cloud, and its water surface: read, fitted to a shoreline, or found in it."""
+"""The water surface of a cloud: read, fitted to a shoreline, or found in the cloud itself."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from os import PathLike
@@ -11,21 +11,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import shapely
 
 from pcfix.errors import InputError, PcfixWarning, SettingError, coded
 from pcfix.flow.runner import Chunk, read_ahead
-from pcfix.io.files import check_output
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.tiles import CloudFiles, open_cloud
-from pcfix.io.vectors import (
-    SHORE_RADIUS_M,
-    Layer,
-    check_layers,
-    is_vector_file,
-    read_shoreline,
-    write_layers,
-)
 from pcfix.label.labelling import Part
 from pcfix.model import (
     NOISE_CLASSES,
@@ -38,7 +28,6 @@ from pcfix.model import (
     WaterRaster,
     WaterSurface,
 )
-from pcfix.options.correct import LEVEL_M
 from pcfix.options.declare import File
 from pcfix.options.shared import WaterOptions
 from pcfix.water.surface import FoundSurface, OwnWater, build_fields, surface_above
@@ -46,7 +35,6 @@ from pcfix.water.surface import FoundSurface, OwnWater, build_fields, surface_ab
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from pcfix.grid.shoreline import NearWater, Shoreline
     from pcfix.io.views import ViewMatch
     from pcfix.water.fit import ShoreFit
 
@@ -203,6 +191,7 @@ def find_surface(
     view : CloudView or None
         Without a cloud only surfaces that do not need one.
     """
+    from pcfix.io.vectors import is_vector_file
     from pcfix.io.water import read_water
 
     if not isinstance(water, str | PathLike | float | int):
@@ -320,6 +309,7 @@ def _found(view: CloudView | None) -> FoundSurface:
 
 def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundSurface:
     """Return the surface fitted to shoreline points."""
+    from pcfix.io.vectors import SHORE_RADIUS_M, read_shoreline
     from pcfix.water.fit import fit_water, heights_from_cloud
     from pcfix.water.river import fit_river
 
@@ -354,47 +344,3 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
             f" {shore.counts.sum():.0f} independent ones."
         )
     return replace(found, notes=(*map(str, notes), *found.notes))
-
-
-# The shoreline of a cloud as a file
-
-LAYER = "shoreline"
-
-
-def check_shoreline(path: File | None, *, overwrite: bool, inputs: Iterable[File] = ()) -> None:
-    """Check that the file can be written, before anything is computed."""
-    if path is not None:
-        check_layers(check_output(path, overwrite=overwrite, inputs=inputs))
-
-
-def write_shoreline(
-    path: File, points: NearWater, water: FoundSurface, crs: Any, *, overwrite: bool,
-    sigma_level_m: float | None = None,
-) -> dict[str, Any]:  # fmt: skip
-    """Write the lines of a cloud in its CRS, and return their figures for the summary.
-
-    The standard error of the water's height is `sigma_level_m`, else that of a fit, else `LEVEL_M`.
-    """
-    stated = LEVEL_M if sigma_level_m is None else sigma_level_m
-
-    def sigma(xy: FloatArray) -> FloatArray:
-        fitted = water.sigma_at(xy) if sigma_level_m is None else None
-        return np.full(len(xy), stated) if fitted is None else fitted
-
-    lines = points.lines(sigma)
-    layer = shoreline_layer(LAYER, lines)
-    write_layers(path, [layer], crs, overwrite=overwrite)
-    values = layer.values
-    length = float(values["length_m"].sum())
-    mean = float(np.sqrt(values["sigma_m"] ** 2 @ values["length_m"] / length)) if lines else None
-    return {"path": str(path), "lines": len(lines), "length_m": length, "sigma_m": mean}
-
-
-def shoreline_layer(name: str, lines: Sequence[Shoreline], style: str = "") -> Layer:
-    """Return lines as a layer, with level, standard error across the line, and length."""
-    values = {
-        figure: np.array([getattr(one, figure) for one in lines], np.float64)
-        for figure in ("level_m", "sigma_m", "length_m")
-    }
-    geometries = [shapely.linestrings(one.xy) for one in lines]
-    return Layer(name, "LineString", geometries, values, style)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,7 +20,6 @@ from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.files import check_input, check_output, write_bytes
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
-from pcfix.io.styles import limits_of
 from pcfix.lens.imaging import unproject
 from pcfix.libraries import load_open3d
 from pcfix.model import Cameras, FloatArray, WaterDimension, WaterSurface
@@ -44,7 +44,7 @@ AZIMUTH_DEG, ELEVATION_DEG = -119.0, 29.0
 MOST_DOTS = 30_000
 GREY = 0.72
 """Of points without a value, such as land where depths are shown."""
-SCALES = {"shift": "depth", "error": "depth"}
+MOST_PERCENT = 98.0
 COLOURS = {
     "depth": (colours.DEPTH, "Depth below the water (m)",
               "Give --water, or a cloud from 'pcfix correct'."),
@@ -91,8 +91,8 @@ def view_clouds(
     ----------
     clouds : sequence of path
         LAS or LAZ, in one CRS.
-    options
-        See `pcfix.correct_file`.
+    options : ViewerOptions, optional
+        Or its attributes as keywords: colour, reference, cameras, water, image and others.
 
     Returns
     -------
@@ -130,7 +130,8 @@ def view_clouds(
     low, high = (end([end(one, axis=0) for one in xyz], axis=0) for end in (np.min, np.max))
     lines = np.zeros((0, 2, 3))
     if given.cameras is not None:
-        lines = _frusta(given.part(Inputs).block(first.crs)[0], float(high[2]))
+        inputs = replace(given, water=0.0 if given.water is None else given.water).part(Inputs)
+        lines = _frusta(inputs.block(first.crs)[0], float(high[2]))
     ends = np.vstack([low, high, lines.reshape(-1, 3)])
     origin = (ends.min(axis=0) + ends.max(axis=0)) / 2.0
     scene = Scene3d(
@@ -227,7 +228,7 @@ def _sheet(surface: WaterSurface | None, low: FloatArray, high: FloatArray) -> F
 
 
 def scale_of(what: str, values: FloatArray) -> ScalarMappable:
-    """Return the colour scale of values, NaN where unknown.
+    """Return the colour scale of values, NaN where unknown; it leaves out 2 % at the ends.
 
     Its ``to_rgba`` gives colours; those of NaN are grey.
     """
@@ -235,9 +236,13 @@ def scale_of(what: str, values: FloatArray) -> ScalarMappable:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    # a shift begins at zero as a depth does; errors lie on both sides of it
-    low, high = limits_of(np.abs(values) if what == "error" else values, SCALES.get(what, what))
-    low = -high if what == "error" else low
+    known = values[np.isfinite(values)]
+    if what == "error":
+        high = max(float(np.percentile(np.abs(known), MOST_PERCENT)), 1e-3)
+        low = -high
+    else:
+        low = float(np.percentile(known, 100.0 - MOST_PERCENT)) if what == "height" else 0.0
+        high = max(float(np.percentile(known, MOST_PERCENT)), low + 1e-3)
     ramp = colormaps[COLOURS[what][0]].with_extremes(bad=(GREY, GREY, GREY))
     return ScalarMappable(Normalize(low, high), ramp)
 

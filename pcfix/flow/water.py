@@ -9,14 +9,8 @@ import numpy as np
 
 from pcfix.errors import plain, shown_once
 from pcfix.flow.runner import check_summary, write_summary
-from pcfix.flow.surfaces import (
-    check_shoreline,
-    file_points,
-    find_surface,
-    sample_of,
-    view_of,
-    write_shoreline,
-)
+from pcfix.flow.shore import check_shoreline, write_shoreline
+from pcfix.flow.surfaces import file_points, find_surface, sample_of, view_of
 from pcfix.grid.shoreline import NearWater
 from pcfix.io.files import check_input
 from pcfix.model import FloatArray, WaterDimension
