@@ -140,13 +140,15 @@ class CamerasReport:
 def sensors_of(cameras: Cameras, above_m: FloatArray | None) -> list[Plain]:
     """Return the sensors of a block; values are None where not stated.
 
-    Images of one sensor have its name, frame and projection. ``lenses`` counts the lenses that
-    differ, and ``folded`` is the share of the frame beyond the fold of the distortion.
+    A sensor is a lens, or if nearly each image has its own, a name with a frame and a projection.
+    ``lenses`` counts the lenses that differ, and ``folded`` is the share of the frame beyond the
+    fold of the distortion.
     """
     groups: dict[Any, list[int]] = {}
+    is_shared = 2 * len(set(cameras.lenses or ())) <= len(cameras)
     for row, lens in enumerate(cameras.lenses or ()):
-        key = lens.sensor, lens.width, lens.height, lens.unit, lens.projection
-        groups.setdefault(key, []).append(row)
+        kind = lens.sensor, lens.width, lens.height, lens.unit, lens.projection
+        groups.setdefault(lens if is_shared else kind, []).append(row)
     sensors = []
     for rows in groups.values():
         lenses = list(dict.fromkeys((cameras.lenses or ())[row] for row in rows))
