@@ -141,24 +141,10 @@ def plausible(
 ) -> Plausible:
     """Test cameras and cloud against each other.
 
-    Parameters
-    ----------
-    cameras : Cameras
-        In the cloud's frame, as the tie points.
-    cloud : array, shape (n, 3)
-        Points, metres, evenly spread over it.
-    ties : TiePoints, optional
-        Of these cameras.
-    level_doubts : tuple of PcfixWarning
-        See `CloudSample.level_doubts`.
-    file : path
-        Of the cameras.
-    water_m : float, optional
-        Median height of the water.
-    listed : bool
-        Whether the listed images were found to hold their points.
-    every : float
-        Points of the whole cloud for each of `cloud`.
+    Cameras and tie points are in the cloud's frame; `cloud` are some of its points, shape (n, 3),
+    metres, evenly spread, each of which stands for `every` of them. `level_doubts` are those of
+    `CloudSample`, `file` is that of the cameras, and `water_m` the median height of the water.
+    `listed` says whether the listed images were found to hold their points.
     """
     if not len(cameras) or not len(cloud):
         return Plausible((), level_doubts)

@@ -140,13 +140,8 @@ class Record:
     A step is done if the record has it with the same key, its outputs are as it left them, and no
     step before it had to be done. The file is written after each step.
 
-    Parameters
-    ----------
-    path : Path
-    request : dict
-        Everything that the results depend on.
-    inputs : dict
-        Input files, by the first step that reads them.
+    `request` is everything that the results depend on, and `inputs` are the input files by the
+    first step that reads them.
     """
 
     def __init__(

@@ -242,11 +242,8 @@ def adjust_first(request: Request, folder: Path, files: list[Path]) -> Plain:
 
     The files are inputs of the run, which the adjustment must not replace.
 
-    Returns
-    -------
-    dict
-        `model`, the file or folder with the cameras in that of the adjustment, None without one;
-        `why`; and `absorbed`, whether the poses absorbed refraction, None if that is not known.
+    Returns `model`, the file or folder with the cameras in that of the adjustment, None without
+    one; `why`; and `absorbed`, whether the poses absorbed refraction, None if that is not known.
     """
     model, why, absorbed = None, "", None
     try:
@@ -344,10 +341,6 @@ class RunResults:
 
     Rasters and lines are in the CRS of the cloud, metres. They need the extra ``analysis``, and are
     read from the files each time they are asked for.
-
-    Attributes
-    ----------
-    folder : Path
     """
 
     folder: Path

@@ -135,24 +135,10 @@ def run_command(
 ) -> Result:
     """Run a command that rewrites clouds over one file or many, and return its result.
 
-    Parameters
-    ----------
-    name : str
-        The command.
-    input, output, options
-        As the user gives them.
-    plan : callable
-        Takes a task for all files, and returns all that its points have in common; it can be
-        pickled.
-    work : callable
-        Returns what is done to one opened file by the plan.
-    finish : callable
-        Takes the plan, the task and the statistics of all points; refuses what cannot be right,
-        else returns the result.
-    reads : iterable
-        Further inputs.
-    progress : callable, optional
-        Called with (points done, points in all), with many files after each.
+    `plan` takes a task for all files, and returns all that its points have in common, which can be
+    pickled. `work` returns what is done to one opened file by the plan. `finish` takes the plan,
+    the task and the statistics of all points; it refuses what cannot be right, else returns the
+    result. `reads` are further inputs. With many files, `progress` is called after each.
     """
     tiles = tiles_of(input)
     if tiles is None:

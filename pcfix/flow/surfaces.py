@@ -218,16 +218,9 @@ def own_water_of(
 ) -> tuple[OwnWater | None, tuple[str, ...]]:
     """Return the separate water surfaces of images, and notes on them.
 
-    Parameters
-    ----------
-    folder : path or None
-        With rasters named after the images, and their standard errors in a folder ``sigma``.
-    cameras : Cameras
-    water : WaterSurface
-        That of the other images.
-    view : CloudView
-    level_offset_m : array, shape (k,), optional
-        Height of the water above `water` at each image.
+    The folder has rasters named after the images, and their standard errors in a folder ``sigma``.
+    `water` is that of the other images, and `level_offset_m`, shape (k,), how much higher the water
+    stood at each image.
     """
     if folder is None:
         return None, ()
