@@ -32,6 +32,7 @@ from pcfix import version
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.io import files
 from pcfix.io.atomic import all_or_none
+from pcfix.io.files import write_bytes, write_text
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix, corrected_identity, las_writer
 from pcfix.io.tiles import Clouds, Tiles, check_one_file, inputs_of, open_cloud, part_of, tiles_of
@@ -418,11 +419,11 @@ def write_summary(options: Any, summary: Any, figure: Callable[[], Figure] | Non
     if figure is not None and options.plot is not None:
         from pcfix.report.page import png_of
 
-        files.write_bytes(options.plot, png_of(figure()), overwrite=options.overwrite)
+        write_bytes(options.plot, png_of(figure()), overwrite=options.overwrite)
     path = getattr(options, "summary", None)
     if path is not None:
         values = summary if isinstance(summary, dict) else summary.as_dict()
-        files.write_text(path, json_text(values), overwrite=options.overwrite)
+        write_text(path, json_text(values), overwrite=options.overwrite)
 
 
 def check_cloud(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
