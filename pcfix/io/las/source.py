@@ -448,8 +448,9 @@ def centring_steps(header: laspy.LasHeader) -> tuple[int, ...]:
     That is 0 where they have room in 32 bits for a shift of `MOST_SHIFT_M`, or where the header
     states impossible bounds; else the middle of the axis becomes 0.
     """
-    low, high = ((end - header.offsets) / header.scales for end in (header.mins, header.maxs))
-    reach, most = np.maximum(np.abs(low), np.abs(high)), 2.0**31
+    ends, most = (header.mins, header.maxs), 2.0**31
+    low, high = (np.clip((one - header.offsets) / header.scales, -1e10, 1e10) for one in ends)
+    reach = np.maximum(np.abs(low), np.abs(high))
     is_near = (reach <= most) & (reach + MOST_SHIFT_M / header.scales > most)
     return tuple(np.where(is_near, -np.rint((low + high) / 2), 0.0).astype(int).tolist())
 
