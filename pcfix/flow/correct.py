@@ -401,15 +401,12 @@ def correct_points(
         "xyz", None, *corners(*xyz[:, :2].T), len(xyz), lambda water=None: iter([points])
     )
     transfer = None if adjusted_from is None else transfer_between(adjusted_from, cameras)
-    line, notes = regression, list[str]()
+    line, path = regression, None
     if isinstance(line, str | PathLike):
-        from pcfix.io.regressions import read_regression
-
-        line = read_regression(line)
-        notes = list(line.notes)
+        line, path = None, line
     plan = plan_of(
         with_index(all_options),
-        Inputs(cameras=cameras, water=surface),
+        Inputs(cameras=cameras, water=surface, regression=path),
         view,
         CameraInputs(cameras, None, original, transfer),
         FoundSurface(surface),
@@ -423,9 +420,10 @@ def correct_points(
     if tally.water is not None:
         tally.water.check_reach("xyz", surface, deep=given.deep)
     check_fit(plan, tally)
-    if line is not None and line is not regression and tally.beyond is not None:
-        notes += tally.beyond.notes(line)
-    for note in (*plan.input_notes, *coded("points.note", notes)):
+    line, beyond = plan.regression, list[str]()
+    if line is not None and tally.beyond is not None:
+        beyond = tally.beyond.notes(line)
+    for note in (*plan.input_notes, *coded("regression.range", beyond)):
         warnings.warn(note, stacklevel=2)
     return correction
 

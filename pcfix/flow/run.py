@@ -263,7 +263,7 @@ def _decide(request: Request) -> tuple[str, bool | None]:
     Without a datum that is not asked. Signs of absorbed refraction do not include the survey with
     which the result is compared: the cloud must not depend on it.
     """
-    if request.adjust != "auto":
+    if request.adjust != "auto" or request.cameras is None:
         return ("that was asked for" if request.adjust == "yes" else ""), None
     if request.why_not_adjust:
         return request.why_not_adjust, None
