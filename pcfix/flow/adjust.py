@@ -29,7 +29,7 @@ from pcfix.adjust.methods import (
     check_marks,
     unknowns_of,
 )
-from pcfix.adjust.result import Adjusted
+from pcfix.adjust.result import Adjusted, adjustment_dict, before_of
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.diagnosis import flags_of, water_word
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
@@ -61,6 +61,7 @@ from pcfix.model import (
 from pcfix.options.declare import File, taken
 from pcfix.options.survey import WATER_UNKNOWNS, AdjustOptions
 from pcfix.port.shapes import FlatPort, Port, spec_of
+from pcfix.report.adjustment import adjustment_page
 from pcfix.water.index import index_of
 
 if TYPE_CHECKING:
@@ -276,9 +277,6 @@ def _calibration(path: File, cameras: Cameras) -> Lens:
 
 def _write(folder: Path, found: Adjusted, model: str) -> None:
     """Write an adjusted block: model, camera files, summary, report; all or nothing."""
-    from pcfix.adjust.result import adjustment_dict, before_of
-    from pcfix.report.adjustment import adjustment_page
-
     before = before_of(found)
     with temporary_folder(folder) as draft:
         _write_models(draft, found)

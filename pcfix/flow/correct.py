@@ -10,23 +10,29 @@ import warnings
 from dataclasses import fields, replace
 from itertools import compress
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, coded
 from pcfix.flow.correction import CloudTally, Plan, correct_chunk
+from pcfix.flow.diagnosis import diagnose_in_passing, quick_ties
 from pcfix.flow.inputs import CameraInputs, Inputs, paths_in, transfer_between
 from pcfix.flow.planning import plan_correction, plan_of, read_inputs
 from pcfix.flow.plausibility import CloudSample, Plausible, plausible
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
+from pcfix.flow.shore import write_shoreline
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
+from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps, part_report
 from pcfix.io.las.writing import corrected_header
+from pcfix.io.regressions import write_regression
 from pcfix.io.tiles import Clouds
+from pcfix.io.views import ViewReport, beside
 from pcfix.label.labelling import Labelling
+from pcfix.lens.frames import beside_frames
 from pcfix.model import (
     BATHYMETRIC_POINT,
     NO_CAMERAS,
@@ -47,16 +53,13 @@ from pcfix.options.correct import (
     ScienceOptions,
 )
 from pcfix.options.declare import File, taken
+from pcfix.refract.regression import LEAST_BEYOND, DepthRegression
 from pcfix.refract.tally import Tally
 from pcfix.report.summary import Summary
 from pcfix.version import __version__
 from pcfix.water.checks import as_surface, check_submerged, checked_points, refuse_under_water
 from pcfix.water.index import with_index
 from pcfix.water.surface import FoundSurface
-
-if TYPE_CHECKING:
-    from pcfix.io.views import ViewReport
-    from pcfix.refract.regression import DepthRegression
 
 
 def correct_file(
@@ -143,14 +146,10 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     counts, uncertainty = figures.as_dict(), figures.uncertainty(plan.made)
     tested, poses, absorbed, shoreline = None, None, None, None
     if plan.inputs.port is None:
-        from pcfix.flow.diagnosis import diagnose_in_passing, quick_ties
-
         ties = quick_ties(plan.inputs, plan.view.crs) if len(plan.cameras) else None
         tested = check_fit(plan, tally, ties)
         poses, absorbed = diagnose_in_passing(plan, ties)
         if tally.shore is not None and options.shoreline is not None:
-            from pcfix.flow.shore import write_shoreline
-
             shoreline = write_shoreline(
                 options.shoreline, tally.shore, plan.found, plan.view.crs,
                 overwrite=options.overwrite, sigma_level_m=options.sigma_level,
@@ -167,8 +166,6 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         water = f"all around, seen through a {plan.inputs.port}"
     path, line = options.save_regression, plan.regression
     if path is not None and line is not None:
-        from pcfix.io.regressions import write_regression
-
         write_regression(path, line, overwrite=options.overwrite)
     if options.unsure != "withhold":
         counts["unsure"] = None
@@ -176,8 +173,6 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     not_moved = sum(counts["uncorrected"].values()) + int(figures.outcomes[Outcome.NOT_CARRIED])
     made, detected = plan.made, [*plan.notes]
     if tally.beyond is not None and line is not None:
-        from pcfix.refract.regression import LEAST_BEYOND
-
         least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
         detected += coded("regression.range", tally.beyond.notes(line, least))
     notes = [
@@ -267,8 +262,6 @@ def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
             f"no submerged point has two rays within {limit or 90.0:g} deg of the surface"
             f" normal; {flat:,} points have rays at larger angles. Increase --max-angle."
         )
-    from pcfix.io.cameras.mistakes import likely_mistake
-
     middle = (figures.low + figures.high) / 2.0
     distance = float(np.hypot(*(plan.cameras.centres - middle)[:, :2].T).min())
     within = f" within {limit:g} degrees" if limit else ""
@@ -446,9 +439,6 @@ def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:
         raise SettingError(
             "views.camera", f"views name camera {camera.max()}, but there are {len(cameras)}."
         )
-    from pcfix.io.views import beside
-    from pcfix.lens.frames import beside_frames
-
     counts = beside_frames(points, views, cameras)
     if counts.any():
         entries, outside = int(counts.sum()), int(np.count_nonzero(counts))

@@ -9,14 +9,17 @@ a water surface: all points are below it, whatever their height, and have no dep
 from __future__ import annotations
 
 from dataclasses import asdict, astuple, dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from pcfix.adjust.transfer import CloudTransfer, TransferCounts, Transferred
 from pcfix.errors import PcfixWarning
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.plausibility import CloudSample
 from pcfix.flow.surfaces import CloudView, Points
+from pcfix.grid.shoreline import NearWater
+from pcfix.io.views import ViewMatch, ViewReport
 from pcfix.label.labelling import LabelCounts, Labelling
 from pcfix.model import (
     BoolArray,
@@ -29,20 +32,16 @@ from pcfix.model import (
     WaterPlane,
 )
 from pcfix.options.correct import CorrectOptions, ScienceOptions
+from pcfix.port.methods import correct_through_port
 from pcfix.refract.batch import Batch, Intersection, OriginalModel, Survey
 from pcfix.refract.methods import correct, shift_of_land
 from pcfix.refract.reconstructions import Verdict
+from pcfix.refract.regression import BeyondRange, DepthRegression
 from pcfix.refract.tally import Tally
 from pcfix.sums import Sums
 from pcfix.version import __version__
 from pcfix.water.checks import WaterMeeting
 from pcfix.water.surface import FoundSurface, surface_above
-
-if TYPE_CHECKING:
-    from pcfix.adjust.transfer import CloudTransfer, TransferCounts, Transferred
-    from pcfix.grid.shoreline import NearWater
-    from pcfix.io.views import ViewMatch, ViewReport
-    from pcfix.refract.regression import BeyondRange, DepthRegression
 
 OWN_WATER = "Each image has its own water surface; only snell and consistent can use them."
 
@@ -195,8 +194,6 @@ def correct_chunk(
     xyz, above = points.xyz, batch.surface
     submerged, labels = plan.labelling.submerged(xyz, above, points.classes)
     if plan.inputs.port is not None:
-        from pcfix.port.methods import correct_through_port
-
         rows, settings = np.flatnonzero(submerged), plan.survey.settings
         wet, n = batch.take(rows), len(batch)
         found = correct_through_port(wet.xyz, plan.cameras, plan.inputs.port, settings, wet.views)
@@ -207,20 +204,14 @@ def correct_chunk(
     correction = _through_water(plan, batch, np.flatnonzero(submerged), covariances=covariances)
     beyond, line = None, plan.regression
     if line is not None:
-        from pcfix.refract.regression import BeyondRange
-
         beyond = BeyondRange.of((above.height_m - xyz[:, 2])[correction.submerged], line)
     shore = None
     if plan.options.shoreline is not None:
-        from pcfix.grid.shoreline import NearWater
-
         higher = xyz[:, 2] + correction.shift_m[:, 2] - above.height_m
         height = np.where(correction.submerged, -correction.depth_m, higher)
         shore = NearWater.of(xyz + correction.shift_m, height, correction.sigma_z_m)
     moved = None
     if step is not None:
-        from pcfix.adjust.transfer import TransferCounts
-
         correction = step.whole(correction)
         moved = TransferCounts.of(step, correction)
     return correction, CloudTally(

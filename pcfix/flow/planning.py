@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import compress
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pcfix.errors import PcfixWarning, SettingError, coded
+from pcfix.flow.check_depths import check_regression, regression_of
 from pcfix.flow.correction import Plan, batch_of, transferred
 from pcfix.flow.inputs import (
     CameraInputs,
@@ -23,8 +23,11 @@ from pcfix.flow.inputs import (
     paths_in,
     read_blocks,
 )
+from pcfix.flow.shore import check_shoreline
 from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
 from pcfix.io.las.source import CHUNK_POINTS
+from pcfix.io.views import ViewMatch
+from pcfix.label.labelling import Labelling
 from pcfix.model import NOISE_CLASSES, FloatArray, Views, WaterPlane
 from pcfix.options.correct import CorrectOptions
 from pcfix.refract import learning
@@ -38,16 +41,13 @@ from pcfix.refract.batch import (
     stacked,
 )
 from pcfix.refract.methods import with_rays
+from pcfix.refract.occlusion import Occluder, OccluderBuilder, wants_occlusion
 from pcfix.refract.patches import PATCH_WIDTH, Squares
 from pcfix.refract.reconstructions import hint_of
+from pcfix.refract.regression import DepthRegression
 from pcfix.water.checks import check_above_water, check_tilt
 from pcfix.water.index import with_index
 from pcfix.water.surface import FoundSurface, is_submerged, surface_above
-
-if TYPE_CHECKING:
-    from pcfix.label.labelling import Labelling
-    from pcfix.refract.occlusion import Occluder
-    from pcfix.refract.regression import DepthRegression
 
 FLAT_SHARE, FLAT_SAMPLE = 0.01, 20_000
 """Share of the submerged points above which it is noted, and size of the sample for it."""
@@ -70,8 +70,6 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
         options.check_no_cameras()
     blocks, match, listed = read_blocks(inputs, view.crs), None, None
     if blocks.views is not None:
-        from pcfix.io.views import ViewMatch
-
         match = ViewMatch(blocks.views, blocks.listed, points=view.points, step_m=view.step_m)
         listed = blocks.views.listed
     if inputs.port is not None:
@@ -90,8 +88,6 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
             notes=tuple(notes),
         )  # fmt: skip
     if options.shoreline is not None:
-        from pcfix.flow.shore import check_shoreline
-
         reads = paths_in(options)
         check_shoreline(options.shoreline, overwrite=options.overwrite, inputs=reads)
     found = inputs.surface(view)
@@ -101,8 +97,6 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
     )
     check_tilt(found.surface)
     if plan.survey.settings.method == "regression":
-        from pcfix.flow.check_depths import check_regression
-
         check_regression(inputs)
     return replace(plan, match=match, input_notes=(*blocks.cameras.notes, *plan.input_notes))
 
@@ -170,8 +164,6 @@ def plan_correction(plan: Plan) -> Plan:
     labelling = plan.labelling.scanned(parts_of(chunks(), water), view.low, view.high)
     plan = replace(plan, labelling=labelling)
     if (inputs.check_depths or inputs.regression) is not None and plan.regression is None:
-        from pcfix.flow.check_depths import regression_of
-
         line, notes = regression_of(inputs, view, chunks(), plan.survey)
         survey = replace(plan.survey, learned=plan.survey.learned._replace(regression=line))
         plan = replace(plan, survey=survey, notes=tuple(coded("regression.fit", notes)))
@@ -293,11 +285,8 @@ def _scanned(
     far apart to detect the reconstruction type, submerged points in squares are returned too.
     """
     view, survey, builder = plan.view, plan.survey, None
-    if occluder:
-        from pcfix.refract.occlusion import OccluderBuilder, wants_occlusion
-
-        if view.points and wants_occlusion(survey.cameras, survey.settings):
-            builder = OccluderBuilder(view.low, view.high, view.points)
+    if occluder and view.points and wants_occlusion(survey.cameras, survey.settings):
+        builder = OccluderBuilder(view.low, view.high, view.points)
     if not sample and builder is None:
         return None, None, None
     # the bed of depth maps needs about 5 points per square metre, wherever the cloud is denser

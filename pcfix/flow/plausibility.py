@@ -13,11 +13,14 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.flow.surfaces import Points
+from pcfix.io.cameras.georeference import adjusted_minus_gnss
+from pcfix.io.tides import read_altitudes
 from pcfix.lens.frames import cameras_in_sight
 from pcfix.lens.imaging import straight_images
 from pcfix.model import Cameras, FloatArray, TiePoints
 from pcfix.options.declare import File
 from pcfix.sums import SAME, Sums
+from pcfix.water.auto import LEAST_POINTS, find_elsewhere
 
 SAMPLE_POINTS, IN_FRAMES = 30_000, 4_000
 """Points of the sample, and those of it that are tested in the frames; evenly spread."""
@@ -97,8 +100,6 @@ class CloudSample(Sums):
 
     def level_doubts(self) -> tuple[PcfixWarning, ...]:
         """Return warnings if the shoreline in the cloud is at another height than the water."""
-        from pcfix.water.auto import LEAST_POINTS, find_elsewhere
-
         xyz, water = self.xyz, np.concatenate([np.zeros(0), *self.water])
         known = np.isfinite(water)
         if known.sum() < LEAST_POINTS:
@@ -361,8 +362,6 @@ def positions(cameras: Cameras, name: str) -> Result:
     """Compare the places of cameras with those that their GNSS recorded."""
     if cameras.gnss is None:
         return Result()
-    from pcfix.io.cameras.georeference import adjusted_minus_gnss
-
     try:
         found = adjusted_minus_gnss(cameras, name)[0][:, :2]
     except InputError:
@@ -383,8 +382,6 @@ def positions(cameras: Cameras, name: str) -> Result:
 
 def flying_heights(cameras: Cameras, file: File, water_m: float | None) -> Result:
     """Compare the heights of cameras above the water with those recorded above take-off."""
-    from pcfix.io.tides import read_altitudes
-
     recorded = read_altitudes(file, cameras.labels)
     rows = np.flatnonzero(np.isfinite(recorded))
     if not len(rows) or water_m is None:
