@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.flow.surfaces import Points
@@ -236,8 +237,6 @@ def _spacing(cameras: Cameras, cloud: FloatArray, every: float) -> Result:
     pixel = _pixel_m(cameras, cloud)
     if pixel is None or len(cloud) <= AROUND:
         return Result()
-    from scipy.spatial import cKDTree  # not quick to load
-
     places = cloud[:, :2]
     reach = np.asarray(cKDTree(places).query(places[:: 1 + len(places) // TIES], k=AROUND + 1)[0])
     area = np.pi * float(np.median(reach[:, -1])) ** 2 / (AROUND * every)
@@ -314,8 +313,6 @@ def _heights(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Res
             " Poses, lens and points of the camera file do not belong together; export them again.",
             share=residual,
         )
-    from scipy.spatial import cKDTree  # not quick to load
-
     placed = ties.xyz[np.isfinite(ties.xyz).all(axis=1)]
     placed = placed[:: 1 + len(placed) // TIES]
     tree = cKDTree(cloud[:, :2])
