@@ -24,7 +24,7 @@ from pcfix.model import NOISE_CLASSES
 from pcfix.report.adjustment import adjustment_tables
 from pcfix.report.comparison import evaluation, in_a_sentence
 from pcfix.report.page import Picture, Report, Table, render
-from pcfix.report.run import RunPage, in_short, run_report
+from pcfix.report.run import RunResults, in_short, run_report
 from pcfix.report.summary import Summary
 from pcfix.report.text import uncertainty_sentence
 
@@ -73,7 +73,7 @@ def report_run(
         tables += adjustment_tables(figures, f"{FOLDER}/report.html")
     if (summary.water_fit or {}).get("model") == "auto":  # the water was sought in the cloud
         pictures.append(found_picture(run.inputs.surface(view_of(request.source))))
-    results = RunPage(
+    results = RunResults(
         summary, run.cameras, **read_cloud(run.cleaned_cloud, run.resolution_m),
         project=request.project or "", date=request.date or "",
         pictures=pictures, tables=tables, verdict=verdict, compared=compared.get("figures", {}),
@@ -86,7 +86,7 @@ def report_run(
     }
 
 
-def write_report(run: RunPage, inputs: Sequence[Path], out_dir: Path) -> Report:
+def write_report(run: RunResults, inputs: Sequence[Path], out_dir: Path) -> Report:
     """Write ``report.html`` and ``figures/*.png`` of a run, into an existing folder.
 
     The page lists size and checksum of the files `inputs`.
@@ -119,7 +119,7 @@ def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> Plain:
     """Return maps, depths, a sample, CRS and vertical datum of a cloud, without noise.
 
     The cloud is from `correct_file` with all dimensions, cleaned or not. The names are those of
-    `RunPage`; `resolution_m` is that of the rasters.
+    `RunResults`; `resolution_m` is that of the rasters.
     """
     with open_cloud(path) as source:
         dimensions = set(source.header.point_format.dimension_names)

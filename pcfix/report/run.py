@@ -51,7 +51,7 @@ UNKNOWN_DATUM = "vertical datum not known"
 
 
 @dataclass(frozen=True, eq=False)
-class RunPage:
+class RunResults:
     """Everything that the page of a run shows."""
 
     summary: Summary
@@ -70,7 +70,7 @@ class RunPage:
     difference: tuple[FloatArray, Extent] | None = None  # cloud minus reference, metres
 
 
-def run_report(run: RunPage, inputs: Table, files: Sequence[Pair]) -> Report:
+def run_report(run: RunResults, inputs: Table, files: Sequence[Pair]) -> Report:
     """Return the page of a run; `inputs` lists the files read, `files` those beside the page."""
     s, depth = run.summary, run.depth_m
     versions = [["pcfix", __version__], ["Python", platform.python_version()]]
@@ -140,7 +140,7 @@ def run_report(run: RunPage, inputs: Table, files: Sequence[Pair]) -> Report:
     )
 
 
-def _layers(run: RunPage) -> list[Layer]:
+def _layers(run: RunResults) -> list[Layer]:
     """Return the choices of the map, depth first."""
     maps, known = run.maps, np.isfinite(run.maps.uncertainty_m).any()
     by = "Uncertainty (95 %)" if known else ""
@@ -168,7 +168,7 @@ def _worded(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _pictures(run: RunPage) -> list[Picture]:
+def _pictures(run: RunResults) -> list[Picture]:
     """Return the map of depths, the cameras, and TVU over depth where there are standard errors."""
     s, maps, depth = run.summary, run.maps, run.depth_m
     interval = depth_interval(maps.depth_m, maps.uncertainty_m)
@@ -209,7 +209,7 @@ def _pictures(run: RunPage) -> list[Picture]:
     return pictures
 
 
-def cameras_figure(run: RunPage) -> Figure:
+def cameras_figure(run: RunResults) -> Figure:
     """Draw the projection centres in plan over the cloud."""
     maps, cameras = run.maps, run.cameras
     used = ~np.isin(np.array(cameras.labels), run.summary.cameras_unused)

@@ -18,7 +18,7 @@ from pcfix.flow.report import read_cloud, write_report
 from pcfix.grid.maps import MapsBuilder
 from pcfix.report.map_data import Layer
 from pcfix.report.page import Report, Table, Tile, render
-from pcfix.report.run import RunPage
+from pcfix.report.run import RunResults
 from tests.utils.browser import needs_browser, open_page
 
 SCENE = Path(__file__).parents[2] / "samples" / "scene"
@@ -33,7 +33,7 @@ def report(tmp_path_factory):
         cloud, folder / "corrected.laz", cameras=cameras, water=0.37, method="snell", max_angle=None
     )
     found = read_cloud(folder / "corrected.laz")
-    run = RunPage(summary, pcfix.read_cameras(cameras), **found)
+    run = RunResults(summary, pcfix.read_cameras(cameras), **found)
     write_report(run, [cloud, cameras], folder)
     return folder, summary
 
