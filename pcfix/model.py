@@ -9,15 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import PcfixWarning, SettingError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 IntArray: TypeAlias = npt.NDArray[np.int64]
@@ -396,10 +393,6 @@ class Outcome(IntEnum):
     """Two cameras or more see it, but fewer than two within the largest angle."""
 
 
-PART_POINTS = 32_768
-"""Points of each of `Correction.parts`: an array of them has 256 kB."""
-
-
 @dataclass(frozen=True, eq=False)
 class Correction:
     """The result for n points, one row per input point; zero on land.
@@ -454,21 +447,6 @@ class Correction:
     lowest_water_m: float
     covariance_m2: FloatArray | None = None
     unsure: BoolArray | None = None
-
-    def parts(self) -> Iterator[tuple[slice, Correction]]:
-        """Yield consecutive rows and their results, without covariances.
-
-        The rows fit into the processor's cache: several operations on them are much faster than on
-        all points.
-        """
-        per_point = [
-            name for name, value in vars(self).items()
-            if isinstance(value, np.ndarray) and name not in ("camera_used", "covariance_m2", "xyz")
-        ]  # fmt: skip
-        for first in range(0, len(self.outcome), PART_POINTS):
-            rows = slice(first, first + PART_POINTS)
-            some = {name: getattr(self, name)[rows] for name in per_point}
-            yield rows, replace(self, covariance_m2=None, **some)
 
     @cached_property
     def xyz(self) -> FloatArray:

@@ -24,13 +24,13 @@ CLOUD = "LAS or LAZ to write; a folder for tiles."
 
 
 def _summarized(
-    title: str, work: Callable[..., Any], text: str, quiet: bool, unit: str = "points"
+    title: str, text: str, quiet: bool, work: Callable[..., Any], *given: Any, unit: str = "points"
 ) -> None:
-    """Do the work with a progress bar, and print its summary by a function of `pcfix.report`."""
+    """Call a function of two files and options with a bar, and print its summary as a text."""
     from pcfix.report import text as texts
 
     with progress_bar(title, quiet, unit=unit) as progress:
-        result = work(progress=progress)
+        result = work(*given[:2], options=given[2], progress=progress)
     say(getattr(texts, text)(result), quiet)
 
 
@@ -71,8 +71,7 @@ def run(
 )
 def correct(input: str, output: Path, /, *, options: CorrectOptions, quiet: bool) -> None:
     """Correct a point cloud for refraction at the water surface."""
-    work = partial(pcfix.correct_file, input, output, options=options)
-    _summarized("Correcting", work, "summary_text", quiet)
+    _summarized("Correcting", "summary_text", quiet, pcfix.correct_file, input, output, options)
 
 
 @command(
@@ -86,7 +85,7 @@ def adjust(
 ) -> None:
     """Refine camera poses and lens by a refractive bundle adjustment."""
     from pcfix.adjust.result import adjustment_dict, before_of
-    from pcfix.flow.next_steps import correct_words
+    from pcfix.flow.adjust import correct_words
     from pcfix.report.adjustment import adjustment_text
     from pcfix.running import threads
 
@@ -100,15 +99,13 @@ def adjust(
 @command("pcfix label cloud.laz labelled.laz --water shore.csv", input=TILED, output=CLOUD)
 def label(input: str, output: Path, /, *, options: LabelOptions, quiet: bool) -> None:
     """Classify points below the water surface (class 40)."""
-    work = partial(pcfix.label_file, input, output, options=options)
-    _summarized("Labelling", work, "labelling_text", quiet)
+    _summarized("Labelling", "labelling_text", quiet, pcfix.label_file, input, output, options)
 
 
 @command("pcfix clean corrected.laz cleaned.laz", input=TILED, output=CLOUD)
 def clean(input: str, output: Path, /, *, options: CleanOptions, quiet: bool) -> None:
     """Flag noise: outliers, weak intersections, points far from the bed."""
-    work = partial(pcfix.clean_file, input, output, options=options)
-    _summarized("Cleaning", work, "cleaning_text", quiet)
+    _summarized("Cleaning", "cleaning_text", quiet, pcfix.clean_file, input, output, options)
 
 
 @command(
@@ -118,8 +115,7 @@ def clean(input: str, output: Path, /, *, options: CleanOptions, quiet: bool) ->
 )
 def dsm(input: str, output: Path, /, *, options: DsmOptions, quiet: bool) -> None:
     """Grid a cloud to a GeoTIFF: height, count and spread."""
-    work = partial(pcfix.grid_dsm, input, output, options=options)
-    _summarized("Gridding", work, "dsm_text", quiet)
+    _summarized("Gridding", "dsm_text", quiet, pcfix.grid_dsm, input, output, options)
 
 
 @command(
@@ -129,8 +125,8 @@ def dsm(input: str, output: Path, /, *, options: DsmOptions, quiet: bool) -> Non
 )
 def ortho(images: Path, output: Path, /, *, options: OrthoOptions, quiet: bool) -> None:
     """Make an orthophoto of land and bed from photographs and the corrected DSM."""
-    work = partial(pcfix.ortho_photo, images, output, options=options)
-    _summarized("Laying out", work, "ortho_text", quiet, unit="cells")
+    given = images, output, options
+    _summarized("Laying out", "ortho_text", quiet, pcfix.ortho_photo, *given, unit="cells")
 
 
 @command(
@@ -172,8 +168,7 @@ def photos(images: Path, out_dir: Path, /, *, options: PhotosOptions, quiet: boo
 )
 def calm(frames: Path, out: Path, /, *, options: CalmOptions, quiet: bool) -> None:
     """Combine a burst of frames into one image as seen through calm water."""
-    work = partial(pcfix.calm_frames, frames, out, options=options)
-    _summarized("Calming", work, "calm_text", quiet)
+    _summarized("Calming", "calm_text", quiet, pcfix.calm_frames, frames, out, options)
 
 
 @command(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -28,10 +29,10 @@ from pcfix.adjust.methods import (
     check_marks,
     unknowns_of,
 )
-from pcfix.adjust.result import Adjusted
+from pcfix.adjust.result import Adjusted, adjustment_dict, before_of
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError, bad_file
+from pcfix.flow.diagnosis import flags_of, water_word
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
-from pcfix.flow.next_steps import WATER as WATER_FILE
 from pcfix.flow.runner import check_folder
 from pcfix.flow.surfaces import sample_of, view_of
 from pcfix.io.atomic import temporary_folder
@@ -58,13 +59,20 @@ from pcfix.model import (
 )
 from pcfix.options.declare import File, taken
 from pcfix.options.survey import WATER_UNKNOWNS, AdjustOptions
-from pcfix.port.shapes import FlatPort, Port
+from pcfix.port.shapes import FlatPort, Port, spec_of
+from pcfix.report.adjustment import adjustment_page
 from pcfix.water.index import index_of
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
 SUMMARY = "adjustment.json"
+FOLDER = "adjusted"
+"""The folder of an adjustment in that of a run."""
+MODELS = ("colmap", "cameras.csv")
+"""The models that an adjustment writes, the preferred one first."""
+WATER_FILE = "water.tif"
+"""The water of an adjustment, where it is not a plane and was adjusted."""
 
 CLOUD_POINTS = 6000
 """Points of the cloud that stand for tie points."""
@@ -102,10 +110,6 @@ def adjust_cameras(
     progress : callable, optional
         Called with the `LogRow` of each step.
 
-    Returns
-    -------
-    Adjusted
-
     Raises
     ------
     PcfixError
@@ -141,7 +145,7 @@ def adjust_into(
             " model of the software, or --sensor."
         )
         raise InputError("cameras.no_angles", words, path=name)
-    water = None if inputs.water is None else inputs.surface(view).surface
+    water = None if inputs.port is not None else inputs.surface(view).surface
     if isinstance(water, WaterDimension):
         words = (
             f"The water {water} is known at points of the cloud only. For an adjustment, give it as"
@@ -272,9 +276,6 @@ def _calibration(path: File, cameras: Cameras) -> Lens:
 
 def _write(folder: Path, found: Adjusted, model: str) -> None:
     """Write an adjusted block: model, camera files, summary, report; all or nothing."""
-    from pcfix.adjust.result import adjustment_dict, before_of
-    from pcfix.report.adjustment import adjustment_page
-
     before = before_of(found)
     with temporary_folder(folder) as draft:
         _write_models(draft, found)
@@ -317,3 +318,28 @@ def _write_models(folder: Path, found: Adjusted) -> None:
         raise InputError(
             "output.format", "No camera format can hold these lenses: " + " ".join(failed)
         )
+
+
+def correct_words(found: Adjusted, model: File, out_dir: File, options: AdjustOptions) -> str:
+    """Return the command that transfers the cloud to the adjusted poses, and corrects it."""
+    out = Path(out_dir)
+    cameras = next((one for one in MODELS if (out / one).exists()), MODELS[0])
+    head = ["pcfix", "correct", str(options.cloud or "CLOUD.laz"), "corrected.laz"]
+    words = [*head, "--cameras", str(out / cameras)]
+    if options.port is not None:  # before a port no cloud is transferred: it is reconstructed
+        moved = found.port if {"distance", "centre"} & set(options.free) else None
+        words[2] = "CLOUD.laz"
+        return shlex.join([*words, "--port", spec_of(moved) if moved else str(options.port)])
+    water = water_word(options.water)
+    if isinstance(found.water, WaterPlane) or (out / WATER_FILE).exists():
+        water, plane = str(out / WATER_FILE), found.water
+        if isinstance(plane, WaterPlane):
+            water = f"plane:{plane.a:.15g},{plane.b:.15g},{plane.c:.15g}"
+            water = f"{plane.a:.3f}" if plane.b == plane.c == 0.0 else water
+        options = replace(options, water_model="auto", water_crs=None)
+    words += ["--adjusted-from", str(model), "--water", water]
+    if "index" in options.free or options.sigma_index is not None:
+        words += ["--index", f"{found.refractive_index:.6g}"]
+    elif options.index is not None:
+        words += ["--index", f"{options.index}"]
+    return shlex.join([*words, *flags_of(options)])

@@ -70,10 +70,9 @@ def calm_frames(
     out : path
         Image in the format of the frames, with the metadata of the first; PNG for a video. The
         spread is written next to it, and with `surface` a folder of rasters of the water.
-    options : CalmOptions, optional
-        Or its attributes as keywords.
-    progress : callable, optional
-        Called with (frames done, frames in all); each is read twice, with `surface` three times.
+    options, progress
+        See `pcfix.correct_file`; progress is in frames, each of which is read twice, with `surface`
+        three times.
     """
     given = taken(CalmOptions, options, keywords, "calm_frames")
     check_summary(given)

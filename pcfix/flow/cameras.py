@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +9,8 @@ import numpy as np
 
 from pcfix.adjust.diagnosis import EXPORT, Diagnosis
 from pcfix.errors import InputError, SettingError, plain, shown_once
-from pcfix.flow.diagnosis import diagnose_inputs, has_datum, quick_ties
+from pcfix.flow.diagnosis import adjust_words, diagnose_inputs, has_datum, quick_ties
 from pcfix.flow.inputs import Inputs, paths_in
-from pcfix.flow.next_steps import adjust_words
 from pcfix.flow.plausibility import plausible
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import CloudView, sample_of, view_of
@@ -36,7 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_SENSORS = 8
-"""Lines on lenses; if there are more, they are grouped by sensor and frame, or by kind."""
+"""Sensors in the text; the others are counted."""
 SAMPLE_POINTS = 50_000
 """Points of the cloud that are tested in the frames, evenly spread."""
 MOST_FOOTPRINTS = 400
@@ -52,8 +50,8 @@ def check_cameras(
     ----------
     path : path
         See `pcfix.read_cameras`.
-    options : CamerasCheckOptions, optional
-        Or its attributes as keywords. With a cloud and water it is tested whether the poses have
+    options
+        See `pcfix.correct_file`. With a cloud and water it is tested whether the poses have
         absorbed refraction, see `pcfix.adjust.diagnosis`.
     """
     given = taken(CamerasCheckOptions, options, keywords, "check_cameras")
@@ -64,8 +62,7 @@ def check_cameras(
             if getattr(given, name) is not None:
                 sentence = f"{name} needs cloud and water, to test for absorbed refraction."
                 raise SettingError("option.needs", sentence, options=[name, "cloud", "water"])
-    water = 0.0 if given.water is None else given.water
-    inputs = replace(replace(given, water=water).part(Inputs), cameras=path)
+    inputs = replace(given.part(Inputs), cameras=path)
     read = shown_once(inputs.read, lambda cameras: cameras.notes)
     view = None if cloud is None else view_of(check_input(cloud))
     surface = None if given.water is None else inputs.surface(view).surface
@@ -141,54 +138,41 @@ class CamerasReport:
 
 
 def sensors_of(cameras: Cameras, above_m: FloatArray | None) -> list[Plain]:
-    """Return the lenses of a block: each separately, or grouped by frame or kind if many."""
-    lenses = cameras.lenses or ()
-    keys: list[Callable[[Lens], Any]] = [
-        lambda lens: lens,
-        lambda lens: (lens.sensor, lens.width, lens.height, lens.unit, lens.projection),
-        lambda lens: (lens.unit, lens.projection, _is_distorted(lens)),
-    ]
+    """Return the sensors of a block; values are None where not stated.
+
+    A sensor is a lens, or if nearly each image has its own, a name with a frame and a projection.
+    ``lenses`` counts the lenses that differ, and ``folded`` is the share of the frame beyond the
+    fold of the distortion.
+    """
     groups: dict[Any, list[int]] = {}
-    for key in keys:
-        groups = {}
-        for row, lens in enumerate(lenses):
-            groups.setdefault(key(lens), []).append(row)
-        # separately only if most lenses have several images
-        if len(groups) <= MOST_SENSORS and (key is not keys[0] or len(groups) <= len(lenses) // 2):
-            break
-    above = np.full(len(lenses), np.nan) if above_m is None else above_m
-    return [
-        _sensor([lenses[row] for row in rows], float(np.mean(above[rows])))
-        for rows in groups.values()
-    ]
+    is_shared = 2 * len(set(cameras.lenses or ())) <= len(cameras)
+    for row, lens in enumerate(cameras.lenses or ()):
+        kind = lens.sensor, lens.width, lens.height, lens.unit, lens.projection
+        groups.setdefault(lens if is_shared else kind, []).append(row)
+    sensors = []
+    for rows in groups.values():
+        lenses = list(dict.fromkeys((cameras.lenses or ())[row] for row in rows))
+        lens = lenses[0]
+        height_m = 0.0 if above_m is None else float(np.mean(above_m[rows]))
+        sensors.append({
+            "name": lens.sensor,
+            "images": len(rows),
+            "width": lens.width,
+            "height": lens.height,
+            "focal": min(one.focal for one in lenses),
+            "focal_most": max(one.focal for one in lenses),
+            "unit": lens.unit,
+            "projection": lens.projection,
+            "distorted": _is_distorted(lens),
+            "gsd_m": height_m / lens.focal if height_m > 0.0 and lens.unit == "px" else None,
+            "lenses": len(lenses),
+            "folded": max(_folded(one) for one in lenses[:: 1 + len(lenses) // 20]),
+        })  # fmt: skip
+    return sensors
 
 
 def _is_distorted(lens: Lens) -> bool:
     return any((*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism))
-
-
-def _sensor(lenses: list[Lens], above_m: float) -> Plain:
-    """Return a sensor from the lenses of its images, `above_m` the water on average.
-
-    Values are None where not stated. ``lenses`` and ``frames`` count those that differ, and
-    ``folded`` is the share of the frame beyond the fold of the distortion.
-    """
-    lens, alike = lenses[0], list(dict.fromkeys(lenses))
-    return {
-        "name": lens.sensor if all(one.sensor == lens.sensor for one in alike) else "several",
-        "images": len(lenses),
-        "width": lens.width,
-        "height": lens.height,
-        "focal": min(one.focal for one in alike),
-        "focal_most": max(one.focal for one in alike),
-        "unit": lens.unit,
-        "projection": lens.projection,
-        "distorted": _is_distorted(lens),
-        "gsd_m": above_m / lens.focal if above_m > 0.0 and lens.unit == "px" else None,
-        "lenses": len(alike),
-        "frames": len({(one.width, one.height) for one in alike}),
-        "folded": max(_folded(one) for one in alike[:: 1 + len(alike) // 20]),
-    }
 
 
 def _folded(lens: Lens) -> float:
@@ -227,21 +211,10 @@ def _fit(
     ``seen_by`` are the shares of the points that 0, 1, 2, 3 or more frames hold. The verdict is
     what is likely wrong, empty where cameras and cloud match.
     """
-    from scipy.spatial import cKDTree
-
     visible = np.minimum(cameras_in_sight(xyz, cameras), 3)
     shares = np.bincount(visible, minlength=4) / len(xyz)
-    low, high, centres = xyz.min(axis=0), xyz.max(axis=0), cameras.centres
-    reach = float(np.hypot(*np.ptp(xyz[:, :2], axis=0))) * 0.1 + 1.0
-    distance, row = (np.asarray(one) for one in cKDTree(xyz[:, :2]).query(centres[:, :2]))
-    below = int(np.count_nonzero((distance < reach) & (centres[:, 2] <= xyz[row, 2])))
     found = plausible(cameras, xyz, ties, **flight)
-    verdict = likely_mistake(centres, low, high, view.crs) or ""
-    if not verdict and below:
-        verdict = (
-            f"{below} of {len(cameras)} cameras are below the ground. Check the vertical datum and"
-            " the order of the axes."
-        )
+    verdict = likely_mistake(cameras.centres, xyz.min(axis=0), xyz.max(axis=0), view.crs)
     verdict = verdict or " ".join(map(str, found.doubts))
     if not verdict and abs(up_m) >= UNDULATION_M[0]:
         side = "above" if up_m > 0.0 else "below"
@@ -268,8 +241,11 @@ def cameras_text(report: CamerasReport) -> str:
     if missing:
         more = ", ..." if len(missing) > SHOWN_NAMES else ""
         images += f", {len(missing):,} without: {', '.join(missing[:SHOWN_NAMES])}{more}"
-    rows = [("Images", images), *(row for one in r["sensors"] for row in _sensor_rows(one))]
-    if not r["sensors"]:
+    sensors = r["sensors"]
+    rows = [("Images", images), *(row for s in sensors[:MOST_SENSORS] for row in _sensor_rows(s))]
+    if len(sensors) > MOST_SENSORS:
+        rows.append(("", f"and {len(sensors) - MOST_SENSORS} more"))
+    if not sensors:
         rows.append(("Sensor", "none: the frames are not known"))
     if cameras.rotations is None:
         rows.append(("Angles", "none: every camera counts as visible from every point"))
@@ -317,11 +293,10 @@ def cameras_text(report: CamerasReport) -> str:
 def _sensor_rows(s: Plain) -> Rows:
     """Return frame, focal length and pixel size of a sensor, and what is wrong with its lens."""
     low, high = f"{s['focal']:.6g}", f"{s['focal_most']:.6g}"
-    frame = f"{s['width']:g} x {s['height']:g} {s['unit']}"
     words = [
         f"{s['name'] or 'unnamed'}: {s['images']:,} images",
         f" with {s['lenses']:,} different lenses" if s["lenses"] > 1 else "",
-        f", {s['frames']} sizes as {frame}" if s["frames"] > 1 else f", {frame}",
+        f", {s['width']:g} x {s['height']:g} {s['unit']}",
         f", focal length {low if low == high else f'{low} to {high}'} {s['unit']}",
     ]
     words.append(f", {s['projection']}{', distorted' * s['distorted']}")

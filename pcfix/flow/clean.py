@@ -13,7 +13,7 @@ import numpy.typing as npt
 from pcfix.blocks import empty, release
 from pcfix.clean.points import Cloud, Reason, flag_neighbours, flag_weak
 from pcfix.errors import bad_file
-from pcfix.flow.runner import Chunk, Command, FileTask, FileWork, Progress, run_command, stream
+from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
@@ -52,28 +52,17 @@ def clean_file(
         The names end in ``.las`` or ``.laz``; the output is LAS 1.4, see `correct_file`. The
         search needs 90 bytes per point of disk beside the output. Or many files and a folder, see
         `pcfix.correct_file`: neighbours are those of the whole cloud.
-    options : CleanOptions, optional
-        Or its attributes as keywords: the options of ``pcfix clean``.
-    progress : callable, optional
-        Called with (points done, all points), over all passes.
-
-    Returns
-    -------
-    Figures
-
-    Raises
-    ------
-    PcfixError
-        If a file, an option or the cloud cannot be used; no output is left behind.
+    options, progress
+        See `pcfix.correct_file`.
     """
     given = taken(CleanOptions, options, keywords, "clean_file")
-    command = Command(
-        "clean", partial(_plan_file, given, progress), partial(stream, _cleaning), _finish
-    )
     last = None
     if progress is not None:  # writing is the last of the passes
         last = lambda done, total: progress(((_PASSES - 1) * total + done) // _PASSES, total)  # noqa: E731
-    return run_command(command, input, output, given, reads=[given.water], progress=last)
+    return run_command(
+        "clean", input, output, given, plan=partial(_plan_file, given, progress), work=_cleaning,
+        finish=_finish, reads=[given.water], progress=last,
+    )  # fmt: skip
 
 
 RAY_DIMENSIONS = ("RayCount", "RayMiss", "Incidence")

@@ -66,10 +66,6 @@ def compare_clouds(
         ``x1,y1,x2,y2`` or `pcfix.compare.sections.SectionLine`, `share` texts or pairs, `also`
         texts, pairs or a dict of paths by name.
 
-    Raises
-    ------
-    PcfixError
-        If a file or an option cannot be used, or the two do not overlap.
     """
     started = time.perf_counter()
     given = taken(CompareOptions, options, keywords, "compare_clouds")

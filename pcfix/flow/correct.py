@@ -8,35 +8,31 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import fields, replace
-from functools import partial
 from itertools import compress
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError, coded
+from pcfix.errors import GeometryError, PcfixWarning, SettingError, coded
 from pcfix.flow.correction import CloudTally, Plan, correct_chunk
+from pcfix.flow.diagnosis import diagnose_in_passing, quick_ties
 from pcfix.flow.inputs import CameraInputs, Inputs, paths_in, transfer_between
 from pcfix.flow.planning import plan_correction, plan_of, read_inputs
 from pcfix.flow.plausibility import CloudSample, Plausible, plausible
-from pcfix.flow.runner import (
-    Chunk,
-    Command,
-    FileTask,
-    FileWork,
-    Finish,
-    Progress,
-    run_command,
-    stream,
-)
+from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
+from pcfix.flow.shore import write_shoreline
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
+from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps, part_report
 from pcfix.io.las.writing import corrected_header
-from pcfix.io.tiles import Clouds, open_cloud
+from pcfix.io.regressions import write_regression
+from pcfix.io.tiles import Clouds
+from pcfix.io.views import ViewReport, beside
 from pcfix.label.labelling import Labelling
+from pcfix.lens.frames import beside_frames
 from pcfix.model import (
     BATHYMETRIC_POINT,
     NO_CAMERAS,
@@ -57,18 +53,13 @@ from pcfix.options.correct import (
     ScienceOptions,
 )
 from pcfix.options.declare import File, taken
-from pcfix.refract.batch import UNLISTED
-from pcfix.refract.reconstructions import CAUSES
+from pcfix.refract.regression import LEAST_BEYOND, DepthRegression
 from pcfix.refract.tally import Tally
 from pcfix.report.summary import Summary
 from pcfix.version import __version__
 from pcfix.water.checks import as_surface, check_submerged, checked_points, refuse_under_water
 from pcfix.water.index import with_index
 from pcfix.water.surface import FoundSurface
-
-if TYPE_CHECKING:
-    from pcfix.io.views import ViewReport
-    from pcfix.refract.regression import DepthRegression
 
 
 def correct_file(
@@ -91,19 +82,15 @@ def correct_file(
     options : CorrectOptions, optional
         Or its attributes as keywords, as of ``pcfix correct``: ``cameras`` (a path or
         `pcfix.Cameras`), ``water`` (what `pcfix.read_water` takes, a `pcfix.WaterSurface`,
-        shoreline points in a vector file, or ``auto``) and many more.
+        shoreline points in a vector file, or ``auto``) and many more. Every command takes its
+        options so.
     progress : callable, optional
         Called with (points done, points in all) after each chunk, or each of many files.
-
-    Returns
-    -------
-    Summary
-        Of all files.
 
     Raises
     ------
     PcfixError
-        With one sentence on what to change. No output is left behind.
+        With one sentence on what to change. No output is left behind. Every command raises it.
     """
     given = taken(CorrectOptions, options, keywords, "correct_file")
 
@@ -111,36 +98,16 @@ def correct_file(
         """Return the plan for a file, or for many as one cloud."""
         return plan_correction(read_inputs(given, view_of(task.source, given.jobs, task.cached)))
 
-    command = Command("correct", plan, _correct_cloud, finish)
-    return run_command(command, input, output, given, reads=paths_in(given), progress=progress)
+    return run_command(
+        "correct", input, output, given, plan=plan, work=_correcting, finish=finish,
+        reads=paths_in(given), progress=progress,
+    )  # fmt: skip
 
 
-def _correct_cloud(plan: Plan, task: FileTask, finish: Finish) -> Any:
-    """Correct a file; see `stream`.
-
-    It is written with the offsets of the input, and again if a coordinate does not fit: with
-    offsets in the middle of the cloud.
-    """
-    steps = tuple[int, ...]((0, 0, 0))
-    while True:
-        try:
-            return stream(partial(_correcting, steps=steps), plan, task, finish)
-        except columns.OutOfRangeError as axis:
-            old = steps
-            with open_cloud(task.source, task.jobs) as source:
-                steps = centring_steps(source)
-            if steps == old:
-                raise InputError(
-                    "cloud.scale",
-                    f"{task.source}: the scale of {axis} is too fine for the result in 32 bits."
-                    " Write the cloud with a coarser scale first.",
-                    path=str(task.source),
-                ) from axis
-
-
-def _correcting(plan: Plan, source: LasSource, steps: tuple[int, ...]) -> FileWork:
+def _correcting(plan: Plan, source: LasSource) -> FileWork:
     """Return the correction of one file: its header, and each chunk."""
     written = columns.columns_for(plan.options.dimensions, plan.options.unsure)
+    steps = centring_steps(source.header)
     header = corrected_header(source, written, plan.provenance(), steps)
     uncorrected = plan.options.uncorrected
 
@@ -151,18 +118,16 @@ def _correcting(plan: Plan, source: LasSource, steps: tuple[int, ...]) -> FileWo
         """Move points, and write their new dimensions, classes and flags."""
         new = columns.convert(points, header.point_format)
         new.offsets = header.offsets
-        for rows, part in correction.parts():
-            some = new[rows]
-            # whole steps of the file's own scale, so that 'pcfix restore' gets back every bit
-            classes = np.array(some["classification"])
-            withheld = np.asarray(some["withheld"]).astype(bool)
-            changes = columns.changes_of(
-                written, part, classes, withheld, some.scales, withhold=uncorrected == "withhold"
-            )
-            columns.move(some, changes.steps + np.array(steps))
-            columns.fill(some, changes)
-            some.array["classification"][part.corrected] = BATHYMETRIC_POINT
-            some["withheld"][:] = (withheld | changes.flagged).astype(np.uint8)
+        # whole steps of the file's own scale, so that 'pcfix restore' gets back every bit
+        classes = np.array(new["classification"])
+        withheld = np.asarray(new["withheld"]).astype(bool)
+        changes = columns.changes_of(
+            written, correction, classes, withheld, new.scales, withhold=uncorrected == "withhold"
+        )
+        columns.move(new, changes.steps + np.array(steps), source.path)
+        columns.fill(new, changes)
+        new.array["classification"][correction.corrected] = BATHYMETRIC_POINT
+        new["withheld"][:] = (withheld | changes.flagged).astype(np.uint8)
         return new[~correction.uncorrected] if uncorrected == "drop" else new
 
     return FileWork(header, compute, apply)
@@ -173,54 +138,51 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
 
     Warns of what is uncertain, and writes the shoreline and the line of a regression if asked.
     """
-    water_notes = _check_counts(plan, tally)
-    tested, poses, absorbed, shoreline, options = None, None, None, None, plan.options
+    options, figures, transfer = plan.options, tally.figures, plan.transfer
+    report = None
+    if tally.views is not None and plan.match is not None:
+        report = replace(tally.views, notes=plan.match.notes)
+    water_notes = _check_counts(plan, tally, report)
+    counts, uncertainty = figures.as_dict(), figures.uncertainty(plan.made)
+    tested, poses, absorbed, shoreline = None, None, None, None
     if plan.inputs.port is None:
-        from pcfix.flow.diagnosis import diagnose_in_passing, quick_ties
-
         ties = quick_ties(plan.inputs, plan.view.crs) if len(plan.cameras) else None
         tested = check_fit(plan, tally, ties)
         poses, absorbed = diagnose_in_passing(plan, ties)
         if tally.shore is not None and options.shoreline is not None:
-            from pcfix.flow.shore import write_shoreline
-
             shoreline = write_shoreline(
                 options.shoreline, tally.shore, plan.found, plan.view.crs,
                 overwrite=options.overwrite, sigma_level_m=options.sigma_level,
             )  # fmt: skip
-    path, line = options.save_regression, plan.regression
-    if path is not None and line is not None:
-        from pcfix.io.regressions import write_regression
-
-        write_regression(path, line, overwrite=options.overwrite)
-    figures, report = tally.figures, _view_report(plan, tally)
-    unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
-    counts = figures.as_dict()
-    if options.unsure != "withhold":
-        counts["unsure"] = None
-    not_moved = sum(counts["uncorrected"].values()) + int(figures.outcomes[Outcome.NOT_CARRIED])
-    transfer, moved = plan.transfer, plan.survey.level_offset_m
-    made, detected, water = plan.made, _detected(plan, tally), str(plan.found.surface)
-    uncertainty = figures.uncertainty(made)
-    by_poses = plan.survey.learned.poses
-    if plan.inputs.port is not None:  # no depths, and no orders by depth
+        water, moved = str(plan.found.surface), plan.survey.level_offset_m
+        if moved is not None:
+            times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
+            water = f"{water}, {times}"
+        by_poses = plan.survey.learned.poses
+        if uncertainty is not None and by_poses is not None:
+            uncertainty["poses_m"] = round(by_poses.middle_m, 4)
+    else:  # no depths, and no orders by depth
         counts["depth_m"], uncertainty = {}, None
         water = f"all around, seen through a {plan.inputs.port}"
-    if uncertainty is not None and by_poses is not None:
-        uncertainty["poses_m"] = round(by_poses.middle_m, 4)
-    if moved is not None:
-        times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
-        water = f"{water}, {times}"
+    path, line = options.save_regression, plan.regression
+    if path is not None and line is not None:
+        write_regression(path, line, overwrite=options.overwrite)
+    if options.unsure != "withhold":
+        counts["unsure"] = None
+    unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
+    not_moved = sum(counts["uncorrected"].values()) + int(figures.outcomes[Outcome.NOT_CARRIED])
+    made, detected = plan.made, [*plan.notes]
+    if tally.beyond is not None and line is not None:
+        least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
+        detected += coded("regression.range", tally.beyond.notes(line, least))
     notes = [
-        *plan.cameras.notes,
+        *plan.input_notes,
         *([] if report is None else report.warnings()),
         *coded("cloud.labels", plan.labelling.notes),
         *(() if tested is None else tested.doubts),
         *detected,
-        *coded("water.surface", plan.found.notes),
-        *coded("water.images", plan.own_notes),
         *coded("water.extent", water_notes),
-        *coded("cameras.poses", filter(None, [absorbed, plan.no_poses])),
+        *([] if absorbed is None else [absorbed]),
     ]
     return Summary(
         input=str(task.source),
@@ -250,12 +212,11 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     )
 
 
-def _check_counts(plan: Plan, tally: CloudTally) -> tuple[str, ...]:
+def _check_counts(plan: Plan, tally: CloudTally, report: ViewReport | None) -> list[str]:
     """Refuse a cloud of which nothing can be corrected; return notes on the extent of the water."""
     # From the general to the particular: a view list of another cloud, or a mask elsewhere, would
     # also leave points without cameras.
     name, figures = plan.view.name, tally.figures
-    report = _view_report(plan, tally)
     if report is not None:
         report.check()
         for note in report.warnings():
@@ -290,14 +251,7 @@ def _check_counts(plan: Plan, tally: CloudTally) -> tuple[str, ...]:
             " Check that cameras and cloud belong together.",
             reasons=reasons,
         )
-    return tuple(water_notes)
-
-
-def _view_report(plan: Plan, tally: CloudTally) -> ViewReport | None:
-    """Return how the view list fitted, with the notes of reading it."""
-    if tally.views is None or plan.match is None:
-        return None
-    return replace(tally.views, notes=plan.match.notes)
+    return water_notes
 
 
 def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
@@ -308,8 +262,6 @@ def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
             f"no submerged point has two rays within {limit or 90.0:g} deg of the surface"
             f" normal; {flat:,} points have rays at larger angles. Increase --max-angle."
         )
-    from pcfix.io.cameras.mistakes import likely_mistake
-
     middle = (figures.low + figures.high) / 2.0
     distance = float(np.hypot(*(plan.cameras.centres - middle)[:, :2].T).min())
     within = f" within {limit:g} degrees" if limit else ""
@@ -329,43 +281,11 @@ def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> P
     tested = plausible(
         plan.cameras, sample.xyz, ties, () if sought else sample.level_doubts(),
         file="" if isinstance(given, Cameras) else given or "", water_m=sample.water_m,
-        listed=plan.views is not None, every=sample.every,
+        listed=plan.kind is not None, every=sample.every,
     )  # fmt: skip
-    tested = tested._replace(noted=CAUSES in map(str, _detected(plan, tally)))
     for warning in tested.doubts:
         warnings.warn(warning, stacklevel=3)
     return tested
-
-
-def _detected(plan: Plan, tally: CloudTally) -> list[PcfixWarning]:
-    """Return the notes on what was detected from the cloud."""
-    verdicts = {str(note): note for one in plan.verdicts for note in one.warnings()}
-    beyond, line = list[str](), plan.regression
-    if tally.beyond is not None and line is not None:
-        from pcfix.refract.regression import LEAST_BEYOND
-
-        least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
-        beyond = tally.beyond.notes(line, least)
-    corrected, rays = tally.figures.corrected, list[PcfixWarning]()
-    if plan.inputs.port is not None and plan.survey.settings.method == "snell" and corrected:
-        mean = tally.port_miss_m / corrected
-        sentence = (
-            "The refracted rays of the apparent points miss each other behind the port by"
-            f" {mean:.3f} m on average. --method consistent takes this into account, best with"
-            " --views."
-        )
-        rays.append(PcfixWarning("port.ray_distance", sentence, mean_m=mean))
-    unlisted = []
-    if UNLISTED in plan.survey.parts:
-        so = " ".join(map(str, plan.of_unlisted))
-        unlisted = [f"Points in no view list are corrected as without a list. {so}"]
-    return [
-        *plan.notes,
-        *rays,
-        *coded("regression.range", beyond),
-        *coded("cloud.reconstruction", verdicts.values()),
-        *coded("views.unlisted", unlisted),
-    ]
 
 
 def correct_points(
@@ -469,25 +389,22 @@ def correct_points(
             sentence = f"may_be_submerged must be {len(xyz)} booleans, not {allowed.dtype}."
             raise SettingError("array.shape", sentence, shape=allowed.shape)
         classes[~allowed] = NOT_SUBMERGED
-    points = Points(xyz, heights, classes)
+    points = Points(xyz, heights, classes, views=views)
     view = CloudView(
         "xyz", None, *corners(*xyz[:, :2].T), len(xyz), lambda water=None: iter([points])
     )
     transfer = None if adjusted_from is None else transfer_between(adjusted_from, cameras)
-    line, notes = regression, list[str]()
+    line, path = regression, None
     if isinstance(line, str | PathLike):
-        from pcfix.io.regressions import read_regression
-
-        line = read_regression(line)
-        notes = list(line.notes)
+        line, path = None, line
     plan = plan_of(
         with_index(all_options),
-        Inputs(cameras=cameras, water=surface),
+        Inputs(cameras=cameras, water=surface, regression=path),
         view,
         CameraInputs(cameras, None, original, transfer),
         FoundSurface(surface),
-        views,
         offset,
+        views,
         Labelling(LabelRules(respect_classes=(NOT_SUBMERGED,))),
         line,
     )
@@ -496,10 +413,11 @@ def correct_points(
     if tally.water is not None:
         tally.water.check_reach("xyz", surface, deep=given.deep)
     check_fit(plan, tally)
-    if line is not None and line is not regression and tally.beyond is not None:
-        notes += tally.beyond.notes(line)
-    for note in (*plan.own_notes, *notes):
-        warnings.warn(PcfixWarning("points.note", note), stacklevel=2)
+    line, beyond = plan.regression, list[str]()
+    if line is not None and tally.beyond is not None:
+        beyond = tally.beyond.notes(line)
+    for note in (*plan.input_notes, *coded("regression.range", beyond)):
+        warnings.warn(note, stacklevel=2)
     return correction
 
 
@@ -521,9 +439,6 @@ def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:
         raise SettingError(
             "views.camera", f"views name camera {camera.max()}, but there are {len(cameras)}."
         )
-    from pcfix.io.views import beside
-    from pcfix.lens.frames import beside_frames
-
     counts = beside_frames(points, views, cameras)
     if counts.any():
         entries, outside = int(counts.sum()), int(np.count_nonzero(counts))

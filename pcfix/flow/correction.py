@@ -8,15 +8,18 @@ a water surface: all points are below it, whatever their height, and have no dep
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, astuple, dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
+from pcfix.adjust.transfer import CloudTransfer, TransferCounts, Transferred
 from pcfix.errors import PcfixWarning
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.plausibility import CloudSample
 from pcfix.flow.surfaces import CloudView, Points
+from pcfix.grid.shoreline import NearWater
+from pcfix.io.views import ViewMatch, ViewReport
 from pcfix.label.labelling import LabelCounts, Labelling
 from pcfix.model import (
     BoolArray,
@@ -26,25 +29,19 @@ from pcfix.model import (
     IntArray,
     Outcome,
     ViewKind,
-    Views,
     WaterPlane,
 )
 from pcfix.options.correct import CorrectOptions, ScienceOptions
+from pcfix.port.methods import correct_through_port
 from pcfix.refract.batch import Batch, Intersection, OriginalModel, Survey
 from pcfix.refract.methods import correct, shift_of_land
 from pcfix.refract.reconstructions import Verdict
+from pcfix.refract.regression import BeyondRange, DepthRegression
 from pcfix.refract.tally import Tally
 from pcfix.sums import Sums
 from pcfix.version import __version__
 from pcfix.water.checks import WaterMeeting
 from pcfix.water.surface import FoundSurface, surface_above
-
-if TYPE_CHECKING:
-    from pcfix.adjust.precision import Members
-    from pcfix.adjust.transfer import CloudTransfer, TransferCounts, Transferred
-    from pcfix.grid.shoreline import NearWater
-    from pcfix.io.views import ViewMatch, ViewReport
-    from pcfix.refract.regression import BeyondRange, DepthRegression
 
 OWN_WATER = "Each image has its own water surface; only snell and consistent can use them."
 
@@ -59,16 +56,13 @@ class Plan:
     survey: Survey  # cameras, water, and options; once planned without ``auto``
     found: FoundSurface  # the water and its origin; infinitely high in front of a port
     labelling: Labelling  # which points may be submerged
-    views: ViewMatch | Views | None = None  # the view list; `Views` are of all points, in order
-    kind: ViewKind | None = None  # its type
+    match: ViewMatch | None = None  # the view list of a file
+    kind: ViewKind | None = None  # the type of the view list, which the points may have themselves
+    some_unlisted: bool = False  # whether points have no images in it
     transfer: CloudTransfer | None = None  # from the original to the adjusted cameras
-    members: Members | None = None  # of an adjustment, for the errors of the poses
-    settings: dict[str, Any] = field(default_factory=dict)  # more settings for the summary
     verdicts: tuple[Verdict, ...] = ()  # on the reconstruction type
-    of_unlisted: tuple[Verdict, ...] = ()  # the same for points in no view list
+    input_notes: tuple[PcfixWarning, ...] = ()  # what was noted on reading the inputs
     notes: tuple[PcfixWarning, ...] = ()  # what the cloud shows
-    own_notes: tuple[str, ...] = ()  # on the water of single images
-    no_poses: str = ""  # why SigmaZ has no errors of the poses, if there is an adjustment
 
     @property
     def cameras(self) -> Cameras:
@@ -81,14 +75,23 @@ class Plan:
         return None if self.transfer is None else self.transfer.original
 
     @property
-    def match(self) -> ViewMatch | None:
-        """The view list of a file."""
-        return None if isinstance(self.views, Views) else self.views
-
-    @property
     def regression(self) -> DepthRegression | None:
         """The line of the method regression."""
         return self.survey.learned.regression
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the summary and the output file say of the settings besides the options."""
+        options, port = self.options, self.inputs.port
+        files = {name: getattr(options, name) for name in ("regression", "water_per_image")}
+        more: dict[str, Any] = {name: str(one) for name, one in files.items() if one is not None}
+        if port is not None:
+            return {"port": asdict(port)}
+        if options.depth_factor == "auto":
+            more["depth_factor"] = self.survey.settings.depth_factor
+        if options.max_angle == "auto":
+            more["max_angle"] = self.survey.limit_deg
+        return more
 
     @property
     def made(self) -> dict[str, Any] | None:
@@ -103,8 +106,8 @@ class Plan:
             return None
         elif settings.method == "snell":
             because = "The cameras have no lenses or no angles: corrected by snell."
-        elif self.views is not None:
-            because = f"The view list is one of {kind_of(self.views)}: corrected as such."
+        elif self.kind is not None:
+            because = f"The view list is one of {self.kind}: corrected as such."
         else:
             because = "Too few points to detect the reconstruction type: tracks assumed."
         return {
@@ -149,33 +152,23 @@ class CloudTally(Sums):
     beyond: BeyondRange | None = None
     shore: NearWater | None = None
     transfer: TransferCounts | None = None
-    port_miss_m: float = 0.0
-
-
-def kind_of(views: ViewMatch | Views | None) -> ViewKind | None:
-    """Return the type of a view list."""
-    if views is None or isinstance(views, Views):
-        return None if views is None else views.kind
-    return views.view_list.listed.kind
 
 
 def transferred(
     plan: Plan, points: Points, row: int
-) -> tuple[Points, Views | None, ViewReport | None, Transferred | None]:
-    """Return points that begin at a row of the cloud, transferred to the adjusted cameras.
+) -> tuple[Points, ViewReport | None, Transferred | None]:
+    """Return points that begin at a row of the cloud, with their views, at the adjusted cameras.
 
-    Then their views, the counts of these, and the transfer; None where there is none.
+    Then the counts of the views of a file, and the transfer; None where there is none.
     """
-    views, counts, step = plan.views, None, None
+    counts, step = None, None
     if plan.match is not None:
         views, counts = plan.match.views_of(points.xyz, row)
-    elif isinstance(views, Views) and len(views.start) != len(points.xyz) + 1:
-        views = views.take(np.arange(row, row + len(points.xyz)))
-    listed = views if isinstance(views, Views) else None
+        points = points._replace(views=views)
     if plan.transfer is not None:
-        step = plan.transfer.step(points.xyz, listed)
-        points, listed = points._replace(xyz=step.xyz, original_xyz=points.xyz), step.views
-    return points, listed, counts, step
+        step = plan.transfer.step(points.xyz, points.views)
+        points = points._replace(xyz=step.xyz, original_xyz=points.xyz, views=step.views)
+    return points, counts, step
 
 
 def batch_of(points: Points, survey: Survey, original: Cameras | None) -> Batch:
@@ -194,40 +187,31 @@ def correct_chunk(
 
     `covariances` are of all coordinates; files hold the standard error of Z only.
     """
-    points, views, counts, step = transferred(plan, points, row)
+    points, counts, step = transferred(plan, points, row)
     batch = batch_of(points, plan.survey, plan.original)
-    if views is not None:
-        batch = replace(batch, views=replace(views, kind=plan.kind or views.kind))
+    if points.views is not None and plan.kind is not None:
+        batch = replace(batch, views=replace(points.views, kind=plan.kind))
     xyz, above = points.xyz, batch.surface
     submerged, labels = plan.labelling.submerged(xyz, above, points.classes)
     if plan.inputs.port is not None:
-        from pcfix.port.methods import correct_through_port
-
         rows, settings = np.flatnonzero(submerged), plan.survey.settings
         wet, n = batch.take(rows), len(batch)
         found = correct_through_port(wet.xyz, plan.cameras, plan.inputs.port, settings, wet.views)
         correction = _spread(batch, rows, found, np.zeros(n), np.ones(n, np.bool_))
-        miss_m = float(correction.ray_miss_m[submerged].sum())
-        return correction, CloudTally(Tally.of(correction), labels, counts, port_miss_m=miss_m)
+        return correction, CloudTally(Tally.of(correction), labels, counts)
     if step is not None:
         submerged &= step.moved  # a point without a place in the adjusted block is left where it is
     correction = _through_water(plan, batch, np.flatnonzero(submerged), covariances=covariances)
     beyond, line = None, plan.regression
     if line is not None:
-        from pcfix.refract.regression import BeyondRange
-
         beyond = BeyondRange.of((above.height_m - xyz[:, 2])[correction.submerged], line)
     shore = None
     if plan.options.shoreline is not None:
-        from pcfix.grid.shoreline import NearWater
-
         higher = xyz[:, 2] + correction.shift_m[:, 2] - above.height_m
         height = np.where(correction.submerged, -correction.depth_m, higher)
         shore = NearWater.of(xyz + correction.shift_m, height, correction.sigma_z_m)
     moved = None
     if step is not None:
-        from pcfix.adjust.transfer import TransferCounts
-
         correction = step.whole(correction)
         moved = TransferCounts.of(step, correction)
     return correction, CloudTally(

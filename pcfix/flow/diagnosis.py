@@ -1,9 +1,11 @@
-"""Find out whether the poses of a correction have absorbed the refraction."""
+"""Find out whether poses have absorbed the refraction, and say how to correct them."""
 
 from __future__ import annotations
 
+import shlex
 import warnings
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,18 +21,26 @@ from pcfix.adjust.diagnosis import (
 )
 from pcfix.errors import InputError, PcfixError, PcfixWarning
 from pcfix.flow.inputs import Inputs, ties_of
-from pcfix.flow.next_steps import adjust_words
 from pcfix.flow.surfaces import CloudView
 from pcfix.io.gnss_positions import gnss_in_frame_of
 from pcfix.io.ground_control import read_ground_control
 from pcfix.model import Cameras, GnssPositions, TiePoints, WaterSurface
-from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
+from pcfix.options.declare import File, OptionSet
+from pcfix.options.shared import (
+    DEFAULT_REFRACTIVE_INDEX,
+    CameraFileOptions,
+    MaskOption,
+    ViewOptions,
+    WaterOptions,
+)
 
 if TYPE_CHECKING:
     from pcfix.flow.correction import Plan
 
 LEAST_POSITIONS = 3
 """GNSS positions that determine position, orientation and scale of a block."""
+
+NO_DATUM = " (GNSS.csv has the positions of the images; control points, --gcps, serve as well)"
 
 QUICK_BYTES = 25_000_000
 """Size of a model that is read within a second or two, even if nobody asked."""
@@ -141,3 +151,39 @@ def has_datum(cameras: Cameras, name: str) -> bool:
     spread = 1.4826 * np.median(np.abs(off - np.median(off, axis=0)))
     stated = found.sigma_m[known]
     return bool(np.median(np.where(np.isfinite(stated), stated, spread)) <= MOST_STATED_M)
+
+
+# Commands that pcfix recommends; a file that was not given has a name in capitals
+
+
+def adjust_words(
+    inputs: Inputs, cloud: str, *, has_datum: bool, **more: File | float | None
+) -> tuple[str, str]:
+    """Return the command that corrects the poses, and a remark on it.
+
+    Without a datum it asks for GNSS positions; `more` are options of an adjustment only.
+    """
+    model = "MODEL" if isinstance(inputs.cameras, Cameras) else str(inputs.cameras)
+    words = ["pcfix", "adjust", model, "OUT", "--water", water_word(inputs.water), "--cloud", cloud]
+    words += flags_of(inputs)
+    remark = "" if has_datum or more.get("gcps") or more.get("gnss") else NO_DATUM
+    if remark:
+        more["gnss"] = "GNSS.csv"
+    for name, value in more.items():
+        words += [] if value is None else [f"--{name}", str(value)]
+    return shlex.join(words), remark
+
+
+def water_word(given: Any) -> str:
+    """Return a water as it was given, or SPEC where an adjustment does not take it."""
+    known = isinstance(given, str | PathLike | float | int)
+    return f"{given}" if known and not str(given).startswith("dim:") else "SPEC"
+
+
+def flags_of(given: OptionSet) -> list[str]:
+    """Return the options that `pcfix correct` and `pcfix adjust` have in common, as given."""
+    words = []
+    for kind in (WaterOptions, CameraFileOptions, ViewOptions, MaskOption):
+        for name, text in given.part(kind).plain().items():
+            words += [f"--{name.replace('_', '-')}", str(text)]
+    return words

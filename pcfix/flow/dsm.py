@@ -89,26 +89,14 @@ def grid_dsm(
         LAS or LAZ, in metres; many, as `pcfix.io.tiles.tiles_of` has them, make one raster.
     output : path
         The name ends in ``.tif`` or ``.tiff``.
-    options : DsmOptions, optional
-        Or its attributes as keywords: the options of ``pcfix dsm``. The bounds of the raster are
+    options, progress
+        See `pcfix.correct_file`. The bounds of the raster are
         multiples of the resolution (m), by default that of `pcfix.grid.lattice.round_resolution`; a
         point on an edge belongs to the cell east or north of it. The method "idw" weights points
         around the centre with 1 / distance squared; "tin" uses Delaunay triangles, and fill is the
         diameter of the widest circle without a point, by default five times the spacing of the
         points and at least three cells. Withheld points and noise (classes 7 and 18) are not used.
         The hillshade is uint8: 1 dark to 255 bright, nodata 0.
-    progress : callable, optional
-        Called with (points done, all points); reading and gridding count half each.
-
-    Raises
-    ------
-    PcfixError
-        If a file, an option or the cloud cannot be used; no output is left behind.
-
-    Warns
-    -----
-    PcfixWarning
-        If the cells are so small that most have no point.
     """
     given = taken(DsmOptions, options, keywords, "grid_dsm")
     rules, files = given.part(DsmRules), cloud_of(input)

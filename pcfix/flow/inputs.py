@@ -16,36 +16,29 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import (
-    GeometryError,
-    InputError,
-    NoTiePointsError,
-    PcfixError,
-    PcfixWarning,
-    SettingError,
-)
+from pcfix.adjust.transfer import CloudTransfer, renumbered, transfer_of
+from pcfix.errors import GeometryError, InputError, NoTiePointsError, PcfixWarning, SettingError
 from pcfix.flow.surfaces import CloudView, find_surface
 from pcfix.io.cameras import read_cameras, read_tie_points, takes_sensor
+from pcfix.io.cameras.georeference import Georeference, georeference
 from pcfix.io.labels import match_labels
-from pcfix.io.vectors import LAYER_MARK
+from pcfix.io.tides import level_offsets, read_image_times, read_tide
+from pcfix.io.vectors import LAYER_MARK, read_water_polygons
+from pcfix.io.views import ViewList, read_views, track_views
 from pcfix.label.areas import WaterMask
 from pcfix.label.labelling import Labelling
 from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints, ViewKind
 from pcfix.options.correct import LabelRules
 from pcfix.options.declare import File, OptionSet, options_of
 from pcfix.options.shared import InputOptions, MaskOption
+from pcfix.port.shapes import port_of
 from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-    from pcfix.adjust.transfer import CloudTransfer
-    from pcfix.io.cameras.georeference import Georeference
-    from pcfix.io.views import ViewList
 
 LOCAL = "local"
-TIMED = (".json", ".geojson")
-"""Camera files that may hold the time of each image."""
 
 
 class Inputs(MaskOption, InputOptions):
@@ -57,13 +50,8 @@ class Inputs(MaskOption, InputOptions):
     """
 
     def check(self) -> None:
-        """Check that there is either a water surface or a housing port."""
+        """Refuse a water surface together with a housing port."""
         super().check()
-        if self.water is None and self.port is None:
-            raise SettingError(
-                "water.missing",
-                "water is missing: give the water surface, or the port of an underwater camera.",
-            )
         if self.water is not None and self.port is not None:
             raise SettingError(
                 "option.conflict",
@@ -72,22 +60,21 @@ class Inputs(MaskOption, InputOptions):
                 options=["water", "port"],
             )
         if isinstance(self.port, str):
-            from pcfix.port.shapes import port_of
-
             object.__setattr__(self, "port", port_of(self.port))
 
     def surface(self, view: CloudView | None = None) -> FoundSurface:
         """Return the water surface over a cloud; see `pcfix.flow.surfaces.find_surface`."""
         if self.water is None:
-            raise SettingError("water.missing", "there is no water surface in front of a port.")
+            raise SettingError(
+                "water.missing",
+                "water is missing: give the water surface, or the port of an underwater camera.",
+            )
         return find_surface(self.water, self, view)
 
     def level_offset_m(self, cameras: Cameras) -> FloatArray | None:
         """Return how much higher than on average the water stood at each image, shape (k,)."""
         if self.tide is None:
             return None
-        from pcfix.io.tides import level_offsets, read_image_times, read_tide
-
         own = self.cameras if self.adjusted_from is None else self.adjusted_from
         given = own if self.image_times is None else self.image_times
         if isinstance(given, Cameras):
@@ -97,20 +84,6 @@ class Inputs(MaskOption, InputOptions):
         offset, notes = level_offsets(read_tide(self.tide), times, cameras.labels)
         _warn(notes)
         return offset
-
-    def dates(self, cameras: Cameras) -> str:
-        """Return the first and last day of the images; empty if unknown."""
-        from pcfix.io.tides import read_image_times
-
-        given = self.image_times or self.adjusted_from or self.cameras
-        if self.image_times is None and Path(str(given)).suffix.lower() not in TIMED:
-            return ""
-        try:
-            days = read_image_times(given, cameras.labels).time_s.astype("datetime64[s]")
-        except PcfixError:  # only the report shows them
-            return ""
-        first, last = (str(day.astype("datetime64[D]")) for day in (days.min(), days.max()))
-        return first if first == last else f"{first} to {last}"
 
     def read(self) -> Cameras:
         """Return the cameras in the frame of their file."""
@@ -125,8 +98,6 @@ class Inputs(MaskOption, InputOptions):
 
         `read` are the cameras in the frame of their file, if they were read before.
         """
-        from pcfix.io.views import read_views, track_views
-
         if isinstance(self.cameras, Cameras):
             cameras, to_cloud = self.cameras, None
         else:
@@ -148,8 +119,6 @@ class Inputs(MaskOption, InputOptions):
 
     def _georeferenced(self, read: Cameras, cloud_crs: str | CRS | None) -> Georeference:
         """Return the transformation from the frame of the camera file to the cloud's CRS."""
-        from pcfix.io.cameras.georeference import georeference
-
         return georeference(
             read, cloud_crs, cameras_crs=self.cameras_crs, offset_m=self.cameras_offset,
             name=str(self.cameras),
@@ -258,8 +227,6 @@ def original_ties(
     """
     if transfer is None:
         return ties_of(inputs, cloud_crs)
-    from pcfix.adjust.transfer import renumbered
-
     original, adjusted = both_models(inputs)
     ties = original.tie_points(cloud_crs)
     if ties is None:
@@ -279,8 +246,6 @@ def transfer_between(original: Cameras, adjusted: Cameras) -> CloudTransfer:
                 " itself, or --sensor."
             )
             raise SettingError(f"cameras.no_{missing}", words, option=which)
-    from pcfix.adjust.transfer import transfer_of
-
     return transfer_of(original, adjusted, _rows(original.labels, adjusted.labels))
 
 
@@ -318,8 +283,6 @@ def mask_of(path: File | None, cloud_crs: str | CRS | None) -> WaterMask | None:
     """Read the mask in the cloud's CRS, if a file is given."""
     if path is None:
         return None
-    from pcfix.io.vectors import read_water_polygons
-
     polygons = read_water_polygons(path, cloud_crs)
     _warn(polygons.notes)
     return WaterMask(polygons.area, polygons.name, tuple(map(str, polygons.notes)))

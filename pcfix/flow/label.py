@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import astuple, dataclass
-from functools import partial
 from os import PathLike
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy.typing as npt
 
 from pcfix.errors import SettingError
 from pcfix.flow.inputs import labelling_of, mask_of, paths_in
-from pcfix.flow.runner import Chunk, Command, FileTask, FileWork, Progress, run_command, stream
+from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
 from pcfix.flow.surfaces import (
     CloudView,
     Points,
@@ -70,11 +69,6 @@ def label_points(
     -------
     array of uint8, shape (n,)
 
-    Raises
-    ------
-    PcfixError
-        If an argument breaks its rule, or the mask cannot be used.
-
     Examples
     --------
     >>> from pcfix.flow.label import label_points
@@ -117,29 +111,16 @@ def label_file(
     input, output : path
         The names end in ``.las`` or ``.laz``; the output is LAS 1.4. Or many files and a folder,
         see `pcfix.correct_file`.
-    options : LabelOptions, optional
-        Or its attributes as keywords: the options of ``pcfix label``. With a dead band or
-        connectivity the cloud is read twice. A point on the border of the mask is inside.
-    progress : callable, optional
-        See `pcfix.correct_file`.
-
-    Returns
-    -------
-    Figures
-
-    Raises
-    ------
-    PcfixError
-        If a file, an option or the water cannot be used; no output is left behind.
+    options, progress
+        See `pcfix.correct_file`. With a dead band or connectivity the cloud is read twice. A point
+        on the border of the mask is inside.
     """
     given = taken(LabelOptions, options, keywords, "label_file")
-    command = Command(
-        "label",
-        lambda task: plan_labelling(given, view_of(task.source, given.jobs)),
-        partial(stream, _labelling),
-        _finish,
-    )
-    return run_command(command, input, output, given, reads=paths_in(given), progress=progress)
+    return run_command(
+        "label", input, output, given, work=_labelling, finish=_finish, reads=paths_in(given),
+        plan=lambda task: plan_labelling(given, view_of(task.source, given.jobs)),
+        progress=progress,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

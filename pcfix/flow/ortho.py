@@ -52,10 +52,9 @@ def ortho_photo(
         Folder of JPEG, TIFF or PNG files of 8 or 16 bits.
     output : path
         The name ends in ``.tif`` or ``.tiff``.
-    options : OrthoOptions, optional
-        Or its attributes as keywords, such as cameras, dsm and, for original photographs, water.
-    progress : callable, optional
-        Called with (cells done, cells in all).
+    options, progress
+        See `pcfix.correct_file`; original photographs need the option water, and progress is in
+        cells.
     """
     started = time.perf_counter()
     given = taken(OrthoOptions, options, keywords, "ortho_photo")

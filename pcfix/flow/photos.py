@@ -67,15 +67,8 @@ def map_photos(
     out : path
         Folder, created if needed. Files keep their names, sizes, bands and metadata, so the camera
         file needs no change. Images that an equal call has written are not written again.
-    options : PhotosOptions, optional
-        Or its attributes as keywords, such as cameras, dsm and water.
-    progress : callable, optional
-        Called with (images done, images in all).
-
-    Raises
-    ------
-    PcfixError
-        Finished images stay.
+    options, progress
+        See `pcfix.correct_file`; progress is in images. After an error finished images stay.
     """
     started = time.perf_counter()
     given = taken(PhotosOptions, options, keywords, "map_photos")

@@ -86,11 +86,8 @@ def plan_flight(
 
     Parameters
     ----------
-    options : PlanOptions, optional
-        Or its attributes as keywords, as for ``pcfix plan``: height, overlap, sidelap, obliques,
-        lens, area, depth, gnss_sigma, index, and the standard deviations of ``pcfix correct``.
-    progress : callable, optional
-        Called with (steps done, steps in all).
+    options, progress
+        See `pcfix.correct_file`; progress is in beds and alternatives.
 
     Examples
     --------

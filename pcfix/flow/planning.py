@@ -6,15 +6,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from itertools import compress
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pcfix.errors import PcfixWarning, SettingError, coded
-from pcfix.flow.correction import Plan, batch_of, kind_of, transferred
+from pcfix.flow.check_depths import check_regression, regression_of
+from pcfix.flow.correction import Plan, batch_of, transferred
 from pcfix.flow.inputs import (
     CameraInputs,
     Inputs,
@@ -23,10 +23,14 @@ from pcfix.flow.inputs import (
     paths_in,
     read_blocks,
 )
+from pcfix.flow.shore import check_shoreline
 from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
 from pcfix.io.las.source import CHUNK_POINTS
+from pcfix.io.views import ViewMatch
+from pcfix.label.labelling import Labelling
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, Views, WaterPlane
 from pcfix.options.correct import CorrectOptions
+from pcfix.refract import learning
 from pcfix.refract.batch import (
     FLAT_DEG,
     UNLISTED,
@@ -36,31 +40,14 @@ from pcfix.refract.batch import (
     require_orientation,
     stacked,
 )
-from pcfix.refract.learning import (
-    CORRECTED_RATIO,
-    Near,
-    depth_ratio,
-    learn_of_sample,
-    resolved,
-    submerged_of,
-    wants_sample,
-    weigh_lists,
-    with_factor,
-    with_matcher,
-    with_verdict,
-)
 from pcfix.refract.methods import with_rays
+from pcfix.refract.occlusion import Occluder, OccluderBuilder, wants_occlusion
 from pcfix.refract.patches import PATCH_WIDTH, Squares
 from pcfix.refract.reconstructions import hint_of
+from pcfix.refract.regression import DepthRegression
 from pcfix.water.checks import check_above_water, check_tilt
 from pcfix.water.index import with_index
 from pcfix.water.surface import FoundSurface, is_submerged, surface_above
-
-if TYPE_CHECKING:
-    from pcfix.io.views import ViewMatch
-    from pcfix.label.labelling import Labelling
-    from pcfix.refract.occlusion import Occluder
-    from pcfix.refract.regression import DepthRegression
 
 FLAT_SHARE, FLAT_SAMPLE = 0.01, 20_000
 """Share of the submerged points above which it is noted, and size of the sample for it."""
@@ -81,66 +68,63 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
         _check_port(options)
     elif not options.cameras:
         options.check_no_cameras()
-    blocks, match = read_blocks(inputs, view.crs), None
+    blocks, match, listed = read_blocks(inputs, view.crs), None, None
     if blocks.views is not None:
-        from pcfix.io.views import ViewMatch
-
         match = ViewMatch(blocks.views, blocks.listed, points=view.points, step_m=view.step_m)
+        listed = blocks.views.listed
     if inputs.port is not None:
-        cameras, settings = blocks.cameras, options
+        cameras, method = blocks.cameras, options.method
         require_orientation(cameras, "A port")
-        if options.method == "auto":
-            settings = replace(options, method="consistent")
-        survey, port = Survey(WaterPlane(np.inf), cameras, settings), {"port": asdict(inputs.port)}
-        found = FoundSurface(survey.water)
-        return Plan(options, inputs, view, survey, found, labelling_of(options, view), match,
-                    kind_of(match), settings=port)  # fmt: skip
+        how = replace(options, method="consistent" if method == "auto" else method)
+        survey = Survey(WaterPlane(np.inf), cameras, how)
+        words = (
+            "Method snell ignores that the refracted rays of the apparent points miss each other"
+            " behind the port. Use --method consistent, best with --views."
+        )
+        notes = coded("port.ray_distance", [words] if method == "snell" else [])
+        return Plan(
+            options, inputs, view, survey, FoundSurface(survey.water), labelling_of(options, view),
+            match, None if listed is None else listed.kind, input_notes=cameras.notes,
+            notes=tuple(notes),
+        )  # fmt: skip
     if options.shoreline is not None:
-        from pcfix.flow.shore import check_shoreline
-
         reads = paths_in(options)
         check_shoreline(options.shoreline, overwrite=options.overwrite, inputs=reads)
     found = inputs.surface(view)
     if match is None and not isinstance(options.cameras, Cameras):
         _check_frames(blocks.cameras, options)
     offset = inputs.level_offset_m(blocks.cameras)
-    plan = plan_of(options, inputs, view, blocks, found, match, offset)
+    plan = plan_of(
+        options, inputs, view, blocks, found, offset, listed, labelling_of(options, view)
+    )
     check_tilt(found.surface)
-    method = plan.survey.settings.method
-    if method == "regression":
-        from pcfix.flow.check_depths import check_regression
-
+    if plan.survey.settings.method == "regression":
         check_regression(inputs)
-    if inputs.regression is not None:
-        plan = replace(plan, settings={"regression": str(inputs.regression), **plan.settings})
-    if options.dimensions == "all" and method != "regression" and len(blocks.cameras):
-        from pcfix.flow.pose_errors import members_of
-
-        members, no_poses = members_of(inputs.cameras, blocks.cameras)
-        plan = replace(plan, members=members, no_poses=no_poses)
-    return plan
+    return replace(plan, match=match, input_notes=(*blocks.cameras.notes, *plan.input_notes))
 
 
 def plan_of(
     options: CorrectOptions, inputs: Inputs, view: CloudView, blocks: CameraInputs,
-    found: FoundSurface, views: ViewMatch | Views | None, offset: FloatArray | None,
-    labelling: Labelling | None = None, line: DepthRegression | None = None,
+    found: FoundSurface, offset: FloatArray | None, listed: Views | None, labelling: Labelling,
+    line: DepthRegression | None = None,
 ) -> Plan:  # fmt: skip
     """Return the plan of a correction through a water surface, with nothing estimated yet.
 
-    `offset`, shape (k,), is how much higher the water stood when each image was taken, and `line`
-    that of a regression if it is known.
+    `offset`, shape (k,), is how much higher the water stood when each image was taken, `listed` are
+    the view lists, and `line` is that of a regression if it is known.
     """
-    cameras, kind = blocks.cameras, kind_of(views)
+    cameras, kind, some_unlisted = blocks.cameras, None, False
+    if listed is not None:
+        kind, start = listed.kind, listed.start
+        some_unlisted = len(start) <= view.points or not bool((np.diff(start) > 0).all())
     check_above_water(cameras, found.surface, offset)
     folder = options.water_per_image
-    settings = resolved(options, cameras, kind, own_water=folder is not None)
+    settings = learning.resolved(options, cameras, kind, own_water=folder is not None)
     own, notes = own_water_of(folder, cameras, found.surface, view, offset)
     survey = Survey(found.surface, cameras, settings, offset, Learned(line), own_water=own)
     return Plan(
-        options, inputs, view, survey, found, labelling or labelling_of(options, view), views, kind,
-        blocks.transfer, own_notes=notes,
-        settings={} if folder is None else {"water_per_image": str(folder)},
+        options, inputs, view, survey, found, labelling, None, kind, some_unlisted, blocks.transfer,
+        input_notes=(*coded("water.surface", found.notes), *coded("water.images", notes)),
     )  # fmt: skip
 
 
@@ -184,41 +168,43 @@ def plan_correction(plan: Plan) -> Plan:
     """
     if plan.inputs.port is not None:
         return plan
-    inputs, view, transfer, match = plan.inputs, plan.view, plan.transfer, plan.match
+    inputs, view, transfer = plan.inputs, plan.view, plan.transfer
     water, first = plan.found.surface, None
-    if plan.views is not None or transfer is not None:
+    if plan.kind is not None or transfer is not None:
         # the first points show whether the list is in the order of the cloud, or has coordinates
         first = sample_of(view, np.arange(min(CHUNK_POINTS, view.points)), water)
-        if match is not None:
-            match = match.settled(first.xyz)
-            plan = replace(plan, views=match)
+        if plan.match is not None:
+            plan = replace(plan, match=plan.match.settled(first.xyz))
         if transfer is not None:
             transfer.check_models(first.xyz)
     chunks = partial(_whole_cloud, plan)
     labelling = plan.labelling.scanned(parts_of(chunks(), water), view.low, view.high)
     plan = replace(plan, labelling=labelling)
     if (inputs.check_depths or inputs.regression) is not None and plan.regression is None:
-        from pcfix.flow.check_depths import regression_of
-
         line, notes = regression_of(inputs, view, chunks(), plan.survey)
         survey = replace(plan.survey, learned=plan.survey.learned._replace(regression=line))
         plan = replace(plan, survey=survey, notes=tuple(coded("regression.fit", notes)))
     plan = _estimated_from_cloud(plan, chunks)
-    options, survey = plan.options, plan.survey
-    found = dict[str, Any]()
-    if options.depth_factor == "auto":
-        found["depth_factor"] = survey.settings.depth_factor
-    if options.max_angle == "auto":
-        found["max_angle"] = survey.limit_deg
-    plan = replace(plan, settings={**plan.settings, **found})
-    if plan.members is not None:
-        from pcfix.flow.pose_errors import SAMPLE_POINTS, pose_errors, with_poses
+    if plan.options.dimensions == "all" and plan.regression is None and len(plan.cameras):
+        plan = _with_pose_errors(plan)
+    if first is not None and plan.kind is not None:
+        plan = _with_type_of_list(plan, first)
+    doubts = dict.fromkeys(note for one in plan.verdicts for note in one.warnings())
+    return replace(plan, notes=(*plan.notes, *coded("cloud.reconstruction", doubts)))
 
-        rows = np.arange(0, view.points, 1 + view.points // SAMPLE_POINTS)
-        sample = sample_of(view, rows, water, match)
-        errors = pose_errors(sample, plan.survey, plan.members, transfer)
-        plan = replace(plan, survey=with_poses(plan.survey, errors))
-    return plan if first is None or plan.views is None else _with_type_of_list(plan, first)
+
+def _with_pose_errors(plan: Plan) -> Plan:
+    """Return the plan with the errors of adjusted poses, if the adjustment left its members."""
+    from pcfix.flow.pose_errors import SAMPLE_POINTS, members_of, pose_errors, with_poses
+
+    members, problem = members_of(plan.inputs.cameras, plan.cameras)
+    if members is None:
+        notes = coded("cameras.poses", filter(None, [problem]))
+        return replace(plan, input_notes=(*plan.input_notes, *notes))
+    rows = np.arange(0, plan.view.points, 1 + plan.view.points // SAMPLE_POINTS)
+    sample = sample_of(plan.view, rows, plan.found.surface, plan.match)
+    errors = pose_errors(sample, plan.survey, members, plan.transfer)
+    return replace(plan, survey=with_poses(plan.survey, errors))
 
 
 def _whole_cloud(plan: Plan) -> Iterator[Points]:
@@ -231,28 +217,27 @@ def _whole_cloud(plan: Plan) -> Iterator[Points]:
 
 def _with_type_of_list(plan: Plan, first: Points) -> Plan:
     """Return the plan with the type of its view list, as the first points show it."""
-    points, views, *_ = transferred(plan, first, 0)
-    batch = replace(batch_of(points, plan.survey, plan.original), views=views)
+    points = transferred(plan, first, 0)[0]
+    batch = replace(batch_of(points, plan.survey, plan.original), views=points.views)
     is_open = plan.inputs.views_are == "auto" and plan.kind == "depth-maps"
-    verdict = weigh_lists(submerged_of(batch), is_open=is_open and plan.match is not None)
+    is_open = is_open and plan.match is not None
+    verdict = learning.weigh_lists(learning.submerged_of(batch), is_open=is_open)
     if verdict is None:
         return plan
-    kind = verdict.chosen.kind or plan.kind
-    return replace(plan, survey=with_verdict(plan.survey, verdict), kind=kind, verdicts=(verdict,))
+    survey, kind = learning.with_verdict(plan.survey, verdict), verdict.chosen.kind or plan.kind
+    return replace(plan, survey=survey, kind=kind, verdicts=(verdict,))
 
 
 def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
     """Resolve every option that is ``auto``, and estimate what the points have in common."""
-    survey, view, views = plan.survey, plan.view, plan.views
+    survey, view, some_unlisted = plan.survey, plan.view, plan.some_unlisted
     given = survey.settings if survey.own_water is not None else plan.options
-    some_listed = False
-    if views is not None:
-        start = views.start if isinstance(views, Views) else views.view_list.listed.start
-        some_listed = len(start) <= view.points or not bool((np.diff(start) > 0).all())
     # listed cameras saw their points, so that nothing hides them
-    may_hide = views is None or survey.settings.occlusion != "auto"
-    wants = some_listed or wants_sample(survey, plan.kind)
-    sample, near, occluder = _scanned(plan, chunks, sample=wants, occluder=may_hide or some_listed)
+    may_hide = plan.kind is None or survey.settings.occlusion != "auto"
+    sample, near, occluder = _scanned(
+        plan, chunks, sample=some_unlisted or learning.wants_sample(survey, plan.kind),
+        occluder=may_hide or some_unlisted,
+    )  # fmt: skip
     if may_hide:
         survey = replace(survey, learned=survey.learned._replace(occluder=occluder))
     plan = replace(plan, survey=survey)
@@ -260,32 +245,34 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
         return plan
     sample = replace(sample, survey=survey)
     ties = original_ties(plan.inputs, plan.transfer, view.crs)
-    sample, factor = with_factor(sample)
+    sample, factor = learning.with_factor(sample)
     notes = [*plan.notes, *coded("cloud.depth_factor", [] if factor is None else [factor])]
     if factor is not None:
         survey, given = sample.survey, replace(given, depth_factor=factor.factor)
-    ratio = None if ties is None else depth_ratio(submerged_of(sample), ties)
-    if ratio is not None and ratio > CORRECTED_RATIO:
+    ratio = None if ties is None else learning.depth_ratio(learning.submerged_of(sample), ties)
+    if ratio is not None and ratio > learning.CORRECTED_RATIO:
         sentence = (
             f"The cloud is {ratio:.2f} times as deep as the tie points of its cameras, as if it"
             " had been corrected before. Give the cloud as the matcher wrote it."
         )
         notes.append(PcfixWarning("cloud.corrected_before", sentence, ratio=ratio))
     hint = hint_of((plan.options.software or view.software,))
-    if views is None:
-        survey, verdicts = learn_of_sample(sample, view.points, ties, hint, near)
+    if plan.kind is None:
+        survey, verdicts = learning.learn_of_sample(sample, view.points, ties, hint, near)
         notes += _note_flat(sample, survey)
         return replace(plan, survey=survey, verdicts=verdicts, notes=tuple(notes))
-    survey, of_unlisted = with_matcher(sample, ties), plan.of_unlisted
-    if some_listed:
+    survey = learning.with_matcher(sample, ties)
+    if some_unlisted:
         learned = plan.survey.learned._replace(occluder=occluder)
-        settings = resolved(given, plan.cameras, None)
+        settings = learning.resolved(given, plan.cameras, None)
         bare = replace(survey, settings=settings, learned=learned)
-        unlisted, of_unlisted = learn_of_sample(
+        unlisted, verdicts = learning.learn_of_sample(
             replace(sample, survey=bare), view.points, ties, hint, near
         )
         survey = replace(survey, parts={UNLISTED: unlisted})
-    return replace(plan, survey=survey, of_unlisted=of_unlisted, notes=tuple(notes))
+        words = ["Points in no view list are corrected as without a list.", *map(str, verdicts)]
+        notes.append(PcfixWarning("views.unlisted", " ".join(words)))
+    return replace(plan, survey=survey, notes=tuple(notes))
 
 
 def _note_flat(sample: Batch, survey: Survey) -> list[PcfixWarning]:
@@ -308,18 +295,15 @@ def _note_flat(sample: Batch, survey: Survey) -> list[PcfixWarning]:
 
 def _scanned(
     plan: Plan, chunks: Chunks, *, sample: bool, occluder: bool
-) -> tuple[Batch | None, Near | None, Occluder | None]:
+) -> tuple[Batch | None, learning.Near | None, Occluder | None]:
     """Read the whole cloud once, for a sample of it and for the surface that hides points.
 
     The sample is evenly spread over the order of the cloud, without noise. If its points may be too
     far apart to detect the reconstruction type, submerged points in squares are returned too.
     """
     view, survey, builder = plan.view, plan.survey, None
-    if occluder:
-        from pcfix.refract.occlusion import OccluderBuilder, wants_occlusion
-
-        if view.points and wants_occlusion(survey.cameras, survey.settings):
-            builder = OccluderBuilder(view.low, view.high, view.points)
+    if occluder and view.points and wants_occlusion(survey.cameras, survey.settings):
+        builder = OccluderBuilder(view.low, view.high, view.points)
     if not sample and builder is None:
         return None, None, None
     # the bed of depth maps needs about 5 points per square metre, wherever the cloud is denser
@@ -338,7 +322,7 @@ def _scanned(
         squares = Squares(PATCH_WIDTH * (float(np.median(above)) if len(above) else HEIGHT_M))
 
     def every(step: int, row: int, points: Points) -> Batch:
-        some = points.take(slice(-row % step, None, step))
+        some = points._replace(views=None).take(slice(-row % step, None, step))
         noise = np.isin(some.classes, NOISE_CLASSES)
         if noise.any():
             some = some.take(np.flatnonzero(~noise))
@@ -351,10 +335,10 @@ def _scanned(
         if sample:
             taken.append(every(step, row, points))
         if squares is not None:
-            squares.add(submerged_of(every(near_step, row, points)))
+            squares.add(learning.submerged_of(every(near_step, row, points)))
         row += len(points.xyz)
     return (
         stacked(taken) if sample else None,
-        None if squares is None else Near(squares.all(), near_step),
+        None if squares is None else learning.Near(squares.all(), near_step),
         None if builder is None else builder.build(),
     )

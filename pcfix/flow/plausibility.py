@@ -10,14 +10,18 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.flow.surfaces import Points
+from pcfix.io.cameras.georeference import adjusted_minus_gnss
+from pcfix.io.tides import read_altitudes
 from pcfix.lens.frames import cameras_in_sight
 from pcfix.lens.imaging import straight_images
 from pcfix.model import Cameras, FloatArray, TiePoints
 from pcfix.options.declare import File
 from pcfix.sums import SAME, Sums
+from pcfix.water.auto import LEAST_POINTS, find_elsewhere
 
 SAMPLE_POINTS, IN_FRAMES = 30_000, 4_000
 """Points of the sample, and those of it that are tested in the frames; evenly spread."""
@@ -52,14 +56,11 @@ class Plausible(NamedTuple):
     fits: tuple[str, ...] = ()  # tests that were passed
     doubts: tuple[PcfixWarning, ...] = ()  # tests that were not
     unchecked: tuple[str, ...] = ()  # what could not be tested
-    noted: bool = False  # whether the discontinuities of the cloud raised doubts too
 
     def __str__(self) -> str:
         """Return a line that claims no more than was tested."""
-        if self.doubts or self.noted:
-            found = "in doubt, see the warnings" if self.doubts else "in doubt, see the notes"
-        else:
-            found = "cameras and cloud fit" if self.fits else "nothing was tested"
+        found = "cameras and cloud fit" if self.fits else "nothing was tested"
+        found = "in doubt, see the warnings" if self.doubts else found
         found += f"; tested: {', '.join(self.fits)}" if self.fits else ""
         return found + (f"; not checked: {', '.join(self.unchecked)}" if self.unchecked else "")
 
@@ -100,8 +101,6 @@ class CloudSample(Sums):
 
     def level_doubts(self) -> tuple[PcfixWarning, ...]:
         """Return warnings if the shoreline in the cloud is at another height than the water."""
-        from pcfix.water.auto import LEAST_POINTS, find_elsewhere
-
         xyz, water = self.xyz, np.concatenate([np.zeros(0), *self.water])
         known = np.isfinite(water)
         if known.sum() < LEAST_POINTS:
@@ -144,24 +143,10 @@ def plausible(
 ) -> Plausible:
     """Test cameras and cloud against each other.
 
-    Parameters
-    ----------
-    cameras : Cameras
-        In the cloud's frame, as the tie points.
-    cloud : array, shape (n, 3)
-        Points, metres, evenly spread over it.
-    ties : TiePoints, optional
-        Of these cameras.
-    level_doubts : tuple of PcfixWarning
-        See `CloudSample.level_doubts`.
-    file : path
-        Of the cameras.
-    water_m : float, optional
-        Median height of the water.
-    listed : bool
-        Whether the listed images were found to hold their points.
-    every : float
-        Points of the whole cloud for each of `cloud`.
+    Cameras and tie points are in the cloud's frame; `cloud` are some of its points, shape (n, 3),
+    metres, evenly spread, each of which stands for `every` of them. `level_doubts` are those of
+    `CloudSample`, `file` is that of the cameras, and `water_m` the median height of the water.
+    `listed` says whether the listed images were found to hold their points.
     """
     if not len(cameras) or not len(cloud):
         return Plausible((), level_doubts)
@@ -252,8 +237,6 @@ def _spacing(cameras: Cameras, cloud: FloatArray, every: float) -> Result:
     pixel = _pixel_m(cameras, cloud)
     if pixel is None or len(cloud) <= AROUND:
         return Result()
-    from scipy.spatial import cKDTree  # not quick to load
-
     places = cloud[:, :2]
     reach = np.asarray(cKDTree(places).query(places[:: 1 + len(places) // TIES], k=AROUND + 1)[0])
     area = np.pi * float(np.median(reach[:, -1])) ** 2 / (AROUND * every)
@@ -333,8 +316,6 @@ def _heights(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Res
             share=residual,
             image=image,
         )
-    from scipy.spatial import cKDTree  # not quick to load
-
     placed = ties.xyz[np.isfinite(ties.xyz).all(axis=1)]
     placed = placed[:: 1 + len(placed) // TIES]
     tree = cKDTree(cloud[:, :2])
@@ -388,8 +369,6 @@ def positions(cameras: Cameras, name: str) -> Result:
     """Compare the places of cameras with those that their GNSS recorded."""
     if cameras.gnss is None:
         return Result()
-    from pcfix.io.cameras.georeference import adjusted_minus_gnss
-
     try:
         found = adjusted_minus_gnss(cameras, name)[0][:, :2]
     except InputError:
@@ -410,8 +389,6 @@ def positions(cameras: Cameras, name: str) -> Result:
 
 def flying_heights(cameras: Cameras, file: File, water_m: float | None) -> Result:
     """Compare the heights of cameras above the water with those recorded above take-off."""
-    from pcfix.io.tides import read_altitudes
-
     recorded = read_altitudes(file, cameras.labels)
     rows = np.flatnonzero(np.isfinite(recorded))
     if not len(rows) or water_m is None:

@@ -55,16 +55,9 @@ def pose_errors(
 ) -> PoseErrors | None:
     """Return the errors of the bed by those of the poses; None if no point is corrected.
 
-    Parameters
-    ----------
-    sample : Points
-        Apparent points, with their views if there is a view list.
-    survey : Survey
-        With everything that was estimated.
-    members : Members
-        Of the adjustment of the survey's cameras, in their order.
-    transfer : CloudTransfer or None
-        The original cameras, if those of the survey were adjusted since.
+    The sample are apparent points, with their views if there is a view list. The members are of
+    the adjustment of the survey's cameras, in their order, and `transfer` has the original cameras,
+    if those of the survey were adjusted since.
     """
     k = len(survey.cameras)
     transfer = transfer or CloudTransfer(survey.cameras, survey.cameras, np.arange(k), ())

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import bad_file
-from pcfix.flow.adjust import SUMMARY
-from pcfix.flow.next_steps import FOLDER
+from pcfix.flow.adjust import FOLDER, SUMMARY
 from pcfix.flow.request import RunFolder
 from pcfix.flow.surfaces import view_of
 from pcfix.flow.water import found_picture
@@ -61,23 +60,22 @@ def report_run(
 ) -> Plain:
     """Write the page of a run, and return what it says in short."""
     pictures, tables, dod, verdict = list[Picture](), list[Table](), None, ""
-    if first["adjusted"]:
-        verdict = f" The cameras were adjusted first, as {first['why']}."
-    elif first["is_shown"]:
-        verdict = f" The cameras were not adjusted: {first['why']}."
+    if first["why"]:
+        how = "not adjusted:" if first["model"] is None else "adjusted first, as"
+        verdict = f" The cameras were {how} {first['why']}."
     request, summary = run.request, Summary(**corrected)
     if compared:
         dod = preview(run.dod, MOST_CELLS) if request.has_surface else None
         pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
         verdict += in_a_sentence(compared["figures"])
-    if first["adjusted"]:
+    if first["model"] is not None:
         figures = read_json(run.folder / FOLDER / SUMMARY)
         tables += adjustment_tables(figures, f"{FOLDER}/report.html")
     if (summary.water_fit or {}).get("model") == "auto":  # the water was sought in the cloud
         pictures.append(found_picture(run.inputs.surface(view_of(request.source))))
     results = RunResults(
         summary, run.cameras, **read_cloud(run.cleaned_cloud, run.resolution_m),
-        project=request.project or "", date=request.date or run.inputs.dates(run.cameras),
+        project=request.project or "", date=request.date or "",
         pictures=pictures, tables=tables, verdict=verdict, compared=compared.get("figures", {}),
         difference=dod,
     )  # fmt: skip

@@ -12,13 +12,13 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from pcfix.errors import InputError, PcfixWarning, SettingError, bad_file
+from pcfix.errors import PcfixWarning, SettingError, bad_file
+from pcfix.flow.adjust import FOLDER
 from pcfix.flow.inputs import Inputs, paths_in, read_blocks
-from pcfix.flow.next_steps import FOLDER
 from pcfix.flow.runner import HOW, json_text
 from pcfix.flow.surfaces import view_of
 from pcfix.io.clouds import is_cloud, own_water, reference_of
-from pcfix.io.files import belonging, file_state, files_in, read_json, write_text
+from pcfix.io.files import belonging, file_state, files_in, read_json, refusing, write_text
 from pcfix.io.rasters import open_raster
 from pcfix.io.tiles import Tiles, cloud_of, inputs_of, open_cloud, tiles_from, tiles_of
 from pcfix.model import Cameras, WaterSurface
@@ -26,11 +26,9 @@ from pcfix.options.declare import named, options_of
 from pcfix.options.steps import DistanceOptions
 from pcfix.options.survey import RunOptions
 from pcfix.version import __version__
-from pcfix.water.index import Water, with_index
+from pcfix.water.index import with_index
 
 SURFACE = "surface.tif"
-VERSION = "pcfix"
-"""Of a request: which version of pcfix did it."""
 STEPS = ("adjust", "correct", "clean", "dsm", "compare", "map", "report")
 """In their order; each depends on those before it."""
 
@@ -67,7 +65,8 @@ class Request(RunOptions):
         if wrong:
             wrong = f"--adjust {self.adjust}: {wrong}"
             raise SettingError("option.conflict", wrong, option="adjust", value=self.adjust)
-        self.part(Inputs)
+        if self.water is None:
+            raise SettingError("water.missing", "water is missing: give the water surface.")
         with_index(self.part(RunOptions))
 
     @property
@@ -88,7 +87,7 @@ class Request(RunOptions):
 
     def with_adjusted(self, folder: Path, step: dict[str, Any]) -> Request:
         """Return the request of the next steps: with the adjusted cameras, if there are any."""
-        if not step["adjusted"]:
+        if step["model"] is None:
             return self
         return replace(
             self,
@@ -100,7 +99,7 @@ class Request(RunOptions):
     def record(self) -> dict[str, Any]:
         """Return plain values, without what the results do not depend on."""
         values = {name: value for name, value in self.as_dict().items() if name not in HOW}
-        return {**values, VERSION: __version__}
+        return {**values, "pcfix": __version__}
 
     def files(self) -> dict[str, list[Path]]:
         """Return the input files, each of which exists, by the first step that reads them."""
@@ -127,20 +126,11 @@ def _files_of(cloud: Path | Tiles) -> list[Path]:
     return inputs_of(cloud) if isinstance(cloud, Tiles) else files_in(cloud)
 
 
-_FIRST = {
-    *("input", "adjust", "gcps", "gnss", "lens", "index", "index_formula", VERSION),
-    *(one.name for one in options_of(Inputs)),
-    *Water._fields,
-}
-_LATER = {
+LATER = {
     **{one.name: "compare" for one in options_of(DistanceOptions)},
     "reference": "compare", "resolution": "dsm", "project": "report", "date": "report",
 }  # fmt: skip
-
-
-def since(name: str) -> str:
-    """Return the first step that an option of a request matters to."""
-    return "adjust" if name in _FIRST else _LATER.get(name, "correct")
+"""The first step that an option of a request matters to, if it does not matter to all."""
 
 
 class Record:
@@ -150,13 +140,8 @@ class Record:
     A step is done if the record has it with the same key, its outputs are as it left them, and no
     step before it had to be done. The file is written after each step.
 
-    Parameters
-    ----------
-    path : Path
-    request : dict
-        Everything that the results depend on.
-    inputs : dict
-        Input files, by the first step that reads them.
+    `request` is everything that the results depend on, and `inputs` are the input files by the
+    first step that reads them.
     """
 
     def __init__(
@@ -164,21 +149,17 @@ class Record:
     ) -> None:
         self._path = path
         states = {step: [file_state(one) for one in some] for step, some in inputs.items()}
-        self._content: dict[str, Any] = {
-            "request": request,
-            "inputs": [{**one, "step": step} for step, some in states.items() for one in some],
-            "steps": {},
-        }
+        self._content: dict[str, Any] = {"request": request, "inputs": states, "steps": {}}
         self._keys: dict[str, str] = {}
         key = ""
         # A chain: the key of a step changes with those of all steps before it.
         for step in STEPS:
-            options = {name: value for name, value in request.items() if since(name) == step}
-            depends = json.dumps([key, options, states.get(step)], sort_keys=True)
+            options = [one for one in request.items() if LATER.get(one[0], STEPS[0]) == step]
+            depends = json.dumps([key, sorted(options), states.get(step)])
             key = self._keys[step] = sha256(depends.encode()).hexdigest()
         earlier = read_record(path) if path.exists() else {"request": request, "steps": {}}
         self._earlier: dict[str, Any] = earlier["steps"]
-        self.resumes = self._has("correct" if "correct" in self._earlier else "adjust")
+        self.resumes = self._has(STEPS[0])
         """Whether there is an earlier run whose corrected cloud is not replaced."""
         plain = json.loads(json.dumps(request))
         self.changed = [one for one in plain if plain[one] != earlier["request"].get(one)]
@@ -207,30 +188,26 @@ class Record:
 
 def read_record(path: Path) -> dict[str, Any]:
     """Return the content of a record."""
-    try:
+    with refusing(path, "run.record", _NO_RECORD):
         content: dict[str, Any] = read_json(path)
         _ = content["request"], content["inputs"], content["steps"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise _bad_record(path, error) from error
     return content
 
 
-def _bad_record(path: Path, error: Exception) -> InputError:
-    sentence = f"is not the record of a run ({error}). Give the run.json of an earlier run, or"
-    return bad_file(path, "run.record", f"{sentence} remove it.")
+_NO_RECORD = "is not the record of a run ({}). Give the run.json of an earlier run, or remove it."
 
 
 def request_of(record: Path) -> Request:
     """Return what an earlier run was asked for, from its ``run.json``."""
     asked = {**read_record(record)["request"]}
     input = asked.pop("input", "")
-    for name in ("index_from", VERSION):
+    for name in ("index_from", "pcfix"):
         asked.pop(name, None)
     try:
         values = named(asked, options_of(RunOptions), str(record))
         return Request(input=tuple(input) if isinstance(input, list) else input, **values)
     except (SettingError, TypeError) as error:
-        raise _bad_record(record, error) from error
+        raise bad_file(record, "run.record", _NO_RECORD.replace("{}", str(error))) from error
 
 
 class RunFolder:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from pcfix.errors import bad_file
-from pcfix.flow.runner import Chunk, Command, FileWork, run_command, stream
+from pcfix.flow.runner import Chunk, FileWork, run_command
 from pcfix.io.las.columns import SHIFTS, UNSURE, columns_for, convert, move
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import read_settings, record_errors, restored_header
@@ -35,9 +34,7 @@ def restore_file(
         output; see `pcfix.correct_file`.
     output : path
         The cloud as it was: coordinates, classes, flags, point format, version.
-    options : TileOptions, optional
-        Or its attributes as keywords: overwrite, jobs, scheduler.
-    progress : callable, optional
+    options, progress
         See `pcfix.correct_file`.
 
     Returns
@@ -51,10 +48,10 @@ def restore_file(
         If pcfix did not correct the file, or without the dimensions that undo it.
     """
     given = taken(TileOptions, options, keywords, "restore_file")
-    command = Command(
-        "restore", lambda task: None, partial(stream, _restoring), lambda plan, task, points: points
-    )
-    return run_command(command, input, output, given, progress=progress)
+    return run_command(
+        "restore", input, output, given, plan=lambda task: None, work=_restoring,
+        finish=lambda plan, task, points: int(points), progress=progress,
+    )  # fmt: skip
 
 
 def _restoring(plan: None, source: LasSource) -> FileWork:
@@ -78,7 +75,7 @@ def _restoring(plan: None, source: LasSource) -> FileWork:
         shift = np.column_stack([points.array[name] for name in SHIFTS]).astype(np.int64)
         old = convert(points, header.point_format)
         old.offsets = header.offsets
-        move(old, -shift - offset)
+        move(old, -shift - offset, source.path)
         return old
 
     return FileWork(header, lambda points, row: (None, len(points)), apply, identity)

@@ -5,7 +5,6 @@ The results are opened as rasters, lines and tables (`RunResults`).
 
 from __future__ import annotations
 
-import math
 import os
 import warnings
 from collections.abc import Callable, Iterable
@@ -17,25 +16,15 @@ from typing import TYPE_CHECKING, Any
 
 from pcfix.adjust.diagnosis import MOST_STATED_M
 from pcfix.compare.m3c2 import load_py4dgeo
-from pcfix.errors import PcfixError, PcfixWarning, SettingError, bad_file
-from pcfix.flow.adjust import SUMMARY, adjust_into
+from pcfix.errors import PcfixError, PcfixWarning, SettingError, bad_file, plain
+from pcfix.flow import maps
+from pcfix.flow.adjust import FOLDER, MODELS, SUMMARY, adjust_into
 from pcfix.flow.clean import clean_file
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.correct import correct_file
 from pcfix.flow.diagnosis import diagnose_inputs, has_datum
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.maps import (
-    BED,
-    DEPTH,
-    SECTIONS,
-    UNCERTAINTY,
-    contours_layer,
-    raster_files,
-    write_map,
-    write_rasters,
-)
-from pcfix.flow.next_steps import FOLDER, MODELS
 from pcfix.flow.report import PAGE, report_run
 from pcfix.flow.request import SURFACE, Record, Request, RunFolder, read_record
 from pcfix.flow.runner import Bar, Progress, check_folder, no_bar
@@ -72,11 +61,6 @@ COLMAP = ("cameras.bin", "images.bin", "points3D.bin", "georeference.json")
 ADJUSTED = ("report.html", SUMMARY, MEMBERS, *(f"colmap/{name}" for name in COLMAP), *MODELS[1:])
 """The files that an adjustment may leave, its report first."""
 
-_WHY = {
-    UNCERTAINTY: "the points have no standard errors",
-    "map.gpkg": "lines need pyogrio; run: pip install 'pcfix[analysis]', then run again",
-}
-
 
 def run(
     input: File | Iterable[File],
@@ -96,22 +80,17 @@ def run(
     out_dir : path
         Folder for all results, made where its parent exists. Called again with the same options it
         resumes, and a finished run is opened at once.
-    options : RunOptions, optional
-        Or its attributes as keywords, as of ``pcfix run``: cameras, water, reference, resolution,
-        overwrite and so on. Cameras and water are files or text, as ``run.json`` keeps them.
+    options
+        See `pcfix.correct_file`. Cameras and water are files or text, as ``run.json`` keeps them.
     say : callable, optional
         Called with a line on each step, as ``print``.
     bar : callable, optional
         Shows the progress of a step; see `pcfix.flow.runner.Bar`.
 
-    Returns
-    -------
-    RunResults
-
     Raises
     ------
     PcfixError
-        With one sentence on what to do; the steps before it stay done.
+        The steps before it stay done.
 
     Examples
     --------
@@ -120,19 +99,17 @@ def run(
     >>> float(result.depth.max())  # doctest: +SKIP
     12.25
     """
-    given, values = taken(RunOptions, options, keywords, "run"), {}
-    for one in options_of(RunOptions):
-        value = getattr(given, one.name)
-        if one.type is Any and value is not None:
-            if not isinstance(value, str | os.PathLike | Real):
-                raise SettingError(
-                    "option.type",
-                    f"run: {one.name} is a {type(value).__name__}. Give a file or text, which"
-                    " run.json can keep, or use correct_file.",
-                    option=one.name,
-                )
-            value = str(value)
-        values[one.name] = value
+    given = taken(RunOptions, options, keywords, "run")
+    values = {one.name: getattr(given, one.name) for one in options_of(RunOptions)}
+    for name in ("cameras", "water", "adjusted_from", "gcps"):
+        if not isinstance(values[name], str | os.PathLike | Real | None):
+            raise SettingError(
+                "option.type",
+                f"run: {name} is a {type(values[name]).__name__}. Give a file or text, which"
+                " run.json can keep, or use correct_file.",
+                option=name,
+            )
+        values[name] = None if values[name] is None else str(values[name])
     cloud = str(input) if isinstance(input, str | os.PathLike) else tuple(map(str, input))
     run_all(Request(input=cloud, **values), Path(out_dir), say=say, bar=bar)
     return RunResults(Path(out_dir))
@@ -174,12 +151,12 @@ def run_all(
     first, done = step(
         "adjust", "Adjusting", outputs, lambda _: adjust_first(asked, out_dir, inputs)
     )
-    if first["adjusted"]:
+    if first["model"] is not None:
         figures = read_json(out_dir / FOLDER / SUMMARY)
         say(f"{done}{outputs[0]}")
         for words in (adjustment_sentence(figures), *all_notes(figures)):
             say(f"{'':<9} {words}")
-    elif first["is_shown"]:
+    elif first["why"]:
         say(f"{'adjust':<9} not done: {first['why']}")
     request = request.with_adjusted(out_dir, first)
     run = RunFolder(out_dir, request)
@@ -189,13 +166,10 @@ def run_all(
     outputs += [] if request.shoreline is None else [Path(request.shoreline)]
     corrected, done = step("correct", "Correcting", outputs, partial(_correct, run))
     poses = corrected["poses"]
-    if first["is_fine"] and poses is not None and poses["absorbed"] is None:
+    if first["absorbed"] is False and poses is not None and poses["absorbed"] is None:
         # the first step has surveys that the correction has not
         words = "did not absorb the refraction, as the first step found"
         corrected = {**corrected, "poses": {**poses, "absorbed": False, "words": words}}
-    if not first["is_shown"] and first["why"] and (poses or {}).get("absorbed"):
-        first = {**first, "is_shown": True}
-        say(f"{'adjust':<9} not done: {first['why']}")
     say(f"{done}{run.corrected}")
 
     # the corrected cloud marks which points are below the water
@@ -209,10 +183,10 @@ def run_all(
     say(f"{done}{run.cleaned}")
 
     errors = corrected["uncertainty"] is not None
-    outputs = raster_files(out_dir, errors=errors)
+    outputs = maps.raster_files(out_dir, errors=errors)
     gridded, done = step(
         "dsm", "Gridding", outputs,
-        lambda progress: write_rasters(run, errors=errors, progress=progress),
+        lambda progress: maps.write_rasters(run, errors=errors, progress=progress),
     )  # fmt: skip
     say(f"{done}{outputs[0]}, cells of {gridded['resolution_m']:g} m")
 
@@ -228,7 +202,7 @@ def run_all(
     except SettingError as error:
         say(f"{'map':<9} not written: {error}")
     else:
-        draw = partial(write_map, layers, run, corrected, compared)
+        draw = partial(maps.write_map, layers, run, corrected, compared)
         _, done = step("map", "Drawing the map", [layers], lambda _: draw())
         say(f"{done}{layers}")
 
@@ -268,65 +242,54 @@ def adjust_first(request: Request, folder: Path, files: list[Path]) -> Plain:
 
     The files are inputs of the run, which the adjustment must not replace.
 
-    Returns
-    -------
-    dict
-        `adjusted`, a bool; `model`, the file or folder with the cameras in that of the adjustment;
-        `why`; `is_shown`, whether that is worth a line; `is_fine`, whether the poses are known to
-        be right.
+    Returns `model`, the file or folder with the cameras in that of the adjustment, None without
+    one; `why`; and `absorbed`, whether the poses absorbed refraction, None if that is not known.
     """
-    found = {"adjusted": False, "model": None, "why": "", "is_shown": False, "is_fine": False}
+    model, why, absorbed = None, "", None
     try:
-        found |= _decide(request)
-        if found["adjusted"]:
-            found["model"] = _adjust(request, folder / FOLDER, files)
+        why, absorbed = _decide(request)
+        if absorbed or request.adjust == "yes":
+            model = _adjust(request, folder / FOLDER, files)
     except PcfixError as error:
         if request.adjust == "yes" or request.only_to_adjust:
             raise
-        # a file that cannot be read will stop the correction, with the same message
-        found |= {"adjusted": False, "why": str(error), "is_shown": found["adjusted"]}
-    return found
+        why = str(error)  # of a file that cannot be read, which stops the correction too
+    return {"model": model, "why": why, "absorbed": absorbed}
 
 
-def _decide(request: Request) -> Plain:
-    """Return whether to adjust: if asked, or if the poses absorbed refraction and there is a datum.
+def _decide(request: Request) -> tuple[str, bool | None]:
+    """Return why the cameras are adjusted, or not; and whether their poses absorbed refraction.
 
-    Signs of absorbed refraction do not include the survey with which the result is compared: the
-    cloud must not depend on it.
+    Without a datum that is not asked. Signs of absorbed refraction do not include the survey with
+    which the result is compared: the cloud must not depend on it.
     """
-    if request.adjust == "yes":
-        return {"adjusted": True, "why": "that was asked for", "is_shown": True}
-    if request.adjust == "no":
-        return {}
-    inputs, is_shown = request.part(Inputs), bool(request.only_to_adjust)
+    if request.adjust != "auto" or request.cameras is None:
+        return ("that was asked for" if request.adjust == "yes" else ""), None
     if request.why_not_adjust:
-        return {"why": request.why_not_adjust, "is_shown": is_shown}
-    view = view_of(request.source)
+        return request.why_not_adjust, None
+    inputs, view = request.part(Inputs), view_of(request.source)
     # the correction shows the warnings
     with warnings.catch_warnings(action="ignore", category=PcfixWarning):
         cameras = inputs.block(view.crs)[0]
         if request.gnss is not None:
             cameras = read_gnss(request.gnss, cameras)
         elif request.gcps is None and not has_datum(cameras, str(request.cameras)):
-            why = (
+            return (
                 "there is no datum: no --gcps, no --gnss, and no GNSS positions better than"
                 f" {MOST_STATED_M:g} m in the camera file"
-            )
-            return {"why": why, "is_shown": is_shown}
+            ), None
         water = inputs.surface(view).surface
         if isinstance(water, WaterDimension):
-            why = f"the water {water} is known at points of the cloud only"
-            return {"why": why, "is_shown": True}
-        index = with_index(request).refractive_index
+            return f"the water {water} is known at points of the cloud only", None
         sign = diagnose_inputs(
-            inputs, cameras, view, water, index, gcps=request.gcps, in_passing=not is_shown
-        ).decided_by
+            inputs, cameras, view, water, with_index(request).refractive_index, gcps=request.gcps,
+            in_passing=not request.only_to_adjust,
+        ).decided_by  # fmt: skip
     if sign is None:
         why = "nothing shows whether the poses absorbed the refraction; --adjust yes adjusts anyway"
-        return {"why": why, "is_shown": True}
+        return why, None
     did = "absorbed" if sign.speaks else "did not absorb"
-    why = f"the poses {did} the refraction: {sign.words}"
-    return {"adjusted": sign.speaks, "why": why, "is_shown": True, "is_fine": not sign.speaks}
+    return f"the poses {did} the refraction: {sign.words}", sign.speaks
 
 
 def _adjust(request: Request, target: Path, files: list[Path]) -> str:
@@ -352,11 +315,10 @@ def _correct(run: RunFolder, progress: Progress | None) -> Plain:
 
 def _compare(run: RunFolder) -> Plain:
     """Compare the cleaned cloud with the reference, and write a raster of differences."""
-    request = run.request
-    reference = request.surveyed
+    request, reference = run.request, run.request.surveyed
     result = compare_clouds(
-        run.cleaned_cloud, reference, out_dir=run.compare, sections=SECTIONS, overwrite=True,
-        **{one.name: getattr(request, one.name) for one in options_of(DistanceOptions)},
+        run.cleaned_cloud, reference, out_dir=run.compare, sections=maps.SECTIONS,
+        overwrite=True, **vars(request.part(DistanceOptions)),
     )  # fmt: skip
     if request.has_surface:
         heights = Path(str(reference))
@@ -367,17 +329,10 @@ def _compare(run: RunFolder) -> Plain:
                 grid_dsm(reference, heights, resolution=run.resolution_m, overwrite=True)
         rasters.write_dod(run.folder / SURFACE, heights, run.dod, overwrite=True)
     sections = [
-        {
-            "distance_m": section.distance_m.tolist(),
-            "heights_m": {
-                name: [None if math.isnan(value) else value for value in heights_m.tolist()]
-                for name, heights_m in section.heights_m.items()
-            },
-        }
-        for section in result.sections
+        {"distance_m": one.distance_m, "heights_m": one.heights_m} for one in result.sections
     ]
-    points = [] if result.check_points is None else result.check_points.tolist()
-    return {"figures": result.as_dict(), "sections": sections, "check_points": points}
+    points = [] if result.check_points is None else result.check_points
+    return {"figures": result.as_dict(), **plain({"sections": sections, "check_points": points})}
 
 
 @dataclass(frozen=True)
@@ -386,10 +341,6 @@ class RunResults:
 
     Rasters and lines are in the CRS of the cloud, metres. They need the extra ``analysis``, and are
     read from the files each time they are asked for.
-
-    Attributes
-    ----------
-    folder : Path
     """
 
     folder: Path
@@ -421,12 +372,12 @@ class RunResults:
     @property
     def depth(self) -> DataArray:
         """Depth of the bed, shape (y, x), metres below the water, positive down; NaN on land."""
-        return rasters.open_array(self._file(DEPTH))
+        return rasters.open_array(self._file(maps.DEPTH))
 
     @property
     def bed(self) -> DataArray:
         """Heights of the bed, shape (y, x), metres; NaN on land."""
-        return rasters.open_array(self._file(BED))
+        return rasters.open_array(self._file(maps.BED))
 
     @property
     def surface(self) -> DataArray:
@@ -436,7 +387,7 @@ class RunResults:
     @property
     def uncertainty(self) -> DataArray:
         """Vertical uncertainty of the bed at 95 %, shape (y, x), metres, predicted."""
-        return rasters.open_array(self._file(UNCERTAINTY))
+        return rasters.open_array(self._file(maps.UNCERTAINTY))
 
     def contours(self, interval: float | None = None) -> GeoDataFrame:
         """Return lines of equal depth, ``depth_m``.
@@ -453,7 +404,7 @@ class RunResults:
                 "option.range", f"interval {interval:g} must be above 0.",
                 option="interval", value=interval, above=0,
             )  # fmt: skip
-        return vectors.frame_of(contours_layer(self.folder, interval), self.depth.rio.crs)
+        return vectors.frame_of(maps.contours_layer(self.folder, interval), self.depth.rio.crs)
 
     @property
     def waterline(self) -> GeoDataFrame:
@@ -482,27 +433,15 @@ class RunResults:
     def _file(self, name: str) -> Path:
         path = self.folder / name
         if not path.is_file():
-            why = f": {_WHY[name]}" if name in _WHY else ""
-            raise bad_file(path, "run.no_file", f"the run has not written it{why}.")
+            raise bad_file(path, "run.no_file", "the run has not written it.")
         return path
 
 
 def open_run(folder: File) -> RunResults:
     """Open the results of a finished run.
 
-    Parameters
-    ----------
-    folder : path
-        The OUT_DIR of ``pcfix run``.
-
-    Returns
-    -------
-    RunResults
-
-    Raises
-    ------
-    InputError
-        If the folder holds no run, or an unfinished one.
+    The folder is the OUT_DIR of ``pcfix run``. An `InputError` if it holds no run, or an unfinished
+    one.
     """
     found = RunResults(Path(folder))
     _ = found.summary

@@ -1,6 +1,6 @@
 """How a command goes over a cloud: in one file, or in many on several processes or a cluster.
 
-A `Command` plans once for a cloud; then each file goes through `stream`, chunk by chunk, with
+A command plans once for a cloud; then each file goes through `stream`, chunk by chunk, with
 the next chunk being read and the last one written meanwhile. Each of many files is a task that
 writes its output, and its statistics in the folder `RECORDS`. A file whose output exists with the
 same key (a hash of options and input files) is skipped.
@@ -10,21 +10,14 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import os
 import pickle
 import signal
 import sys
 import time
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from concurrent.futures import (
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
-    as_completed,
-)
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import as_completed as completed
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
@@ -33,34 +26,16 @@ from operator import add
 from os import PathLike
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar, cast
 
 from pcfix import version
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
+from pcfix.io import files
 from pcfix.io.atomic import all_or_none
-from pcfix.io.files import (
-    belonging,
-    check_input,
-    check_output,
-    file_state,
-    path_of,
-    read_tally,
-    write_bytes,
-    write_tally,
-    write_text,
-)
+from pcfix.io.files import write_bytes, write_text
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix, corrected_identity, las_writer
-from pcfix.io.tiles import (
-    BrokenTileError,
-    Clouds,
-    Tiles,
-    check_one_file,
-    inputs_of,
-    open_cloud,
-    part_of,
-    tiles_of,
-)
+from pcfix.io.tiles import Clouds, Tiles, check_one_file, inputs_of, open_cloud, part_of, tiles_of
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.libraries import optional_library
 from pcfix.options.declare import File, options_of
@@ -75,15 +50,13 @@ Chunk: TypeAlias = "laspy.ScaleAwarePointRecord"
 Progress: TypeAlias = Callable[[int, int], None]
 Bar: TypeAlias = Callable[[str], AbstractContextManager[Progress | None]]
 """Shows the progress of a step, given its title."""
-Finish: TypeAlias = Callable[[Any], Any]
-"""Takes the statistics of all points; refuses what cannot be right, else returns the result."""
 RECORDS = ".pcfix"
 HOW = ("overwrite", "jobs", "scheduler", "summary")
 """Options on which no output depends."""
 WAIT_S = 10
 """For a scheduler to answer, and for its first worker."""
-Work = Callable[..., str]
-Run = Callable[[Work, bytes, Sequence[Any]], Iterator[tuple[Any, str]]]
+Run = Callable[[Callable[..., str], bytes, Sequence[Any]], Iterator[tuple[Any, str]]]
+"""Yields tasks with their errors as they are done, with the same pickled bytes for all."""
 POINTS_A_PROCESS = 500_000
 """These take about as long as another process takes to start."""
 
@@ -107,6 +80,10 @@ class FileWork(NamedTuple):
     identity: bytes = b""  # of the software in the header; by default that of pcfix
 
 
+Work: TypeAlias = Callable[[Any, LasSource], FileWork]
+"""Takes the plan of a command and an opened file."""
+
+
 @dataclass(frozen=True, eq=False)
 class FileTask:
     """A cloud to read, a cloud to write, and how."""
@@ -124,9 +101,6 @@ class FileTask:
     key: str = ""
     pcfix: str = version.__version__
 
-    def __str__(self) -> str:
-        return str(self.source)
-
     @property
     def seconds(self) -> float:
         """Time since the start."""
@@ -140,67 +114,95 @@ class FileTask:
     @property
     def is_finished(self) -> bool:
         """Whether the output exists, with the same key."""
-        return self.target.is_file() and read_tally(self.record)[0] == self.key
+        return self.target.is_file() and files.read_tally(self.record)[0] == self.key
 
     def keep(self, tally: Any) -> None:
         """Write the statistics; an older output must not be taken for the one that follows."""
         self.target.unlink(missing_ok=True)
-        write_tally(self.record, self.key, tally)
-
-
-@dataclass(frozen=True)
-class Command(Generic[Result]):
-    """A command that rewrites clouds, as functions.
-
-    `plan` takes a task for all files, and returns all that its points have in common, which
-    can be pickled. `process` takes one file through a plan; see `stream`. `finish` takes the plan,
-    the task and the statistics of all points; it refuses what cannot be right, and returns the
-    result of the command.
-    """
-
-    name: str
-    plan: Callable[[FileTask], Any]
-    process: Callable[[Any, FileTask, Finish], Any]
-    finish: Callable[[Any, FileTask, Any], Result]
+        files.write_tally(self.record, self.key, tally)
 
 
 def run_command(
-    command: Command[Result],
+    name: str,
     input: Clouds,
     output: File,
     options: Any,
     *,
+    plan: Callable[[FileTask], Any],
+    work: Work,
+    finish: Callable[[Any, FileTask, Any], Result],
     reads: Iterable[Any] = (),
     progress: Progress | None = None,
 ) -> Result:
-    """Run a command over one file or many; `reads` are further inputs. Returns its result.
+    """Run a command that rewrites clouds over one file or many, and return its result.
 
-    With many files, `progress` is called with (points done, points in all) after each.
+    `plan` takes a task for all files, and returns all that its points have in common, which can be
+    pickled. `work` returns what is done to one opened file by the plan. `finish` takes the plan,
+    the task and the statistics of all points; it refuses what cannot be right, else returns the
+    result. `reads` are further inputs. With many files, `progress` is called after each.
     """
     tiles = tiles_of(input)
-    if tiles is not None:
-        return _run_tiles(command, tiles, output, options, progress)
-    task = file_task(cast("File", input), output, options, reads=reads, progress=progress)
-    with threads(task.jobs), all_or_none():
-        plan = command.plan(task)
-        result: Result = command.process(plan, task, partial(command.finish, plan, task))
-        _write_summary(options, result)
+    if tiles is None:
+        task = file_task(cast("File", input), output, options, reads=reads, progress=progress)
+        with threads(task.jobs), all_or_none():
+            planned = plan(task)
+            result: Result = stream(work, planned, task, partial(finish, planned, task))
+            write_summary(options, result)
+        return result
+    folder = files.path_of(output)
+    task = FileTask(tiles, folder)
+    check_one_file(tiles, options)
+    check_folder(folder, tiles.paths)
+    named = Path(tiles.name)
+    if named.is_dir() and folder.resolve().is_relative_to(named.resolve()):
+        sentence = f"{folder}: is inside the folder of the inputs. Give one outside of it."
+        raise SettingError("output.is_input", sentence, path=folder)
+    check_summary(options, tiles.paths)
+    tasks = _tasks(name, tiles, folder, options)
+    todo = [one for one in tasks if not one.is_finished]
+    for one in todo if folder.exists() else ():
+        check_cloud(one.target, overwrite=options.overwrite, inputs=tiles.paths)
+    points, failed = sum(one.points for one in todo), list[str]()
+    with threads(options.jobs), machines(options.scheduler, options.jobs, points) as run:
+        planned = plan(task)
+        try:
+            (folder / RECORDS).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            sentence = f"{folder}: cannot be made ({error.strerror})."
+            raise InputError("output.folder", sentence) from error
+        done = len(tiles) - points
+        for one, why in run(do_task, pickle.dumps((work, planned)), todo):
+            failed += [why] if why else []
+            done += 0 if why else one.points
+            if progress is not None:
+                progress(done, len(tiles))
+        if failed:
+            raise InputError(
+                "tiles.failed",
+                f"{tiles}: {len(failed)} of {len(tasks)} files failed. The same command continues"
+                " with them; if files have changed, add --overwrite.\n"
+                + "\n".join(f"  {one}" for one in failed),
+                failed=failed,
+            )
+        # in the order of the files, so that no sum depends on which was first
+        tallies = [files.read_tally(one.record)[1] for one in tasks]
+        tally = reduce(add, tallies) if tallies[0] is not None else None
+        # Only the statistics of all points show whether cameras and water fit.
+        try:
+            result = finish(planned, task, tally)
+        except PcfixError:
+            for one in tasks:
+                one.record.unlink(missing_ok=True)
+                one.target.unlink(missing_ok=True)
+            raise
+        write_summary(options, result)
     return result
 
 
-def _write_summary(options: Any, result: Any) -> None:
-    """Write the summary of a command, if it has one and its options name a file."""
-    if getattr(options, "summary", None) is not None:
-        write_summary(options, result.as_dict())
-
-
-def stream(
-    work: Callable[[Any, LasSource], FileWork], plan: Any, task: FileTask, finish: Finish
-) -> Any:
+def stream(work: Work, plan: Any, task: FileTask, finish: Callable[[Any], Any]) -> Any:
     """Take every chunk of a file through a command; the target appears when all went well.
 
-    `work` returns what is done to the opened file by the plan. Returns what `finish` makes of the
-    statistics.
+    Returns what `finish` makes of the statistics.
     """
     with open_cloud(task.source, task.jobs, kept=task.cached or None) as source:
         own, total = work(plan, source), len(source)
@@ -244,82 +246,14 @@ def read_ahead(chunks: Iterator[Any]) -> Iterator[Any]:
             yield one
 
 
-def _run_tiles(
-    command: Command[Result], tiles: Tiles, output: File, options: Any, progress: Progress | None
-) -> Result:
-    """Run a command over all files that are not finished yet, and return its result."""
-    folder = path_of(output)
-    task = FileTask(tiles, folder)
-    check_one_file(tiles, options)
-    check_folder(folder, tiles.paths)
-    named = Path(tiles.name)
-    if named.is_dir() and folder.resolve().is_relative_to(named.resolve()):
-        sentence = f"{folder}: is inside the folder of the inputs. Give one outside of it."
-        raise SettingError("output.is_input", sentence, path=folder)
-    check_summary(options, tiles.paths)
-    work = _tasks(command.name, tiles, folder, options)
-    # A tile is finished if its output exists with the key of these options and inputs.
-    done = {tile for tile in work.values() if tile.is_finished}
-    todo = [tile for tile in work.values() if tile not in done]
-    for tile in todo if folder.exists() else ():
-        check_cloud(tile.target, overwrite=options.overwrite, inputs=tiles.paths)
-    result, points = None, sum(one.points for one in todo)
-    with threads(options.jobs), machines(options.scheduler, options.jobs, points) as run:
-        readable = tiles
-        while True:
-            try:
-                plan = command.plan(FileTask(readable, folder))
-                break
-            except BrokenTileError as error:
-                readable = readable.without(error.path, str(error))
-        try:
-            (folder / RECORDS).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(
-                "output.folder", f"{folder}: cannot be made ({error.strerror})."
-            ) from error
-        todo = [work[path] for path in readable.paths if work[path] not in done]
-        failed = list(readable.broken.values())
-        for tile, why in run(do_task, pickle.dumps((command.process, plan)), todo):
-            if why:
-                failed.append(why)
-            else:
-                done.add(tile)
-            if progress is not None:
-                progress(sum(one.points for one in done), sum(tiles.points))
-        if done:
-            # in the order of the files, so that no sum depends on which was first
-            tallies = [read_tally(tile.record)[1] for tile in work.values() if tile in done]
-            tally = reduce(add, tallies) if tallies[0] is not None else None
-            # Only the statistics of all points show whether cameras and water fit.
-            try:
-                result = command.finish(plan, task, tally)
-            except PcfixError:
-                for tile in todo:
-                    tile.record.unlink(missing_ok=True)
-                    tile.target.unlink(missing_ok=True)
-                raise
-            _write_summary(options, result)
-    if failed:
-        count = len(work) + len(readable.broken)
-        raise InputError(
-            "tiles.failed",
-            f"{tiles}: {len(failed)} of {count} files failed. The same command continues with them;"
-            " if files have changed, add --overwrite.\n" + "\n".join(f"  {one}" for one in failed),
-            failed=failed,
-        )
-    return cast("Result", result)
-
-
-def _tasks(name: str, tiles: Tiles, folder: Path, options: Any) -> dict[Path, FileTask]:
+def _tasks(name: str, tiles: Tiles, folder: Path, options: Any) -> list[FileTask]:
     """Return a task for each file, in their order."""
-    key = key_of(name, options, (*tiles.paths, *tiles.broken))
-    work, row = {}, 0
+    key, tasks, row = key_of(name, options, tiles.paths), list[FileTask](), 0
     for path, points in zip(tiles.paths, tiles.points, strict=True):
         target = folder.resolve() / path.name
-        work[path] = FileTask(path.resolve(), target, points=points, row=row, key=key)
+        tasks.append(FileTask(path.resolve(), target, points=points, row=row, key=key))
         row += points
-    return work
+    return tasks
 
 
 def key_of(
@@ -331,7 +265,7 @@ def key_of(
         for one in options_of(type(options))
         if one.name not in ignored
     }
-    depends = [version.__version__, name, asked, [file_state(path) for path in inputs]]
+    depends = [version.__version__, name, asked, [files.file_state(path) for path in inputs]]
     return sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
 
 
@@ -339,7 +273,8 @@ def _plain(value: Any) -> Any:
     """Return an option as JSON holds it; of files their size and time."""
     if isinstance(value, str) or hasattr(value, "joinpath"):
         path = Path(str(value).partition(LAYER_MARK)[0])
-        return [file_state(one) for one in belonging(path)] if path.exists() else str(value)
+        found = files.belonging(path) if path.exists() else []
+        return [files.file_state(one) for one in found] or str(value)
     if value is None or isinstance(value, int | float | tuple):
         return value
     return sha256(pickle.dumps(value)).hexdigest()
@@ -354,28 +289,27 @@ def do_task(pickled: bytes, task: FileTask, jobs: int | None = None) -> str:
         if task.pcfix != version.__version__:
             raise InputError(
                 "cluster.version",
-                f"{task}: this worker has pcfix {version.__version__}, not {task.pcfix}."
+                f"{task.source}: this worker has pcfix {version.__version__}, not {task.pcfix}."
                 " Install that there.",
             )
         if task.is_finished:  # by a worker that was lost before it could say so
             return ""
-        process, plan = pickle.loads(pickled)
+        work, plan = pickle.loads(pickled)
         with threads(jobs), warnings.catch_warnings():
             warnings.simplefilter("ignore", PcfixWarning)  # shown when the plan was made
-            process(plan, replace(task, jobs=jobs), task.keep)
+            stream(work, plan, replace(task, jobs=jobs), task.keep)
     except PcfixError as error:
         return str(error)
     return ""
 
 
 def in_processes(
-    work: Work, shared: bytes, tasks: Sequence[Any], most: int, jobs: int | None
+    work: Callable[..., str], shared: bytes, tasks: Sequence[Any], most: int, jobs: int | None
 ) -> Iterator[tuple[Any, str]]:
-    """Yield tasks with their errors as they are done, with the same `shared` for all.
+    """Do tasks in processes of this machine, see `Run`.
 
     At most `most` processes share `jobs` threads, all cores by default. A single one is this
-    process. If a process dies, the tasks that are not done continue one at a time, each in its own
-    process: so only those whose process dies again have an error.
+    process.
     """
     jobs = jobs or current().threads
     most = min(most, jobs, len(tasks))
@@ -383,76 +317,50 @@ def in_processes(
         for task in tasks:
             yield task, work(shared, task, jobs)
         return
-    groups = [list(tasks)]
-    for group in groups:
-        count = min(most, len(group))
-        with _processes(count) as pool:
-            given = work, shared, max(1, jobs // count)
-            futures = {pool.submit(_interruptible, *given, task): task for task in group}
-            for future in as_completed(futures):
-                task = futures[future]
-                try:
-                    yield task, future.result()
-                except BrokenProcessPool:
-                    if len(group) > 1:
-                        groups.append([task])
-                    else:
-                        words = "its process ended suddenly, probably for lack of memory."
-                        yield task, f"{task}: {words}"
-
-
-@contextmanager
-def _processes(count: int) -> Iterator[Executor]:
-    """Give an executor of new processes, which Ctrl-C interrupts in their tasks."""
     context, main = multiprocessing.get_context("spawn"), sys.modules["__main__"]
-    with ProcessPoolExecutor(count, context, initializer=_ignore_interrupts) as pool:
+    with ProcessPoolExecutor(most, context, initializer=_begin_process) as pool:
         # without the user's script, which each process would run again
         sys.modules["__main__"] = ModuleType("__main__")
         try:
-            pool.submit(int)  # starts all processes
+            futures = {pool.submit(work, shared, task, jobs // most): task for task in tasks}
         finally:
             sys.modules["__main__"] = main
         try:
-            yield pool
+            yield from _finished(futures)
         except BaseException:
             for process in multiprocessing.active_children():
-                if process.pid is not None:  # it is not started yet
-                    os.kill(process.pid, signal.SIGINT)
+                process.terminate()
             pool.shutdown(cancel_futures=True)
             raise
 
 
-def _ignore_interrupts() -> None:
+def _begin_process() -> None:
+    """Ignore Ctrl-C: the parent ends its processes, which remove their temporary files."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _interruptible(work: Work, shared: bytes, jobs: int, task: Any) -> str:
-    """Do a task that Ctrl-C ends; between tasks a process waits for its parent to end it."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        return work(shared, task, jobs)
-    finally:
-        _ignore_interrupts()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())
 
 
 def on_cluster(
-    client: Any, work: Work, shared: bytes, tasks: Sequence[Any]
+    client: Any, work: Callable[..., str], shared: bytes, tasks: Sequence[Any]
 ) -> Iterator[tuple[Any, str]]:
-    """Yield tasks with their errors as they are done on the workers of a cluster."""
+    """Do tasks on the workers of a cluster, see `Run`."""
     everywhere = client.scatter(shared, broadcast=True)  # a lost worker loses its own copy only
     executor: Executor = client.get_executor(pure=False)
-    futures: dict[Future[str], Any] = {
-        executor.submit(work, everywhere, task, 1): task for task in tasks
-    }
     try:
-        for future in as_completed(futures):
-            task = futures[future]
-            try:
-                yield task, future.result()
-            except Exception as error:  # of the cluster; those of pcfix are results
-                yield task, f"{task}: the cluster gave up ({error})."
+        yield from _finished({executor.submit(work, everywhere, one, 1): one for one in tasks})
     finally:
         executor.shutdown(wait=False)
+
+
+def _finished(futures: dict[Future[str], Any]) -> Iterator[tuple[Any, str]]:
+    """Yield tasks with their errors as they are done."""
+    for future in completed(futures):
+        task = futures[future]
+        try:
+            yield task, future.result()
+        except Exception as error:  # of processes and clusters; those of pcfix are results
+            name, memory = getattr(task, "source", task), "With fewer --jobs each has more memory"
+            yield task, f"{name}: its process ended suddenly ({error}) {memory}."
 
 
 @contextmanager
@@ -500,24 +408,27 @@ def check_summary(options: Any, inputs: Iterable[File] = ()) -> None:
     for name in ("plot", "summary", "save_regression"):
         path = getattr(options, name, None)
         if path is not None:
-            known.append(check_output(path, overwrite=options.overwrite, inputs=known))
+            known.append(files.check_output(path, overwrite=options.overwrite, inputs=known))
 
 
-def write_summary(
-    options: Any, summary: dict[str, Any], figure: Callable[[], Figure] | None = None
-) -> None:
-    """Write a summary as JSON and its figure as PNG, if the options name files for them."""
+def write_summary(options: Any, summary: Any, figure: Callable[[], Figure] | None = None) -> None:
+    """Write a summary as JSON and its figure as PNG, if the options name files for them.
+
+    The summary is a dict, or has a method `as_dict`.
+    """
     if figure is not None and options.plot is not None:
         from pcfix.report.page import png_of
 
         write_bytes(options.plot, png_of(figure()), overwrite=options.overwrite)
-    if options.summary is not None:
-        write_text(options.summary, json_text(summary), overwrite=options.overwrite)
+    path = getattr(options, "summary", None)
+    if path is not None:
+        values = summary if isinstance(summary, dict) else summary.as_dict()
+        write_text(path, json_text(values), overwrite=options.overwrite)
 
 
 def check_cloud(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
     """Return the path of a cloud that may be written, by its suffix and `check_output`."""
-    target = check_output(path, overwrite=overwrite, inputs=inputs)
+    target = files.check_output(path, overwrite=overwrite, inputs=inputs)
     check_suffix(target)
     return target
 
@@ -567,7 +478,7 @@ def file_task(
     """
     started = time.perf_counter()
     check_one_file(input, options)
-    source: Any = input if isinstance(input, Tiles) else check_input(input)
+    source: Any = input if isinstance(input, Tiles) else files.check_input(input)
     known = [one for one in (*inputs_of(input), *reads) if isinstance(one, str | PathLike)]
     for path in (output, *more):
         known.append(check(path, overwrite=options.overwrite, inputs=known))

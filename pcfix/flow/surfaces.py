@@ -115,7 +115,10 @@ def file_points(
 
 
 def joined_points(parts: Iterable[Points]) -> Points:
-    """Return consecutive points as one, with what all of them have, but no weights of views."""
+    """Return consecutive points as one, with what all of them have; several without weights."""
+    parts = list(parts)
+    if len(parts) == 1:
+        return parts[0]
     *columns, views = [
         None if any(v is None for v in one) else one for one in zip(*parts, strict=True)
     ]
@@ -215,16 +218,9 @@ def own_water_of(
 ) -> tuple[OwnWater | None, tuple[str, ...]]:
     """Return the separate water surfaces of images, and notes on them.
 
-    Parameters
-    ----------
-    folder : path or None
-        With rasters named after the images, and their standard errors in a folder ``sigma``.
-    cameras : Cameras
-    water : WaterSurface
-        That of the other images.
-    view : CloudView
-    level_offset_m : array, shape (k,), optional
-        Height of the water above `water` at each image.
+    The folder has rasters named after the images, and their standard errors in a folder ``sigma``.
+    `water` is that of the other images, and `level_offset_m`, shape (k,), how much higher the water
+    stood at each image.
     """
     if folder is None:
         return None, ()

@@ -52,8 +52,8 @@ def check_water(
     ----------
     spec : WaterSurface, float, str or path
         See `pcfix.flow.surfaces.find_surface`.
-    options : WaterCheckOptions, optional
-        Or its attributes as keywords.
+    options
+        See `pcfix.correct_file`.
     """
     given = taken(WaterCheckOptions, options, keywords, "check_water")
     cloud = given.cloud

@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -29,14 +29,6 @@ OVERLAP = 0.01
 """Of the smaller tile's side: neighbours may reach so far into each other, by rounding."""
 
 
-class BrokenTileError(InputError):
-    """One of many files that cannot be read; `path` is which."""
-
-    def __init__(self, path: Path, sentence: str) -> None:
-        super().__init__("cloud.broken_tile", sentence, path=path)
-        self.path = path
-
-
 @dataclass(frozen=True)
 class Tiles:
     """Files that are read as one cloud, in their order."""
@@ -47,27 +39,12 @@ class Tiles:
     lows: FloatArray  # corners of each file, shape (files, 3), metres
     highs: FloatArray
     step_m: float  # the coarsest scale
-    broken: dict[Path, str] = field(default_factory=dict)  # why other files cannot be read
 
     def __str__(self) -> str:
         return self.name
 
     def __len__(self) -> int:
         return sum(self.points)
-
-    def without(self, path: Path, why: str) -> Tiles:
-        """Return the others, where one turns out to be broken."""
-        rows = [i for i, one in enumerate(self.paths) if one != path]
-        if not rows:
-            raise InputError("cloud.broken_files", why)
-        return replace(
-            self,
-            paths=tuple(self.paths[i] for i in rows),
-            points=tuple(self.points[i] for i in rows),
-            lows=self.lows[rows],
-            highs=self.highs[rows],
-            broken={**self.broken, path: why},
-        )
 
 
 class TiledSource(LasSource):
@@ -82,13 +59,10 @@ class TiledSource(LasSource):
         self.header.point_count = len(tiles)
 
     def chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
-        """Yield all points; a `BrokenTileError` if a file cannot be read to its end."""
+        """Yield all points."""
         for path in self._tiles.paths:
-            try:
-                with LasSource(path, self._jobs) as source:
-                    yield from source.chunks()
-            except InputError as error:
-                raise BrokenTileError(path, str(error)) from error
+            with LasSource(path, self._jobs) as source:
+                yield from source.chunks()
 
 
 CloudFiles: TypeAlias = Path | CloudPart | Tiles
@@ -146,7 +120,7 @@ def check_one_file(cloud: Any, options: Any) -> None:
 
 def inputs_of(cloud: Any) -> list[Any]:
     """Return the files of a cloud, one or many."""
-    return [*cloud.paths, *cloud.broken] if isinstance(cloud, Tiles) else [cloud]
+    return list(cloud.paths) if isinstance(cloud, Tiles) else [cloud]
 
 
 def tiles_of(cloud: Clouds) -> Tiles | None:
@@ -185,15 +159,8 @@ def tiles_of(cloud: Clouds) -> Tiles | None:
 
 
 def cloud_of(cloud: Clouds) -> Path | Tiles:
-    """Return a file, or many as one cloud, see `tiles_of`; one that cannot be read is an error."""
-    tiles = tiles_of(cloud)
-    if tiles is None:
-        return path_of(cloud)
-    if tiles.broken:
-        why = "\n".join(f"  {one}" for one in tiles.broken.values())
-        sentence = f"{len(tiles.broken)} of {len(inputs_of(tiles))} files cannot be read:\n{why}"
-        raise bad_file(tiles, "cloud.broken_files", sentence, paths=list(tiles.broken))
-    return tiles
+    """Return a file, or many as one cloud, see `tiles_of`."""
+    return tiles_of(cloud) or path_of(cloud)
 
 
 def _listed(path: Path) -> list[Path] | None:
@@ -218,7 +185,7 @@ def _listed(path: Path) -> list[Path] | None:
 
 
 def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
-    """Return files as one cloud; those whose header cannot be read are its `broken` ones."""
+    """Return files as one cloud; an `InputError` if the header of any cannot be read."""
     kinds: dict[Path, tuple[Any, ...]] = {}
     heads: list[tuple[int, FloatArray, FloatArray, float]] = []
     broken: dict[Path, str] = {}
@@ -231,8 +198,10 @@ def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
                 heads.append((len(source), header.mins, header.maxs, float(max(header.scales))))
         except InputError as error:
             broken[path] = str(error)
-    if not heads:
-        raise InputError("cloud.broken_files", next(iter(broken.values())), paths=list(broken))
+    if broken:
+        why = "\n".join(f"  {one}" for one in broken.values())
+        sentence = f"{len(broken)} of {len(broken) + len(heads)} files cannot be read:\n{why}"
+        raise bad_file(name, "cloud.broken_files", sentence, paths=list(broken))
     # Refuse files of several coordinate systems, point formats or extra dimensions
     first, *rest = kinds
     for other in rest:
@@ -245,7 +214,7 @@ def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
                 sentence += " them to the same, or correct them separately."
                 raise bad_file(name, "cloud.mixed_tiles", sentence, paths=[first, other])
     counts, lows, highs, steps = zip(*heads, strict=True)
-    tiles = Tiles(name, tuple(kinds), counts, np.array(lows), np.array(highs), max(steps), broken)
+    tiles = Tiles(name, tuple(kinds), counts, np.array(lows), np.array(highs), max(steps))
     # Warn of tiles that lie in each other by more than their borders, as points may be double
     boxes = shapely.box(*tiles.lows[:, :2].T, *tiles.highs[:, :2].T)
     one, other = shapely.STRtree(boxes).query(boxes, predicate="intersects")

@@ -83,7 +83,7 @@ class RunOptions(
     project: str | None = option(None, basic=True)
     """Name of the project, the title of the report. [default: the name of the cloud]"""
     date: str | None = option(None)
-    """Date of the images, for the report. [default: what --image-times says]"""
+    """Date of the images, for the report."""
     adjust: Literal["auto", "yes", "no"] = option("auto", basic=True)
     """First refine the cameras, as 'pcfix adjust'; auto: if they have absorbed refraction, and
     there are GNSS positions or --gcps."""

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.flow.adjust import adjust_cameras
-from pcfix.flow.next_steps import correct_words
+from pcfix.flow.adjust import adjust_cameras, correct_words
 from pcfix.lens.imaging import straight_images
 from pcfix.options.survey import AdjustOptions
 from pcfix.running import threads

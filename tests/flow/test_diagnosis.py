@@ -8,8 +8,8 @@ import pytest
 import pcfix
 from pcfix.errors import PcfixWarning
 from pcfix.flow.cameras import cameras_text, check_cameras
+from pcfix.flow.diagnosis import adjust_words
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.next_steps import adjust_words
 from tests.utils.crops import middle_of
 from tests.utils.shared import SCENE, needs
 

@@ -68,7 +68,7 @@ def test_files_of_steps(finished):
     folder, said = finished
     assert sorted(path.name for path in folder.iterdir()) == RESULTS
     assert [line.split()[0] for line in said.splitlines()] == [
-        "correct", "clean", "dsm", "compare", "map", "report",
+        "adjust", "correct", "clean", "dsm", "compare", "map", "report",
     ]  # fmt: skip
 
 
@@ -199,8 +199,8 @@ def test_file_missing(copied):
     assert (done.returncode, done.stderr) == (0, "")
     steps = {line.split()[0]: "done before" in line for line in done.stdout.splitlines()}
     assert steps == {
-        "correct": True, "clean": True, "dsm": False, "compare": False, "map": False,
-        "report": False,
+        "adjust": False, "correct": True, "clean": True, "dsm": False, "compare": False,
+        "map": False, "report": False,
     }  # fmt: skip
     assert (copied / "out" / "surface.tif").exists()
 
@@ -228,7 +228,7 @@ def test_other_request(copied):
 def test_later_option(copied, more, first):
     done = run(copied, *WORDS, *more)
     assert (done.returncode, done.stderr) == (0, "")
-    again = [line.split()[0] for line in done.stdout.splitlines() if "done before" not in line]
+    again = [line.split()[0] for line in done.stdout.splitlines() if line.split()[1] == "done:"]
     assert again == ["correct", "clean", "dsm", "compare", "map", "report"][-len(again) :]
     assert again[0] == first
     assert ("Lake &lt;2&gt;" in (copied / "out" / "report.html").read_text()) is (first == "report")
@@ -287,11 +287,10 @@ def test_reference_added(finished, tmp_path):
     assert done_again(added) == ["compare", "map", "report"]
     os.utime(touched)
     assert done_again(record()) == ["compare", "map", "report"]
-    other = record(uncorrected="drop")
-    assert not other.resumes
-    assert done_again(other) == [*STEPS[1:]]
-    for name in ("index", "water", "gnss"):
-        assert done_again(record(**{name: "1.33"})) == list(STEPS)
+    for name in ("index", "water", "gnss", "uncorrected"):
+        other = record(**{name: "1.33"})
+        assert not other.resumes
+        assert done_again(other) == list(STEPS)
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -350,7 +349,7 @@ def test_tiles(finished, tiled, tmp_path):
         assert before.items() < finished_in(out / "corrected").items()
         said = []
         pcfix.run(tiled / "cloud", out, say=said.append, **asked)
-    assert [line.split()[1:3] for line in said] == [["done", "before:"]] * 6
+    assert [line.split()[1:3] for line in said[1:]] == [["done", "before:"]] * 6
     for name in ("corrected", "cleaned"):
         whole = laspy.read(finished[0] / f"{name}.laz").points.array
         np.testing.assert_array_equal(records(*sorted((out / name).glob("*.laz"))), whole)

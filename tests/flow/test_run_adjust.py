@@ -90,7 +90,7 @@ def test_first_step(finished):
     assert "under water" in said[1]
     record = json.loads((folder / "run.json").read_text())
     assert record["steps"]["adjust"]["result"]["model"] == "colmap"
-    assert "gnss.csv" in {one["path"].rsplit("/", 1)[-1] for one in record["inputs"]}
+    assert "gnss.csv" in {one["path"].rsplit("/", 1)[-1] for one in record["inputs"]["adjust"]}
     assert record["request"]["cameras"].endswith("model")
 
 
@@ -104,7 +104,7 @@ def test_resumed(scene, finished):
 def test_auto(scene, tmp_path, monkeypatch):
     monkeypatch.setattr("pcfix.flow.run._adjust", lambda *_: "colmap")
     step = first_step(scene.request(gnss=scene.gnss), tmp_path)
-    assert step["adjusted"]
+    assert step["model"] == "colmap"
     assert "tie points under water" in step["why"]
 
 
@@ -140,7 +140,8 @@ def test_datum_of_camera_file(scene, tmp_path, monkeypatch, sigma_m, is_datum):
 
     monkeypatch.setattr(Inputs, "block", with_gnss)
     monkeypatch.setattr("pcfix.flow.run._adjust", lambda *_: "colmap")
-    assert first_step(scene.request(), tmp_path)["adjusted"] is is_datum
+    model = first_step(scene.request(), tmp_path)["model"]
+    assert (model is not None) is is_datum
 
 
 def test_water_dimension(scene, tmp_path):
@@ -152,7 +153,7 @@ def test_water_dimension(scene, tmp_path):
         scene.request(gnss=scene.gnss), input=str(tmp_path / "cloud.las"), water="dim:w_surf"
     )
     step = first_step(request, tmp_path)
-    assert not step["adjusted"]
+    assert step["model"] is None
     assert "w_surf" in step["why"]
     with refused("water.dimension"):
         first_step(replace(request, adjust="yes"), tmp_path)

@@ -10,8 +10,7 @@ from pcfix.adjust.block import Unknowns, plain_block
 from pcfix.adjust.problem import port_of, prepare
 from pcfix.adjust.solve import solve
 from pcfix.errors import SettingError
-from pcfix.flow.adjust import adjust_cameras
-from pcfix.flow.next_steps import correct_words
+from pcfix.flow.adjust import adjust_cameras, correct_words
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.model import TiePoints
 from pcfix.options.survey import AdjustOptions

@@ -8,12 +8,13 @@ holds the documentation to them.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, bad_file
 from pcfix.model import BoolArray, Correction, FloatArray
 from pcfix.options.correct import Dimensions, Unsure
 
@@ -37,10 +38,6 @@ _PACKED = (
     *("return_number", "number_of_returns", "scan_direction_flag", "edge_of_flight_line"),
     *("classification", "synthetic", "key_point", "withheld"),
 )
-
-
-class OutOfRangeError(Exception):
-    """A coordinate leaves the 32 bits that LAS has; move the offsets and write again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,13 +174,17 @@ def convert(
     return new
 
 
-def move(points: laspy.ScaleAwarePointRecord, steps: npt.NDArray[np.int64]) -> None:
-    """Move points by whole steps of their scale, shape (n, 3).
+def move(points: laspy.ScaleAwarePointRecord, steps: npt.NDArray[np.int64], path: Path) -> None:
+    """Move points of a file by whole steps of their scale, shape (n, 3).
 
-    An `OutOfRangeError` if a coordinate does not fit 32 bits.
+    An `InputError` if a coordinate does not fit 32 bits.
     """
     for axis, name in enumerate("XYZ"):
         moved = points.array[name] + steps[:, axis]
         if moved.size and (moved.min() < _INT32.min or moved.max() > _INT32.max):
-            raise OutOfRangeError(name)
+            sentence = (
+                f"the scale of {name} is too fine for the result in 32 bits. Write the cloud with a"
+                " coarser scale first."
+            )
+            raise bad_file(path, "cloud.scale", sentence)
         points.array[name] = moved
