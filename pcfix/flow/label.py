@@ -23,7 +23,7 @@ from pcfix.flow.surfaces import (
 )
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource, part_report
-from pcfix.io.las.writing import labelling_vlr, noted_header
+from pcfix.io.las.writing import noted_header
 from pcfix.io.tiles import Clouds
 from pcfix.label.areas import WaterMask
 from pcfix.label.labelling import LabelCounts, Labelling, Part
@@ -166,7 +166,7 @@ def _labelling(plan: LabelPlan, source: LasSource) -> FileWork:
         "water_mask": None if mask is None else mask.name,
         **({} if part is None else {"part": part}),
     }
-    header = noted_header(source, labelling_vlr(content))
+    header = noted_header(source, "labelling", content)
 
     def apply(points: Chunk, classes: Classes) -> Chunk:
         new = convert(points, header.point_format)

@@ -86,10 +86,8 @@ def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
 
 
-def view_of(
-    cloud: CloudFiles, jobs: int | None = None, kept: list[Chunk] | None = None
-) -> CloudView:
-    """Return the view of a LAS or LAZ file, or of many as one cloud; `kept` as of `LasSource`."""
+def view_of(cloud: CloudFiles, jobs: int | None = None) -> CloudView:
+    """Return the view of a LAS or LAZ file, or of many as one cloud."""
     with open_cloud(cloud, jobs) as source:
         return CloudView(
             str(cloud),
@@ -97,20 +95,17 @@ def view_of(
             np.array(source.header.mins[:2]),
             np.array(source.header.maxs[:2]),
             len(source),
-            partial(file_points, cloud, jobs=jobs, kept=kept),
+            partial(file_points, cloud, jobs=jobs),
             str(source.header.generating_software or ""),
             float(max(source.header.scales)),
         )
 
 
 def file_points(
-    cloud: CloudFiles,
-    water: WaterSurface | None = None,
-    jobs: int | None = None,
-    kept: list[Chunk] | None = None,
+    cloud: CloudFiles, water: WaterSurface | None = None, jobs: int | None = None
 ) -> Iterator[Points]:
     """Yield all points of a LAS or LAZ file, or of many, chunk by chunk; see `LasSource`."""
-    with open_cloud(cloud, jobs, kept=kept) as source:
+    with open_cloud(cloud, jobs) as source:
         yield from read_ahead(points_of(one, source, water) for one in source.chunks())
 
 

@@ -195,7 +195,7 @@ def parse_json(text: str | bytes) -> Any:
 
 def read_json(path: Path) -> Any:
     """Return the content of a JSON file; OSError or ValueError where it is none."""
-    return parse_json(path.read_text("utf-8"))
+    return parse_json(path.read_bytes())
 
 
 def write_bytes(path: File, data: bytes, *, overwrite: bool) -> None:

@@ -68,12 +68,12 @@ class TiledSource(LasSource):
 CloudFiles: TypeAlias = Path | CloudPart | Tiles
 
 
-def open_cloud(cloud: CloudFiles, jobs: int | None = None, *, kept: Any = None) -> LasSource:
+def open_cloud(cloud: CloudFiles, jobs: int | None = None) -> LasSource:
     """Return the points of a file, of a part of one, or of many; see `LasSource`."""
     if isinstance(cloud, Tiles):
         return TiledSource(cloud, jobs)
     path, part = (cloud.path, cloud) if isinstance(cloud, CloudPart) else (cloud, None)
-    return LasSource(path, jobs, kept=kept, part=part)
+    return LasSource(path, jobs, part=part)
 
 
 def part_of(path: Path, options: Any) -> Path | CloudPart:
@@ -91,7 +91,7 @@ def part_of(path: Path, options: Any) -> Path | CloudPart:
         raise SettingError("option.range", words, option="bounds")
     with LasSource(path, getattr(options, "jobs", None)) as source:
         header, count, ends = source.header, 0, list[Any]()
-        for points in source.chunks_within(part):
+        for points in source.chunks(part):
             count += len(points)
             xyz = [points.array[axis] for axis in "XYZ"]
             ends.append([[one.min() for one in xyz], [one.max() for one in xyz]])
