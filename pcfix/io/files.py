@@ -46,14 +46,25 @@ def check_input(path: File) -> Path:
     """Return the path of a file; one that cannot be read is an `InputError`."""
     found = path_of(path)
     try:
-        kind = kind_of(found.stat().st_mode)
-        if not kind:
-            found.open("rb").close()
-            return found
-        why = f"is {kind}; give a file"
+        why = kind_of(found.stat().st_mode)
+        if why:
+            raise bad_file(found, "input.unreadable", f"is {why}; give a file.")
+        with found.open("rb") as stream:
+            head = stream.read(64).lstrip().lower()
     except OSError as error:
-        why = refusal(error)
-    raise bad_file(found, "input.unreadable", f"{why}.")
+        raise bad_file(found, "input.unreadable", f"{refusal(error)}.") from error
+    for start, sentence in _NOT_THE_FILE.items():
+        if head.startswith(start):
+            raise bad_file(found, "input.not_the_file", sentence)
+    return found
+
+
+_NOT_THE_FILE = {
+    b"version https://git-lfs": "is a Git LFS pointer, not the file. Run 'git lfs pull'.",
+    b"<!doctype html": "is a web page, not the file. Download it again.",
+    b"<html": "is a web page, not the file. Download it again.",
+}
+"""First bytes of what people have in place of a file."""
 
 
 def kind_of(mode: int) -> str:

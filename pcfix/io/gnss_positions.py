@@ -31,6 +31,9 @@ FARTHEST_M = 50e3
 """Horizontal distance to the projection centres that indicates another zone or swapped axes."""
 
 
+_WITHOUT_NAMES = {".mrk": "a list of DJI's exposure times", ".pos": "a solution of RTKLIB"}
+
+
 def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Cameras:
     """Return cameras with `gnss`: the GNSS positions of their images, in their own CRS.
 
@@ -52,6 +55,10 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
     source = Path(path) if Path(path).is_dir() else check_input(path)
     if crs is not None and crs.strip().lower() != "local":
         parse_crs(crs, str(source))
+    if (kind := _WITHOUT_NAMES.get(source.suffix.lower())) is not None:
+        sentence = f"is {kind}, which names no images. Make a table with the columns image,"
+        sentence += " longitude, latitude, height from it."
+        raise bad_file(source, "gnss.no_names", sentence)
     if source.name == "images.json":
         _, names = read_images(source, ())
         listed, _ = read_images(source, tuple(names))

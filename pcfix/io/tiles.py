@@ -58,7 +58,7 @@ class TiledSource(LasSource):
         self.header.scales = np.full(3, tiles.step_m)
         self.header.point_count = len(tiles)
 
-    def chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
+    def chunks(self, part: CloudPart | None = None) -> Iterator[laspy.ScaleAwarePointRecord]:
         """Yield all points."""
         for path in self._tiles.paths:
             with LasSource(path, self._jobs) as source:
