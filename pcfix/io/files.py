@@ -113,13 +113,17 @@ def belonging(path: File) -> list[Path]:
     return sorted(chosen)
 
 
-def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
-    """Return the path of a file that may be written."""
+def check_output(
+    path: File, *, overwrite: bool, inputs: Iterable[File] = (), suffixes: tuple[str, ...] = ()
+) -> Path:
+    """Return the path of a file that may be written, with one of the suffixes if there are any."""
 
     def refused(code: str, sentence: str) -> SettingError:
         return SettingError(f"output.{code}", f"{target}: {sentence}", path=target)
 
     target = path_of(path)
+    if suffixes and target.suffix.lower() not in suffixes:
+        raise refused("suffix", f"the name must end in {' or '.join(suffixes)}.")
     for source in inputs:
         if is_same(target, source):
             raise refused("is_input", f"is also the input {source}. Give the output another name.")

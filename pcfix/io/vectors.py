@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from pcfix.errors import PcfixWarning, SettingError, bad_file
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io import tables
 from pcfix.io.atomic import cannot_write, temporary_output
 from pcfix.io.crs import LOCAL, parse_crs, way_to_cloud
@@ -344,11 +344,9 @@ class Layer(NamedTuple):
     style: str = ""
 
 
-def check_layers(path: Path) -> None:
+def check_layers(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> None:
     """Refuse what `write_layers` cannot write."""
-    if path.suffix.lower() != ".gpkg":
-        sentence = f"{path}: lines are written as GeoPackage. Give a name in .gpkg."
-        raise SettingError("output.suffix", sentence, path=path)
+    check_output(path, overwrite=overwrite, inputs=inputs, suffixes=(".gpkg",))
     load_pyogrio()
 
 

@@ -498,30 +498,6 @@ def test_large_shifts(tmp_path: Path) -> None:
     assert trip.back.read_bytes() == trip.source.read_bytes()
 
 
-EARLIER = {
-    "narrow": {"ShiftX": "i2", "ShiftY": "i2", "ShiftZ": "i2", "WaterDepth": "u2"},
-    "wide": {"RayMiss": "u4", "SigmaZ": "u4"},
-}
-
-
-@pytest.mark.parametrize("kind", EARLIER)
-def test_types_of_earlier_versions(tmp_path: Path, kind: str) -> None:
-    trip = round_trip(write_cloud(tmp_path / "cloud.las", 6))
-    las = laspy.read(trip.output)
-    for name, dtype in EARLIER[kind].items():
-        dimension, values = las.point_format.dimension_by_name(name), las.points.array[name].copy()
-        las.remove_extra_dim(name)
-        las.add_extra_dim(laspy.ExtraBytesParams(
-            name, dtype, dimension.description, dimension.offsets, dimension.scales,
-        ))  # fmt: skip
-        las.points.array[name] = values
-        assert (las.points.array[name] == values).all()
-    las.write(tmp_path / "earlier.las")
-    pcfix.restore_file(tmp_path / "earlier.las", tmp_path / "again.las")
-    back = laspy.read(tmp_path / "again.las")
-    assert back.points.array.tobytes() == laspy.read(trip.source).points.array.tobytes()
-
-
 EDGE = {
     "east end": ("X", np.iinfo(np.int32).max, EAST_M + SIDE_M),
     "west end": ("X", np.iinfo(np.int32).min, EAST_M),

@@ -11,7 +11,6 @@ from PIL import Image
 
 import pcfix
 from pcfix.flow.inputs import Inputs, paths_in
-from pcfix.io.cameras import read_cameras
 from pcfix.io.scenes import write_scene
 from pcfix.io.tides import (
     ImageTimes,
@@ -189,12 +188,3 @@ def test_heights_in_images(tmp_path, text):
     for place in (tmp_path, tmp_path / "cameras.csv"):
         found = read_altitudes(place, ["folder/a", "b", "c"])
         np.testing.assert_array_equal(found, [30.1, np.nan, np.nan])
-
-
-@real
-def test_heights_in_a_metashape_project():
-    path = CAMERAS / "metashape" / "easyidp_wheat_psx" / "wheat_tanashi.psx"
-    found = read_altitudes(path, read_cameras(path).labels)
-    assert len(found) == 138
-    assert found[:3].tolist() == [30.0, 29.9, 29.8]
-    assert np.ptp(found) < 2.0
