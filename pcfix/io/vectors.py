@@ -6,7 +6,7 @@ import re
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -166,7 +166,8 @@ def _read_gdal(path: Path, layer: str) -> tuple[Geometries, str | None, str]:
     try:
         names = [str(name) for name, kind in pyogrio.list_layers(path) if kind is not None]
         if suffix == ".gpx":  # it always has the layers of waypoints, routes and tracks
-            names = [one for one in names if pyogrio.read_info(path, layer=one)["features"]]
+            count = partial(pyogrio.read_info, path, force_feature_count=True)
+            names = [one for one in names if count(layer=one)["features"]]
         layer = layer or (names[0] if len(names) == 1 else "")
         if layer in names:
             with warnings.catch_warnings():
