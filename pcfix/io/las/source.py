@@ -269,46 +269,40 @@ class LasSource:
         if stated == 0:
             raise bad_file(self.path, "cloud.empty", "contains no points.")
         # points that the header does not count would be lost
-        packed = self.header.are_points_compressed
-        least, most = self._points_of_chunks() if packed else self._points_of_records()
+        least, most = self._points_held()
         if not least <= stated <= most:
             held = f"{least:,}" if least == most else f"{least:,} to {most:,}"
             sentence = f"its header counts {stated:,} points, but it holds {held}. Export it again."
             raise bad_file(self.path, "cloud.count", sentence, stated=stated)
 
-    def _points_of_records(self) -> tuple[int, float]:
-        """Return how many point records fit between the header and what follows the points.
+    def _points_held(self) -> tuple[int, float]:
+        """Return the least and the largest number of points that the file may hold.
 
-        Zeros behind the last point are padding. A file that is cut short is found on reading.
+        A file that is cut short is found on reading.
         """
-        stated, size = len(self), self.header.point_format.size
-        start = self.header.offset_to_point_data
-        ends = [self.path.stat().st_size]
-        for name in ("start_of_first_evlr", "start_of_waveform_data_packet_record"):
-            place = getattr(self.header, name, None) or 0
-            ends += [place] if place > start else []
-        held = (min(ends) - start) // size
-        if held > stated:
+        start, record = self.header.offset_to_point_data, self.header.point_format.size
+        size = self.path.stat().st_size
+        if not self.header.are_points_compressed:
+            for name in ("start_of_first_evlr", "start_of_waveform_data_packet_record"):
+                place = getattr(self.header, name, None) or 0
+                size = min(size, place) if place > start else size
+            held = (size - start) // record
             with self.path.open("rb") as stream:
-                stream.seek(start + stated * size)
-                held = held if any(stream.read(size)) else stated
-        return held, np.inf
-
-    def _points_of_chunks(self) -> tuple[int, float]:
-        """Return the least and the largest number of points that the chunks of a LAZ file hold."""
+                stream.seek(start + len(self) * record)
+                is_padded = held > len(self) and not any(stream.read(record))
+            return len(self) if is_padded else held, np.inf
         laszip = next((v.record_data for v in self.vlrs if v.user_id == "laszip encoded"), b"")
         (compressor,) = struct.unpack_from("<H", laszip)
         (chunk_points,) = struct.unpack_from("<I", laszip, 12)
         if compressor == _ONE_STREAM or chunk_points == _VARIABLE_CHUNKS:
             return 0, np.inf
-        start, size = self.header.offset_to_point_data + 8, self.path.stat().st_size
         with self.path.open("rb") as stream:
-            stream.seek(start - 8)
+            stream.seek(start)
             (table,) = struct.unpack("<q", stream.read(8))
             if table == -1:  # written by software that cannot seek backwards
                 stream.seek(-8, os.SEEK_END)
                 (table,) = struct.unpack("<q", stream.read(8))
-            if not start <= table <= size - 8:
+            if not start + 8 <= table <= size - 8:
                 raise ValueError(f"its chunk table is at byte {table:,} of {size:,}")
             stream.seek(table + 4)
             (chunks,) = struct.unpack("<I", stream.read(4))
@@ -316,9 +310,9 @@ class LasSource:
                 raise ValueError(f"{chunks:,} chunks in {table - start:,} bytes")
             last = 1
             if compressor == _LAYERED:  # these chunks state their number of points
-                stream.seek(start - 8)
+                stream.seek(start)
                 sizes = [size for _, size in lazrs.read_chunk_table(stream, lazrs.LazVlr(laszip))]
-                stream.seek(start + sum(sizes[:-1]) + self.header.point_format.size)
+                stream.seek(start + 8 + sum(sizes[:-1]) + record)
                 (last,) = struct.unpack("<I", stream.read(4))
         return (chunks - 1) * chunk_points + last, chunks * chunk_points
 
