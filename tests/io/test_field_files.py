@@ -12,6 +12,8 @@ from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.las.source import LasSource, metric_crs, stated_crs
 from pcfix.io.tables import read_check_depths
 from pcfix.io.vectors import read_vectors
+from pcfix.io.water import write_water_raster
+from pcfix.model import WaterRaster
 from tests.utils.clouds import EAST_M, NORTH_M, block, random_cloud
 from tests.utils.codes import refused, warned
 
@@ -107,6 +109,16 @@ def test_water_elsewhere(tmp_path, path, name):
     with refused("water.no_overlap") as caught:
         pcfix.label_file(path, tmp_path / "b.las", water=tmp_path / name)
     assert caught.value.values["apart_m"] == pytest.approx(np.max([EAST_M, NORTH_M]), rel=2e-3)
+
+
+def test_rough_water(tmp_path):
+    noise = np.random.default_rng(1).normal(0.37, 0.1, (50, 50))
+    raster = WaterRaster(noise, EAST_M, NORTH_M, (1.0, 1.0), "")
+    write_water_raster(tmp_path / "w.tif", raster, "EPSG:32633")
+    with warned("water.rough") as caught:
+        pcfix.read_water(tmp_path / "w.tif", "EPSG:32633")
+    (noise_m,) = (one.message.values["noise_m"] for one in caught if hasattr(one.message, "code"))
+    assert noise_m == pytest.approx(0.1 * 1.25**0.5, rel=0.1)
 
 
 def test_water_far_above(tmp_path, path):
