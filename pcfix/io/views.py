@@ -1,32 +1,26 @@
 """Read view lists, which say which cameras contributed to each point of a dense cloud.
 
-Read a list with `read_views`, or make one of tie points with `track_views`; then `ViewMatch` gives
+Read a list with `read_views`, or make one of tie points with `track_views`. `ViewMatch` then gives
 its cameras to the rows of a cloud, chunk by chunk.
 
 COLMAP's stereo fusion writes ``fused.ply.vis`` next to ``fused.ply``. It is little-endian: a uint64
-number of points; then for each vertex of ``fused.ply`` a uint32 number of images and their uint32
-numbers, counted from 0 (COLMAP's source, mvs/fusion.cc and mvs/model.cc). The dense PLY of OpenMVS,
-and so of ODM, has two lists at each vertex: ``view_indices``, image numbers from 0, and
-``view_weights`` (OpenMVS's source, libs/MVS/PointCloud.cpp and apps/InterfaceCOLMAP). Both name the
-images whose depth maps were fused at the point, not the images that these were matched against.
+number of points; then for each point a uint32 number of images and their uint32 numbers, from 0
+(COLMAP's source, mvs/fusion.cc and mvs/model.cc). The dense PLY of OpenMVS, and so of ODM, has two
+lists at each vertex: ``view_indices``, image numbers from 0, and ``view_weights`` (OpenMVS's
+source, libs/MVS/PointCloud.cpp). Both name the images whose depth maps were fused at the point.
 
-An image number counts in the order of the dense matcher, which the list does not state:
-
-- COLMAP counts the registered images of its sparse model, not IMAGE_ID: in some versions in the
-  order of ``images.bin`` or ``images.txt``, in others by ascending IMAGE_ID, and with rigs by
-  ascending FRAME_ID (``Reconstruction::RegImageIds``).
-- OpenMVS uses the order of its importer: that of ``images.txt`` for InterfaceCOLMAP, that of the
-  shots of the undistorted reconstruction for OpenSfM's exporter (ODM).
-
-So every order that a sparse model next to the list allows is a candidate, then that of the given
-cameras, and the frames decide: nearly every listed camera must have the apparent point in its
-frame. With numbers off by one, a quarter of the cameras of an ordinary block do not.
+An image number counts in the order of the dense matcher, which the list does not state. COLMAP
+counts the registered images of its sparse model: in some versions in the order of ``images.bin`` or
+``images.txt``, in others by ascending IMAGE_ID, and with rigs by ascending FRAME_ID
+(``Reconstruction::RegImageIds``). OpenMVS counts as its importer does, mostly in the order of
+``images.txt``. So every order that a sparse model next to the list allows is a candidate, then that
+of the given cameras. The geometry decides: nearly every listed camera must have the apparent point
+in its frame. With numbers off by one, a quarter of the cameras of an ordinary block do not.
 
 A row of the cloud gets the list of the same row if its position agrees to a fraction of the point
-spacing. Every other row gets the list of the nearest point within a tolerance, which is as strict:
-on a real dense cloud, points 5 cm apart hardly have a camera in common. A list without positions
-is matched by row number; then the numbers of points must agree, and the listed cameras must have
-the points in their frames, chunk by chunk.
+spacing, else the list of the nearest point within a tolerance. This is as strict, because on a real
+dense cloud points 5 cm apart hardly have a camera in common. A list without positions is matched by
+row number. Then the numbers of points must agree, and the geometry is tested chunk by chunk.
 """
 
 from __future__ import annotations
