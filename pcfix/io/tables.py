@@ -274,7 +274,8 @@ def read_table(path: Path, *needed: Sequence[str], spellings: Spellings | None =
             if len(fields) != len(header):
                 sentence = f"line {line} has {len(fields)} fields, the header has {len(header)}."
                 raise bad_file(path, "table.shifted", sentence, line=line)
-            rows.append([_with_point(field.strip()) for field in fields])
+            fields = [field.strip() for field in fields]
+            rows.append(fields if delimiter == "," else [_with_point(one) for one in fields])
             numbers.append(line)
     except csv.Error as error:
         sentence = f"line {at + 1 + reader.line_num} is not CSV ({error})."

@@ -477,13 +477,12 @@ def metric_crs(source: LasSource) -> CRS | None:
     An `InputError` if its coordinates or heights are in degrees, feet or another unit.
     """
     crs, keys = stated_crs(source), _geo_keys(source)
-    if crs is None:
-        return None
-    # the units of plan and heights, which GeoTIFF keys may state otherwise than the CRS
+    name, axes = ("", []) if crs is None else (crs.name, crs.axis_info)
+    # GeoTIFF keys may state other units of plan and heights than the CRS has
     stated = {_UNITS[keys[key]] for key in (3076, 4099) if keys.get(key) in _UNITS}
-    units = {axis.unit_name for axis in crs.axis_info} | stated
+    units = {axis.unit_name for axis in axes} | stated
     if not units.issubset(METRES):
         unit = " and ".join(sorted(units.difference(METRES)))
-        sentence = f"its CRS {crs.name} is in {unit}. Reproject the cloud to metres first."
-        raise bad_file(source.path, "cloud.crs_unit", sentence, crs=crs.name)
+        sentence = f"its CRS {name} is in {unit}. Reproject the cloud to metres first."
+        raise bad_file(source.path, "cloud.crs_unit", sentence, crs=name)
     return crs
