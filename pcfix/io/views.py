@@ -47,7 +47,6 @@ from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, Views
 from pcfix.options.declare import File
 from pcfix.sums import LEAST, MOST, SAME, Sums
 
-COLMAP_LIST = "COLMAP view list"
 _HEAD = 8
 _IMAGES, _WEIGHTS = "view_indices", "view_weights"
 _OTHERS = (b"LASF", b"MVSI", b"PK\x03\x04", b"SQLi")
@@ -163,15 +162,8 @@ def _placed(views: ViewList, cameras: Cameras, to_cloud: Points | None) -> ViewL
         return views
     xyz = views.xyz if to_cloud is None else to_cloud(views.xyz)
     xyz = np.ascontiguousarray(xyz, np.float64)
-    try:
-        placed = replace(views, xyz=xyz, spacing_m=spacing_m(xyz))
-        return fitted(placed, cameras, xyz, np.arange(len(views)))
-    except InputError:
-        if views.what != COLMAP_LIST:
-            raise
-    sentence = f"{views.path}: the PLY file beside it is in another frame and is not used."
-    note = PcfixWarning("views.other_frame", sentence, path=views.path)
-    return replace(views, xyz=None, notes=(*views.notes, note))
+    placed = replace(views, xyz=xyz, spacing_m=spacing_m(xyz))
+    return fitted(placed, cameras, xyz, np.arange(len(views)))
 
 
 def _colmap(path: Path) -> ViewList:
@@ -185,7 +177,7 @@ def _colmap(path: Path) -> ViewList:
     if not count or records is None or _HEAD + records.end < path.stat().st_size:
         sentence = f"is no complete COLMAP view list of {count:,} points. {_REMEDY}"
         raise bad_file(path, "views.damaged", sentence, points=count)
-    raw = ViewList(path, COLMAP_LIST, _listed(path, records))
+    raw = ViewList(path, "COLMAP view list", _listed(path, records))
     bare = path.with_suffix("")
     ply = bare if bare.suffix.lower() == ".ply" else bare.with_suffix(".ply")
     if not ply.is_file():
