@@ -72,26 +72,28 @@ def corrected_header(
     if twice is not None:
         sentence = f"already has a dimension {twice}. Rename it, or use --dimensions none."
         raise bad_file(source.path, "cloud.dimension_exists", sentence, dimension=twice)
-    header, before = _upgraded(source, columns)
-    header.offsets = source.header.offsets - np.array(steps) * source.header.scales
     part = part_report(source.part)
-    settings = {**content, **({} if part is None else {"part": part})}
-    settings["before"] = {**before, "steps": list(steps)}
-    header._vlrs.append(_note("settings", {**settings, _SEAL: _seal_of(settings)}))
+
+    def note(before: dict[str, Any]) -> VLR:
+        """Return the VLR of the correction."""
+        settings = {**content, **({} if part is None else {"part": part})}
+        settings["before"] = {**before, "steps": list(steps)}
+        return _note("settings", {**settings, _SEAL: _seal_of(settings)})
+
+    header = _upgraded(source, columns, note)
+    header.offsets = source.header.offsets - np.array(steps) * source.header.scales
     return header
 
 
 def noted_header(source: LasSource, kind: str, content: dict[str, Any]) -> laspy.LasHeader:
     """Return the header of a file with other classes or flags: LAS 1.4, its records, and a note."""
-    header, _ = _upgraded(source, ())
-    header._vlrs.append(_note(kind, content))
-    return header
+    return _upgraded(source, (), lambda before: _note(kind, content))
 
 
 def _upgraded(
-    source: LasSource, columns: tuple[Column, ...]
-) -> tuple[laspy.LasHeader, dict[str, Any]]:
-    """Return the input's header in LAS 1.4 with dimensions added, and what it was before."""
+    source: LasSource, columns: tuple[Column, ...], note: Callable[[dict[str, Any]], VLR]
+) -> laspy.LasHeader:
+    """Return the input's header in LAS 1.4 with dimensions added, and a note of what it was."""
     old = source.header
     point_format = laspy.PointFormat(UPGRADE[old.point_format.id])
     point_format.dimensions.extend(old.point_format.extra_dimensions)
@@ -109,25 +111,25 @@ def _upgraded(
         name, description = (text.encode() for text in texts)
         options, step = (0, 0.0) if scaled is None else (_SCALED, scale)
         described.append(_EXTRA.pack(number, options, name, step, 0.0, description))
-    vlrs, encoding = list(source.vlrs), old.global_encoding.value
-    crs = None
+    vlrs, crs = list(source.vlrs), None
     if old.point_format.id < 6 and not old.global_encoding.wkt:  # formats 6 and up want WKT
         crs = stated_crs(source)
     if crs is not None:
         wkt = WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL")).record_data_bytes()
         vlrs.append(VLR("LASF_Projection", 2112, "OGC COORDINATE SYSTEM WKT", wkt))
-    version = max(old.version, laspy.header.Version(1, 4))
-    header = _header(source, version, point_format, vlrs, described)
-    header.global_encoding.wkt = header.global_encoding.wkt or crs is not None
-    return header, {
+    before = {
         "version": str(old.version),
         "point_format": old.point_format.id,
         "identity": source.identity.decode("latin-1"),
-        "global_encoding": encoding,
+        "global_encoding": old.global_encoding.value,
         "offsets": old.offsets.tolist(),
         "added_wkt": crs is not None,
         "undescribed": [dimension.name for dimension in undescribed],
     }
+    version = max(old.version, laspy.header.Version(1, 4))
+    header = _header(source, version, point_format, [*vlrs, note(before)], described)
+    header.global_encoding.wkt = header.global_encoding.wkt or crs is not None
+    return header
 
 
 def restored_header(source: LasSource, before: dict[str, Any], drop: set[str]) -> laspy.LasHeader:
