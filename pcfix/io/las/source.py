@@ -51,8 +51,8 @@ _VARIABLE_CHUNKS = 2**32 - 1
 _PANIC = "PanicException"
 """lazrs raises this, too, if the compressed points are damaged; it cannot be imported."""
 _OTHER_CLOUDS = {b"ply\n": "PLY", b"ply\r": "PLY", b"ASTM": "E57"}
-_UNITS = {9002: "foot", 9003: "US survey foot"}
-"""GeoTIFF codes of units (EPSG)."""
+_UNITS, _OWN_CODE = {9001: "metre", 9002: "foot", 9003: "US survey foot"}, 32767
+"""GeoTIFF codes of units (EPSG), and the least of the codes that only a user knows."""
 
 MOST_SCALE_M = 1000.0
 """Largest step of coordinates that a header may state."""
@@ -452,7 +452,7 @@ def stated_crs(source: LasSource) -> CRS | None:
         with las_errors(source.path):
             crs: CRS | None = source.header.parse_crs()
         code = _geo_keys(source).get(4096, 0)
-        if crs is not None and len(crs.axis_info) == 2 and 1024 <= code <= 32766:
+        if crs is not None and len(crs.axis_info) == 2 and 1024 <= code < _OWN_CODE:
             with suppress(CRSError):  # a code of a datum or an ellipsoid, as earlier software wrote
                 vertical = CRS.from_epsg(code)
                 if vertical.is_vertical:
@@ -468,7 +468,8 @@ def _geo_keys(source: LasSource) -> dict[int, int]:
     if any((vlr.user_id, vlr.record_id) == ("LASF_Projection", 2112) for vlr in source.vlrs):
         return {}
     listed = source.header.vlrs.get("GeoKeyDirectoryVlr")
-    return {key.id: key.value_offset for vlr in listed for key in vlr.geo_keys}
+    keys = (key for vlr in listed for key in vlr.geo_keys if key.tiff_tag_location == 0)
+    return {key.id: key.value_offset for key in keys}
 
 
 def metric_crs(source: LasSource) -> CRS | None:
@@ -479,8 +480,9 @@ def metric_crs(source: LasSource) -> CRS | None:
     crs, keys = stated_crs(source), _geo_keys(source)
     name, axes = ("", []) if crs is None else (crs.name, crs.axis_info)
     # GeoTIFF keys may state other units of plan and heights than the CRS has
-    stated = {_UNITS[keys[key]] for key in (3076, 4099) if keys.get(key) in _UNITS}
-    units = {axis.unit_name for axis in axes} | stated
+    codes = {keys.get(key, 9001) for key in (3076, 4099)}
+    units = {_UNITS.get(code, f"EPSG:{code}") for code in codes if 0 < code < _OWN_CODE}
+    units |= {axis.unit_name for axis in axes}
     if not units.issubset(METRES):
         unit = " and ".join(sorted(units.difference(METRES)))
         sentence = f"its CRS {name} is in {unit}. Reproject the cloud to metres first."
