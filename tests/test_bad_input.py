@@ -33,7 +33,6 @@ TABLES = {
     "empty_field": "label,x,y,z\n" + ROWS + "d,456060,,90\n",
     "nan": "label,x,y,z\n" + ROWS + "d,456060,5432060,nan\n",
     "inf": "label,x,y,z\n" + ROWS + "d,-inf,5432060,90\n",
-    "decimal_comma": "label;x;y;z\na;456010,5;5432010;90\n",
     "empty_lines": "label,x,y,z\n\n\n" + ROWS + "\nd,1,2,east\n",
     "header_only": "label,x,y,z\n",
     "empty": "",
@@ -252,7 +251,7 @@ CAMERAS = {
     ],
     "table.empty": ["t_header_only.csv", "angles.csv --sensor s_no_rows.csv"],
     "table.number": [
-        *(f"t_{name}.csv" for name in ("word", "empty_field", "nan", "inf", "decimal_comma",
+        *(f"t_{name}.csv" for name in ("word", "empty_field", "nan", "inf",
                                        "empty_lines", "nan_angle")),
         "angles.csv --sensor s_nan.csv",
     ],
