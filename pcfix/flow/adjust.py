@@ -35,7 +35,7 @@ from pcfix.flow.diagnosis import flags_of, water_word
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
 from pcfix.flow.runner import check_folder
 from pcfix.flow.surfaces import sample_of, view_of
-from pcfix.io.atomic import temporary_folder
+from pcfix.io.atomic import temporary_output
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.io.cameras.sensor import read_sensor, write_table
 from pcfix.io.crs import is_topocentric, parse_crs
@@ -277,7 +277,7 @@ def _calibration(path: File, cameras: Cameras) -> Lens:
 def _write(folder: Path, found: Adjusted, model: str) -> None:
     """Write an adjusted block: model, camera files, summary, report; all or nothing."""
     before = before_of(found)
-    with temporary_folder(folder) as draft:
+    with temporary_output(folder, is_folder=True) as draft:
         _write_models(draft, found)
         sigma = found.unknowns.surface
         moved = sigma.get("level") or sigma.get("shape")

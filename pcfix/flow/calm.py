@@ -17,7 +17,7 @@ from pcfix.flow.inputs import Inputs
 from pcfix.flow.photos import photo_of, read_heights, warn_all
 from pcfix.flow.runner import Progress, check_summary, write_summary
 from pcfix.grid.lattice import Lattice
-from pcfix.io.atomic import temporary_folder
+from pcfix.io.atomic import temporary_output
 from pcfix.io.crs import parse_crs
 from pcfix.io.files import scratch_arrays
 from pcfix.io.photographs import Frames, check_calm, read_frames, write_calm, write_spread
@@ -108,7 +108,7 @@ def calm_frames(
             shifts, weights = (np.stack(one) for one in zip(*measured, strict=True))
             weights[:, still(shifts, weights)] = 0.0
             waters, water = _water(view, nodes, shifts, weights, interval, str(folder))
-            with temporary_folder(folder) as draft:
+            with temporary_output(folder, is_folder=True) as draft:
                 _write_waters(draft, found.names, view.level_m, nodes.lattice, waters, crs)
             if interval is None:
                 words = "The times are unknown, so frames are fitted separately. Give --interval."

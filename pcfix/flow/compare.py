@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,7 +18,7 @@ from pcfix.compare.match import SurveyCloud, match
 from pcfix.compare.sections import parse_line
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
-from pcfix.io.atomic import all_or_none, output_folder
+from pcfix.io.atomic import all_or_none
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
 from pcfix.io.files import check_output, scratch_arrays, write_text
 from pcfix.io.tiles import Clouds, cloud_of, inputs_of
@@ -125,7 +124,7 @@ def _write(result: Comparison, given: CompareOptions) -> None:
     """Write the files of a comparison, and remove those of an earlier one with more sections."""
     files: dict[str, str] = {}
     folder = None if given.out_dir is None else Path(given.out_dir)
-    with nullcontext() if folder is None else output_folder(folder), all_or_none():
+    with all_or_none(folder):
         if folder is not None:
             tables = {"depth_bins.csv": result.depth_bins, "shore_bins.csv": result.shore_bins}
             files = {"compare.json": json_text(result.as_dict())}

@@ -96,7 +96,7 @@ def correct_file(
 
     def plan(task: FileTask) -> Plan:
         """Return the plan for a file, or for many as one cloud."""
-        return plan_correction(read_inputs(given, view_of(task.source, given.jobs, task.cached)))
+        return plan_correction(read_inputs(given, view_of(task.source, given.jobs)))
 
     return run_command(
         "correct", input, output, given, plan=plan, work=_correcting, finish=finish,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import astuple, dataclass
 from os import PathLike
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import SettingError
+from pcfix.errors import PcfixWarning, SettingError
 from pcfix.flow.inputs import labelling_of, mask_of, paths_in
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
 from pcfix.flow.surfaces import (
@@ -23,7 +24,7 @@ from pcfix.flow.surfaces import (
 )
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource, part_report
-from pcfix.io.las.writing import labelling_vlr, noted_header
+from pcfix.io.las.writing import noted_header
 from pcfix.io.tiles import Clouds
 from pcfix.label.areas import WaterMask
 from pcfix.label.labelling import LabelCounts, Labelling, Part
@@ -166,7 +167,7 @@ def _labelling(plan: LabelPlan, source: LasSource) -> FileWork:
         "water_mask": None if mask is None else mask.name,
         **({} if part is None else {"part": part}),
     }
-    header = noted_header(source, labelling_vlr(content))
+    header = noted_header(source, "labelling", content)
 
     def apply(points: Chunk, classes: Classes) -> Chunk:
         new = convert(points, header.point_format)
@@ -178,9 +179,19 @@ def _labelling(plan: LabelPlan, source: LasSource) -> FileWork:
     )
 
 
+DEEP_M = 10.0
+"""A cloud that is deeper everywhere has hardly been made of images through the water surface."""
+
+
 def _finish(plan: LabelPlan, task: FileTask, counts: LabelCounts) -> Figures:
     """Check the counts of a cloud, and return the summary."""
     check(plan, counts)
+    notes = list[Any](plan.labelling.notes)
+    if DEEP_M < counts.least_m < np.inf:
+        sentence = f"{plan.name}: every point is more than {counts.least_m:.0f} m below the water"
+        sentence += f" ({plan.water}). Check the height of the water and its vertical datum."
+        notes.append(PcfixWarning("water.above_cloud", sentence, depth_m=counts.least_m))
+        warnings.warn(notes[-1], stacklevel=2)
     return Figures(
         input=str(task.source),
         output=str(task.target),
@@ -190,6 +201,6 @@ def _finish(plan: LabelPlan, task: FileTask, counts: LabelCounts) -> Figures:
         settings=plan.labelling.settings.as_dict(),
         labelling=plan.labelling.report(counts),
         seconds=task.seconds,
-        warnings=list(plan.labelling.notes),
+        warnings=notes,
         part=part_report(task.source),
     )

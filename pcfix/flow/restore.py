@@ -95,7 +95,7 @@ def _ours(source: LasSource, settings: dict[str, Any]) -> set[str]:
     else:
         for column in columns:  # another program may have changed a type
             found = header.dimension_by_name(column.name).dtype
-            if str(found) not in (column.dtype, column.earlier):
+            if str(found) != column.dtype:
                 wrong = f"has a dimension {column.name} of type {found}, not {column.dtype}"
     if wrong:
         raise bad_file(source.path, "cloud.cannot_restore", f"{wrong}. Use the original cloud.")

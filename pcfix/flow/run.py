@@ -198,7 +198,7 @@ def run_all(
 
     layers = out_dir / "map.gpkg"
     try:
-        vectors.check_layers(layers)
+        vectors.check_layers(layers, overwrite=True)
     except SettingError as error:
         say(f"{'map':<9} not written: {error}")
     else:

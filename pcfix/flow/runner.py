@@ -93,7 +93,6 @@ class FileTask:
     jobs: int | None = None
     progress: Progress | None = None  # called with (points done, points in all)
     started: float = field(default_factory=time.perf_counter)
-    cached: list[Chunk] = field(default_factory=list)  # of a small cloud that is read several times
     # of one of many files: its points, the first as a row of all files, a checksum of all
     # that the output depends on, and the version that must process it
     points: int = 0
@@ -204,7 +203,7 @@ def stream(work: Work, plan: Any, task: FileTask, finish: Callable[[Any], Any]) 
 
     Returns what `finish` makes of the statistics.
     """
-    with open_cloud(task.source, task.jobs, kept=task.cached or None) as source:
+    with open_cloud(task.source, task.jobs) as source:
         own, total = work(plan, source), len(source)
         tally, done, end, reached = None, 0, 0, 0.0  # points before and after, and those reported
         # the index of a COPC file would be wrong

@@ -9,7 +9,6 @@ import numpy as np
 import shapely
 
 from pcfix.grid.shoreline import NearWater, Shoreline
-from pcfix.io.files import check_output
 from pcfix.io.vectors import Layer, check_layers, write_layers
 from pcfix.model import FloatArray
 from pcfix.options.correct import LEVEL_M
@@ -22,7 +21,7 @@ LAYER = "shoreline"
 def check_shoreline(path: File | None, *, overwrite: bool, inputs: Iterable[File] = ()) -> None:
     """Check that the file can be written, before anything is computed."""
     if path is not None:
-        check_layers(check_output(path, overwrite=overwrite, inputs=inputs))
+        check_layers(path, overwrite=overwrite, inputs=inputs)
 
 
 def write_shoreline(

@@ -86,10 +86,8 @@ def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
 
 
-def view_of(
-    cloud: CloudFiles, jobs: int | None = None, kept: list[Chunk] | None = None
-) -> CloudView:
-    """Return the view of a LAS or LAZ file, or of many as one cloud; `kept` as of `LasSource`."""
+def view_of(cloud: CloudFiles, jobs: int | None = None) -> CloudView:
+    """Return the view of a LAS or LAZ file, or of many as one cloud."""
     with open_cloud(cloud, jobs) as source:
         return CloudView(
             str(cloud),
@@ -97,20 +95,17 @@ def view_of(
             np.array(source.header.mins[:2]),
             np.array(source.header.maxs[:2]),
             len(source),
-            partial(file_points, cloud, jobs=jobs, kept=kept),
+            partial(file_points, cloud, jobs=jobs),
             str(source.header.generating_software or ""),
             float(max(source.header.scales)),
         )
 
 
 def file_points(
-    cloud: CloudFiles,
-    water: WaterSurface | None = None,
-    jobs: int | None = None,
-    kept: list[Chunk] | None = None,
+    cloud: CloudFiles, water: WaterSurface | None = None, jobs: int | None = None
 ) -> Iterator[Points]:
     """Yield all points of a LAS or LAZ file, or of many, chunk by chunk; see `LasSource`."""
-    with open_cloud(cloud, jobs, kept=kept) as source:
+    with open_cloud(cloud, jobs) as source:
         yield from read_ahead(points_of(one, source, water) for one in source.chunks())
 
 
@@ -202,7 +197,27 @@ def find_surface(
         return _fitted(options, water, view)
     if view is None:
         return FoundSurface(read_water(water))
-    return FoundSurface(read_water(water, view.crs, _bounds(view.low, view.high)))
+    found = read_water(water, view.crs, _bounds(view.low, view.high))
+    if isinstance(found, WaterMesh):
+        _check_near(str(water), found.vertices, view, 0.0)
+    return FoundSurface(found)
+
+
+FAR_M = 1000.0
+"""Largest distance of a shoreline from the cloud, unless the cloud itself is larger."""
+
+
+def _check_near(name: str, xyz: FloatArray, view: CloudView, most_m: float) -> None:
+    """Raise InputError if the vertices of a water surface are too far from the cloud in plan."""
+    low, high = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
+    apart_m = float(np.maximum(low - view.high, view.low - high).max())
+    if apart_m > most_m:
+        raise InputError(
+            "water.no_overlap",
+            f"{name}: does not overlap the cloud in plan; they are {apart_m / 1e3:,.2f} km apart."
+            " Check its CRS and the order of its axes.",
+            path=name, apart_m=apart_m,
+        )  # fmt: skip
 
 
 APART_M = 2.0
@@ -307,6 +322,8 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
     from pcfix.water.river import fit_river
 
     shore = read_shoreline(path, None if view is None else view.crs, crs=options.water_crs)
+    if view is not None:
+        _check_near(shore.name, shore.xyz, view, max(FAR_M, *(view.high - view.low)))
     xyz, notes = shore.xyz, list[Any](shore.notes)
     lacking = np.isnan(xyz[:, 2])
     if lacking.any():  # they get the heights of the cloud

@@ -40,20 +40,23 @@ def temporary_path(target: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def temporary_output(target: Path) -> Iterator[Path]:
+def temporary_output(target: Path, *, is_folder: bool = False) -> Iterator[Path]:
     """Give a path to write to, and rename what is there to the target when the block ends well.
 
-    The new file has the permissions of the one that it replaces. Within `all_or_none` the file is
-    renamed when that block ends.
+    The new file has the permissions of the one that it replaces. Within `all_or_none` it is renamed
+    when that block ends. A folder is made, and replaces the one that is there.
     """
     group = _group.get()
     with ExitStack() as own:
         path = (group[0] if group else own).enter_context(temporary_path(target))
         with _write_errors(target, path):
+            if is_folder:
+                path.mkdir()
             yield path
             if target.is_file():
                 path.chmod(stat.S_IMODE(target.stat().st_mode))
-            _flush(path)
+            for one in (path, *path.rglob("*")):
+                _flush(one)
         if group:
             group[1][target] = path
         else:
@@ -61,10 +64,17 @@ def temporary_output(target: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def all_or_none() -> Iterator[None]:
-    """Let the files that are written in the block appear when it ends well, or none of them."""
+def all_or_none(folder: Path | None = None) -> Iterator[None]:
+    """Let the files that are written in the block appear when it ends well, or none of them.
+
+    A folder is made for them, and removed again if it is new and the block fails.
+    """
     complete: dict[Path, Path] = {}
     with ExitStack() as stack:
+        if folder is not None and not folder.exists():
+            with _write_errors(folder, folder):
+                folder.mkdir(parents=True)
+            stack.callback(_remove_empty, folder)
         token = _group.set((stack, complete))
         try:
             yield
@@ -75,42 +85,12 @@ def all_or_none() -> Iterator[None]:
 
 
 @contextmanager
-def temporary_folder(target: Path) -> Iterator[Path]:
-    """Give a folder to write into, which replaces the target when the block ends well."""
-    with temporary_path(target) as path, _write_errors(target, path):
-        path.mkdir()
-        yield path
-        for one in path.rglob("*"):
-            _flush(one)
-        with temporary_path(target.with_name(f"{target.name}.old")) as old:
-            if target.exists():
-                target.rename(old)
-            path.replace(target)
-        _flush(target.parent)
-
-
-@contextmanager
 def scratch_folder(target: Path) -> Iterator[Path]:
     """Give a folder beside a target for intermediate files; it is removed when the block ends."""
     with temporary_path(target.with_name(f"{target.name}.scratch")) as path:
         with _write_errors(target, path):
             path.mkdir()
         yield path
-
-
-@contextmanager
-def output_folder(folder: Path) -> Iterator[None]:
-    """Make a folder for what the block writes; remove a new one again if the block fails."""
-    is_new = not folder.exists()
-    with _write_errors(folder, folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    try:
-        yield
-    except BaseException:
-        if is_new:
-            with suppress(OSError):  # it stays if somebody else has put a file into it
-                folder.rmdir()
-        raise
 
 
 def cannot_write(target: Path, error: Exception, written: Path | None = None) -> InputError:
@@ -143,7 +123,10 @@ def _write_errors(target: Path, path: Path) -> Iterator[None]:
 
 
 def _rename(path: Path, target: Path) -> None:
-    with _write_errors(target, path):
+    with _write_errors(target, path), ExitStack() as stack:
+        if path.is_dir() and target.exists():  # a folder that is not empty cannot be replaced
+            aside = target.with_name(f"{target.name}.old")
+            target.rename(stack.enter_context(temporary_path(aside)))
         path.replace(target)
     _flush(target.parent)
 
@@ -164,3 +147,8 @@ def _remove(path: Path) -> None:
     else:
         with suppress(OSError):
             path.unlink()
+
+
+def _remove_empty(folder: Path) -> None:
+    with suppress(OSError):  # it holds the files of the block, or of somebody else
+        folder.rmdir()

@@ -20,7 +20,7 @@ from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, stated_crs
 from pcfix.io.las.writing import own_settings, record_errors
 from pcfix.io.rasters import open_raster, place_of, read_masked
-from pcfix.io.tables import read_table
+from pcfix.io.tables import POINT_SPELLINGS, read_table
 from pcfix.io.tiles import SUFFIXES, Clouds, Tiles, cloud_of, open_cloud
 from pcfix.model import (
     BATHYMETRIC_POINT,
@@ -174,7 +174,7 @@ def read_reference(reference: Clouds) -> Reference:
         return Reference(cloud.name, cloud.xyz, cloud.crs, cloud.left_out)
     suffix = found.suffix.lower()
     if suffix in TABLES:
-        xyz = read_table(found, ("x", "y", "z")).of("xyz")
+        xyz = read_table(found, ("x", "y", "z"), spellings=POINT_SPELLINGS).of("xyz")
         return Reference(str(found), xyz, None, sparse=True)
     if suffix not in (".tif", ".tiff"):
         raise bad_file(found, "reference.unknown", f"is not a reference. Give {KINDS}.")

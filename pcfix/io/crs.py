@@ -376,16 +376,15 @@ def way_to_cloud(
     The cloud's is projected, in metres. `heights` says whether z matters.
     """
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
-    if crs is None:
-        if cloud is None or is_local(cloud):
-            return None, ()
-        sentence = f"{name}: names no CRS; that of the cloud is assumed ({cloud.name})."
+    if crs is not None and crs.strip().lower() == LOCAL:
+        return None, ()
+    source = None if crs is None else parse_crs(crs, name)
+    if all(one is None or is_local(one) for one in (source, cloud)):
+        return None, ()
+    if source is None:
+        known = "" if cloud is None else cloud.name
+        sentence = f"{name}: names no CRS; that of the cloud is assumed ({known})."
         return None, (PcfixWarning("crs.assumed", sentence),)
-    if crs.strip().lower() == LOCAL:
-        return None, ()
-    source = parse_crs(crs, name)
-    if cloud is None and is_local(source):
-        return None, ()
     if cloud is None:
         unit = plan_unit(source)[0] if source.is_projected else "degrees"
         if not source.is_projected or plan_unit(source)[1] != 1.0:
@@ -394,8 +393,6 @@ def way_to_cloud(
         sentence = f"{name}: no cloud names a CRS; that of the file is assumed ({source.name})."
         return None, (PcfixWarning("crs.assumed", sentence),)
     if is_local(cloud) or is_local(source):
-        if is_local(cloud) and is_local(source):
-            return None, ()
         sentence = f"is in {source.name}, the cloud in {cloud.name}, of which one is local. Use one"
         raise bad_file(name, "crs.local", f"{sentence} CRS, or give that of the file as 'local'.")
     check_projected_metres(cloud, "the cloud")

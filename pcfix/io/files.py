@@ -46,14 +46,25 @@ def check_input(path: File) -> Path:
     """Return the path of a file; one that cannot be read is an `InputError`."""
     found = path_of(path)
     try:
-        kind = kind_of(found.stat().st_mode)
-        if not kind:
-            found.open("rb").close()
-            return found
-        why = f"is {kind}; give a file"
+        why = kind_of(found.stat().st_mode)
+        if why:
+            raise bad_file(found, "input.unreadable", f"is {why}; give a file.")
+        with found.open("rb") as stream:
+            head = stream.read(64).lstrip().lower()
     except OSError as error:
-        why = refusal(error)
-    raise bad_file(found, "input.unreadable", f"{why}.")
+        raise bad_file(found, "input.unreadable", f"{refusal(error)}.") from error
+    for start, sentence in _NOT_THE_FILE.items():
+        if head.startswith(start):
+            raise bad_file(found, "input.not_the_file", sentence)
+    return found
+
+
+_NOT_THE_FILE = {
+    b"version https://git-lfs": "is a Git LFS pointer, not the file. Run 'git lfs pull'.",
+    b"<!doctype html": "is a web page, not the file. Download it again.",
+    b"<html": "is a web page, not the file. Download it again.",
+}
+"""First bytes of what people have in place of a file."""
 
 
 def kind_of(mode: int) -> str:
@@ -102,13 +113,17 @@ def belonging(path: File) -> list[Path]:
     return sorted(chosen)
 
 
-def check_output(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
-    """Return the path of a file that may be written."""
+def check_output(
+    path: File, *, overwrite: bool, inputs: Iterable[File] = (), suffixes: tuple[str, ...] = ()
+) -> Path:
+    """Return the path of a file that may be written, with one of the suffixes if there are any."""
 
     def refused(code: str, sentence: str) -> SettingError:
         return SettingError(f"output.{code}", f"{target}: {sentence}", path=target)
 
     target = path_of(path)
+    if suffixes and target.suffix.lower() not in suffixes:
+        raise refused("suffix", f"the name must end in {' or '.join(suffixes)}.")
     for source in inputs:
         if is_same(target, source):
             raise refused("is_input", f"is also the input {source}. Give the output another name.")
@@ -195,7 +210,7 @@ def parse_json(text: str | bytes) -> Any:
 
 def read_json(path: Path) -> Any:
     """Return the content of a JSON file; OSError or ValueError where it is none."""
-    return parse_json(path.read_text("utf-8"))
+    return parse_json(path.read_bytes())
 
 
 def write_bytes(path: File, data: bytes, *, overwrite: bool) -> None:

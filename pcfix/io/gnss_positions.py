@@ -31,6 +31,9 @@ FARTHEST_M = 50e3
 """Horizontal distance to the projection centres that indicates another zone or swapped axes."""
 
 
+_WITHOUT_NAMES = {".mrk": "a list of DJI's exposure times", ".pos": "a solution of RTKLIB"}
+
+
 def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Cameras:
     """Return cameras with `gnss`: the GNSS positions of their images, in their own CRS.
 
@@ -52,6 +55,10 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
     source = Path(path) if Path(path).is_dir() else check_input(path)
     if crs is not None and crs.strip().lower() != "local":
         parse_crs(crs, str(source))
+    if (kind := _WITHOUT_NAMES.get(source.suffix.lower())) is not None:
+        sentence = f"is {kind}, which names no images. Make a table with the columns image,"
+        sentence += " longitude, latitude, height from it."
+        raise bad_file(source, "gnss.no_names", sentence)
     if source.name == "images.json":
         _, names = read_images(source, ())
         listed, _ = read_images(source, tuple(names))
@@ -65,13 +72,30 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
     if listed is None:
         sentence = "has no measured positions. Give a table with the columns image, x, y, z."
         raise bad_file(source, "gnss.none", sentence)
-    found, unknown = _by_camera(source, cameras, names, listed)
-    known = int(np.isfinite(found.xyz).all(axis=1).sum())
+    bad = (listed.sigma_m <= 0.0).any(axis=1)
+    if bad.any():
+        name = names[int(np.argmax(bad))]
+        sentence = f"image {name}: a standard deviation is not positive. Leave it empty if unknown."
+        raise bad_file(source, "gnss.sigma", sentence, image=name)
+    row_of: dict[str, int] = {}
+    for i, label in enumerate(names):
+        first = row_of.setdefault(label, i)
+        if not np.array_equal(listed.xyz[i], listed.xyz[first], equal_nan=True):
+            sentence = f"image {label} has two positions. Give one for every image."
+            raise bad_file(source, "gnss.two_positions", sentence, image=label)
+    row, ambiguous = match_labels(list(row_of), cameras.labels)
+    for name in ambiguous:
+        sentence = f"image {name} could be several of the model. Use names with their folders."
+        raise bad_file(source, "images.ambiguous", sentence, image=name)
+    there = row >= 0
+    rows = np.array(list(row_of.values()))[there]
+    xyz, sigma = np.full((2, len(cameras), 3), np.nan)
+    xyz[row[there]], sigma[row[there]] = listed.xyz[rows], listed.sigma_m[rows]
+    known = int(np.isfinite(xyz).all(axis=1).sum())
     if not known:
         sentence = f"no position belongs to an image such as {cameras.labels[0]}. Give those of"
         raise bad_file(source, "gnss.no_image", f"{sentence} this block.")
-    if crs is not None:
-        found = replace(found, crs=crs)
+    found = GnssPositions(xyz, sigma, listed.crs if crs is None else crs)
     cameras = replace(cameras, gnss=found)
     if is_tied(cameras.crs, str(source)):
         enu_m = adjusted_minus_gnss(cameras, str(source))[0][:, :2]
@@ -84,6 +108,7 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
     if known < len(cameras):
         words = f"{source}: {known} of {len(cameras)} images have a GNSS position."
         notes.append(PcfixWarning("gnss.images_without", words, path=source, images=known))
+    unknown = [label for label, known in zip(row_of, there, strict=True) if not known]
     others = unnamed(unknown, cameras.unposed)
     if others:
         words = f"{source}: {len(others)} positions of unknown images ({others[0]}) are skipped."
@@ -91,34 +116,6 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
     for note in notes:
         warnings.warn(note, stacklevel=2)
     return replace(cameras, notes=(*cameras.notes, *notes))
-
-
-def _by_camera(
-    path: Path, cameras: Cameras, names: list[str], listed: GnssPositions
-) -> tuple[GnssPositions, list[str]]:
-    """Return the positions by camera, and the names of unknown images."""
-    bad = (listed.sigma_m <= 0.0).any(axis=1)
-    if bad.any():
-        name = names[int(np.argmax(bad))]
-        sentence = f"image {name}: a standard deviation is not positive. Leave it empty if unknown."
-        raise bad_file(path, "gnss.sigma", sentence, image=name)
-    row_of: dict[str, int] = {}
-    for i, label in enumerate(names):
-        first = row_of.setdefault(label, i)
-        if not np.array_equal(listed.xyz[i], listed.xyz[first], equal_nan=True):
-            sentence = f"image {label} has two positions. Give one for every image."
-            raise bad_file(path, "gnss.two_positions", sentence, image=label)
-    labels = list(row_of)
-    row, ambiguous = match_labels(labels, cameras.labels)
-    for name in ambiguous:
-        sentence = f"image {name} could be several of the model. Use names with their folders."
-        raise bad_file(path, "images.ambiguous", sentence, image=name)
-    there = row >= 0
-    rows = np.array([row_of[label] for label in labels])[there]
-    xyz, sigma = np.full((2, len(cameras), 3), np.nan)
-    xyz[row[there]], sigma[row[there]] = listed.xyz[rows], listed.sigma_m[rows]
-    unknown = [label for label, known in zip(labels, there, strict=True) if not known]
-    return GnssPositions(xyz, sigma, listed.crs), unknown
 
 
 def gnss_in_frame_of(cameras: Cameras, name: str = "cameras") -> tuple[GnssPositions, str]:

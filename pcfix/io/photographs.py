@@ -258,11 +258,8 @@ def _opened(path: Path) -> Iterator[Any]:
 def check_calm(path: File, frames: Frames, *, overwrite: bool) -> tuple[Path, Path]:
     """Return the paths of the median and of its spread; refuse names that cannot be used."""
     inputs = frames.photographs or (frames.path,)
-    target = check_output(path, overwrite=overwrite, inputs=inputs)
     suffixes = (frames.photographs[0].suffix.lower(),) if frames.photographs else PNG
-    if target.suffix.lower() not in suffixes:
-        sentence = f"{target}: must end in {suffixes[0]}, as the frames do (PNG for a video)."
-        raise SettingError("output.suffix", sentence, path=target, suffix=suffixes[0])
+    target = check_output(path, overwrite=overwrite, inputs=inputs, suffixes=suffixes)
     if frames.photographs and target.parent.resolve() == frames.path.resolve():
         sentence = f"{target}: is in the folder of the frames. Give a file in another folder."
         raise SettingError("output.is_input", sentence, path=target)

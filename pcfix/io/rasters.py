@@ -5,15 +5,16 @@ from __future__ import annotations
 import errno
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import GeometryError, SettingError, bad_file
+from pcfix.errors import GeometryError, bad_file
 from pcfix.grid.lattice import Lattice, Window
 from pcfix.io.atomic import is_full_disk, temporary_output
 from pcfix.io.files import check_input, check_output, refusing
@@ -31,7 +32,8 @@ if TYPE_CHECKING:
 NO_HEIGHT = -9999.0
 """Value of cells without a height; every program that reads GeoTIFF knows this one."""
 TILE = 256
-_SUFFIXES = (".tif", ".tiff")
+check_tif = partial(check_output, suffixes=(".tif", ".tiff"))
+"""Return the path of a GeoTIFF that may be written."""
 
 
 @contextmanager
@@ -53,17 +55,12 @@ def place_of(transform: Affine, column: Any, row: Any) -> tuple[Any, Any]:
     return t.a * column + t.b * row + t.c, t.d * column + t.e * row + t.f
 
 
-def read_heights(source: DatasetReader, window: Window) -> FloatArray:
-    """Return part of the first band, shape (rows, columns), NaN for no value."""
-    return read_masked(source, window=_slices(window))
-
-
 def read_within(source: DatasetReader, window: Window, whole: Window) -> FloatArray:
-    """Return part of the first band as `read_heights`, NaN beyond the raster."""
+    """Return part of the first band, shape (rows, columns), NaN for no value and beyond it."""
     values = np.full((window.height, window.width), np.nan)
     inside = window.clipped(whole)
     if inside.height > 0 and inside.width > 0:
-        values[inside.within(window)] = read_heights(source, inside)
+        values[inside.within(window)] = read_masked(source, window=_slices(inside))
     return values
 
 
@@ -102,15 +99,6 @@ def write_part(target: DatasetWriter, values: npt.NDArray[Any], window: Window, 
 
 def _slices(window: Window) -> tuple[tuple[int, int], tuple[int, int]]:
     return (window.row, window.row_stop), (window.column, window.column_stop)
-
-
-def check_tif(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
-    """Return the path of a GeoTIFF that may be written, by its suffix and `check_output`."""
-    target = check_output(path, overwrite=overwrite, inputs=inputs)
-    if target.suffix.lower() not in _SUFFIXES:
-        sentence = f"{target}: a raster is written as GeoTIFF. End the name in .tif."
-        raise SettingError("output.suffix", sentence, path=target, suffixes=list(_SUFFIXES))
-    return target
 
 
 @contextmanager
@@ -257,15 +245,10 @@ PREVIEW_CELLS = 360_000
 def preview(path: Path, cells: int = PREVIEW_CELLS) -> tuple[FloatArray, Bounds]:
     """Return a raster of at most `cells`, NaN for no data, and west, east, south, north."""
     with open_raster(path) as source:
-        shape, bounds = _small(source, cells)
-        return read_masked(source, out_shape=shape), bounds
-
-
-def _small(source: DatasetReader, cells: int) -> tuple[tuple[int, int], Bounds]:
-    scale = max(1.0, math.sqrt(source.height * source.width / cells))
-    west, south, east, north = source.bounds
-    shape = max(1, int(source.height / scale)), max(1, int(source.width / scale))
-    return shape, (west, east, south, north)
+        scale = max(1.0, math.sqrt(source.height * source.width / cells))
+        shape = max(1, int(source.height / scale)), max(1, int(source.width / scale))
+        west, south, east, north = source.bounds
+        return read_masked(source, out_shape=shape), (west, east, south, north)
 
 
 def centres(place: FloatArray, values: FloatArray, bounds: Bounds) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import math
 import re
@@ -109,8 +110,7 @@ class Table:
         if role not in self.place:
             return np.full(len(self.rows), np.nan)
         name, texts = self.name(role), self.column(role)
-        points = [text if "." in text else text.replace(",", ".") for text in texts]
-        values = np.array([(exif_number if name in EXIF else number)(text) for text in points])
+        values = np.array([(exif_number if name in EXIF else number)(text) for text in texts])
         for i in np.flatnonzero(~(np.abs(values) < TOO_LARGE)):
             if needed or texts[i].lower() not in UNKNOWN:
                 why = "too large" if math.isfinite(values[i]) else "not a finite number"
@@ -142,6 +142,11 @@ def number(text: str) -> float:
         return math.nan
 
 
+def _with_point(text: str) -> str:
+    """Return a number with a decimal point in place of a comma, and any other text as it is."""
+    return re.sub(r"^([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)$", r"\1.\2", text)
+
+
 def exif_number(text: str) -> float:
     """Return the number in what exiftool writes: 24 deg 40' 48.5" S, 86.5 m Below Sea Level."""
     parts = [number(part) for part in re.findall(r"[\d.]+", text)]
@@ -154,13 +159,19 @@ def exif_number(text: str) -> float:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Read a text file, with or without a byte order mark."""
-    data = path.read_bytes()
+    """Read a text file."""
+    return decoded(path.read_bytes()).splitlines()
+
+
+def decoded(data: bytes) -> str:
+    """Return a text of UTF-16, if its byte order mark says so, or else of UTF-8 or Latin-1."""
+    if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        return data.decode("utf-16", errors="replace")
     try:
-        text = data.decode("utf-8-sig")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError:
-        text = data.decode("latin-1")  # only names can be affected
-    return text.splitlines()
+        # only names can be affected
+        return data.removeprefix(codecs.BOM_UTF8).decode("latin-1")
 
 
 class Header(NamedTuple):
@@ -193,8 +204,8 @@ def find_header(lines: Sequence[str], spellings: Spellings) -> Header | None:
 
 
 def _delimiter(line: str) -> str | None:
-    """Return the tab, semicolon or comma between the fields of a line, else None: spaces."""
-    most = max(",;\t", key=line.count)
+    """Return the semicolon, tab or comma between the fields of a line, else None: spaces."""
+    most = ";" if ";" in line else max(",\t", key=line.count)  # decimals may have commas
     return most if most in line else None
 
 
@@ -238,6 +249,10 @@ def read_table(path: Path, *needed: Sequence[str], spellings: Spellings | None =
     lines = read_lines(path)
     at, header, units, is_comment = find_header(lines, spellings) or Header(0, [], [], False)
     place = places(header, spellings)
+    if header and not np.isnan([number(_with_point(name)) for name in header[:4]]).any():
+        sentence = "line 1 has numbers only. Add a line above it that names the columns, such as"
+        sentence += f" {', '.join(spellings[role][0] for role in needed[0])}."
+        raise bad_file(path, "table.no_header", sentence)
     if not any({*some} <= place.keys() for some in needed):
         most = max(needed, key=lambda some: len(place.keys() & {*some}))
         missing = [spellings[role][0] for role in most if role not in place]
@@ -259,7 +274,8 @@ def read_table(path: Path, *needed: Sequence[str], spellings: Spellings | None =
             if len(fields) != len(header):
                 sentence = f"line {line} has {len(fields)} fields, the header has {len(header)}."
                 raise bad_file(path, "table.shifted", sentence, line=line)
-            rows.append([field.strip() for field in fields])
+            fields = [field.strip() for field in fields]
+            rows.append(fields if delimiter == "," else [_with_point(one) for one in fields])
             numbers.append(line)
     except csv.Error as error:
         sentence = f"line {at + 1 + reader.line_num} is not CSV ({error})."
@@ -269,11 +285,13 @@ def read_table(path: Path, *needed: Sequence[str], spellings: Spellings | None =
     return Table(path, header, rows, numbers, place, units, is_comment, stated_crs(lines[:at]))
 
 
-DEPTH_SPELLINGS = {
+POINT_SPELLINGS = {
     "x": ("x", "easting", "east"),
     "y": ("y", "northing", "north"),
-    "depth": ("depth", "true_depth", "water_depth", "measured_depth"),
     "z": ("z", "height", "elevation", "elev", "altitude"),
+}
+DEPTH_SPELLINGS = POINT_SPELLINGS | {
+    "depth": ("depth", "true_depth", "water_depth", "measured_depth")
 }
 
 

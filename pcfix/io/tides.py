@@ -4,8 +4,7 @@ Times with a zone (or Z) are UTC moments. Times without one are the readings of 
 table and images share. The two cannot be compared, so both must be of one kind.
 
 The heights above the take-off place are those that drones recorded in their images: DJI's XMP has
-``drone-dji:RelativeAltitude`` (metres, by the barometer); Metashape stores it in its projects, as
-the property ``DJI/RelativeAltitude`` of each image.
+``drone-dji:RelativeAltitude`` (metres, by the barometer).
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, bad_file
-from pcfix.io.cameras.metashape import open_chunk
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.files import check_input, read_json, refusing
 from pcfix.io.labels import match_labels
 from pcfix.io.tables import read_table
@@ -213,25 +211,14 @@ def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
     NaN where it is not recorded. At most `MOST_IMAGES` images near the camera file are read.
     """
     altitudes, path, found = np.full(len(labels), np.nan), Path(cameras), {}
-    with suppress(OSError, InputError):  # no correction needs them
-        if path.suffix.lower() == ".psx":
-            chunk = open_chunk(path)
-            frame, listed = chunk.frame, chunk.element.iter("camera")
-            names = {camera.get("id"): camera.get("label") for camera in listed}
-            for camera in () if frame is None else frame.root.iter("camera"):
-                for entry in camera.iter("property"):
-                    label = names.get(camera.get("camera_id"))
-                    if entry.get("name") == "DJI/RelativeAltitude" and label:
-                        with suppress(ValueError):
-                            found[label] = float(entry.get("value", ""))
-        else:
-            root = path if path.is_dir() else path.parent
-            inside = [one for name in FOLDERS for one in sorted(root.joinpath(name).glob("*"))]
-            images = [one for one in inside if one.suffix.lower() in IMAGES and one.is_file()]
-            for image in images[:: 1 + len(images) // MOST_IMAGES]:
-                with image.open("rb") as stream:
-                    if above := _ABOVE.search(stream.read(HEAD_BYTES)):
-                        found[image.name] = float(above[1])
-        row = match_labels(list(found), labels, one_to_one=False)[0]
-        altitudes[row[row >= 0]] = np.array(list(found.values()))[row >= 0]
+    root = path if path.is_dir() else path.parent
+    with suppress(OSError):  # no correction needs them
+        inside = [one for name in FOLDERS for one in sorted(root.joinpath(name).glob("*"))]
+        images = [one for one in inside if one.suffix.lower() in IMAGES and one.is_file()]
+        for image in images[:: 1 + len(images) // MOST_IMAGES]:
+            with image.open("rb") as stream:
+                if above := _ABOVE.search(stream.read(HEAD_BYTES)):
+                    found[image.name] = float(above[1])
+    row = match_labels(list(found), labels, one_to_one=False)[0]
+    altitudes[row[row >= 0]] = np.array(list(found.values()))[row >= 0]
     return altitudes

@@ -14,7 +14,7 @@ import shapely
 
 from pcfix.errors import InputError, PcfixWarning, SettingError, bad_file
 from pcfix.io.files import path_of, read_json, refusing
-from pcfix.io.las.source import CloudPart, LasSource, metric_crs
+from pcfix.io.las.source import CloudPart, LasSource, coordinates, metric_crs
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 
@@ -58,7 +58,7 @@ class TiledSource(LasSource):
         self.header.scales = np.full(3, tiles.step_m)
         self.header.point_count = len(tiles)
 
-    def chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
+    def chunks(self, part: CloudPart | None = None) -> Iterator[laspy.ScaleAwarePointRecord]:
         """Yield all points."""
         for path in self._tiles.paths:
             with LasSource(path, self._jobs) as source:
@@ -68,12 +68,12 @@ class TiledSource(LasSource):
 CloudFiles: TypeAlias = Path | CloudPart | Tiles
 
 
-def open_cloud(cloud: CloudFiles, jobs: int | None = None, *, kept: Any = None) -> LasSource:
+def open_cloud(cloud: CloudFiles, jobs: int | None = None) -> LasSource:
     """Return the points of a file, of a part of one, or of many; see `LasSource`."""
     if isinstance(cloud, Tiles):
         return TiledSource(cloud, jobs)
     path, part = (cloud.path, cloud) if isinstance(cloud, CloudPart) else (cloud, None)
-    return LasSource(path, jobs, kept=kept, part=part)
+    return LasSource(path, jobs, part=part)
 
 
 def part_of(path: Path, options: Any) -> Path | CloudPart:
@@ -90,11 +90,10 @@ def part_of(path: Path, options: Any) -> Path | CloudPart:
         words = f"bounds {west:g},{south:g},{east:g},{north:g} must be west,south,east,north."
         raise SettingError("option.range", words, option="bounds")
     with LasSource(path, getattr(options, "jobs", None)) as source:
-        header, count, ends = source.header, 0, list[Any]()
-        for points in source.chunks_within(part):
-            count += len(points)
-            xyz = [points.array[axis] for axis in "XYZ"]
-            ends.append([[one.min() for one in xyz], [one.max() for one in xyz]])
+        header, count, ends = source.header, 0, list[FloatArray]()
+        for points in source.chunks(part):
+            xyz, count = coordinates(points), count + len(points)
+            ends += [xyz.min(axis=0), xyz.max(axis=0)]
     if not count:
         asked, reach = (
             ",".join(f"{one:.12g}" for one in box)
@@ -102,8 +101,7 @@ def part_of(path: Path, options: Any) -> Path | CloudPart:
         )
         sentence = f"has no point within {asked}. The cloud extends over {reach}."
         raise bad_file(path, "cloud.bounds", sentence)
-    low, high = np.min(ends, axis=0)[0], np.max(ends, axis=0)[1]
-    mins, maxs = (end * header.scales + header.offsets for end in (low, high))
+    mins, maxs = np.min(ends, axis=0), np.max(ends, axis=0)
     total = int(header.point_count)
     return replace(part, points=count, points_of_file=total, mins=mins, maxs=maxs)
 

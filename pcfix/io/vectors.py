@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from pcfix.errors import PcfixWarning, SettingError, bad_file
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io import tables
 from pcfix.io.atomic import cannot_write, temporary_output
 from pcfix.io.crs import LOCAL, parse_crs, way_to_cloud
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 Geometries = npt.NDArray[Any]
 
 TEXT_SUFFIXES = (".wkt", ".csv", ".txt")
-GDAL_SUFFIXES = (".gpkg", ".shp", ".geojson", ".json")
-KINDS = "GeoPackage (.gpkg), Shapefile (.shp), GeoJSON (.geojson, .json), WKT (.wkt) or CSV (.csv)"
+GDAL_SUFFIXES = (".gpkg", ".shp", ".geojson", ".json", ".kml", ".gpx")
+KINDS = "GeoPackage (.gpkg), Shapefile (.shp), GeoJSON, KML, GPX, WKT (.wkt) or CSV (.csv)"
 COLUMNS = {
     "x": ("x", "easting", "east", "e"),
     "y": ("y", "northing", "north", "n"),
@@ -81,7 +81,8 @@ class Vectors:
 
 def is_vector_file(path: File) -> bool:
     """Whether the name of a file, with or without a layer, is one that `read_vectors` reads."""
-    return Path(_split_layer(path)[0]).suffix.lower() in (*GDAL_SUFFIXES, *TEXT_SUFFIXES)
+    file = str(path).partition(LAYER_MARK)[0]
+    return Path(file).suffix.lower() in (*GDAL_SUFFIXES, *TEXT_SUFFIXES)
 
 
 def read_vectors(path: File, *, crs: str | None = None) -> Vectors:
@@ -90,20 +91,20 @@ def read_vectors(path: File, *, crs: str | None = None) -> Vectors:
     Parameters
     ----------
     path : path
-        ``.gpkg``, ``.shp``, ``.geojson``, ``.json``; ``.wkt`` with one geometry a line; ``.csv``
-        or ``.txt`` with the columns x, y and perhaps z, or easting, northing, height, or
-        longitude, latitude, height, or wkt. A layer may follow, if there are several:
-        ``river.gpkg|layername=shore``.
+        ``.gpkg``, ``.shp``, ``.geojson``, ``.json``, ``.kml``, ``.gpx``; ``.wkt`` with one geometry
+        a line; ``.csv`` or ``.txt`` with the columns x, y and perhaps z, or easting, northing,
+        height, or longitude, latitude, height, or wkt. A layer may follow, if there are several, as
+        QGIS writes it: ``river.gpkg|layername=shore``.
     crs : str, optional
         The file's CRS, in place of the one that it states. ``local``: the cloud's.
     """
-    file, layer = _split_layer(path)
+    file, _, layer = str(path).partition(LAYER_MARK)
     source = check_input(file)
     suffix, name = source.suffix.lower(), str(source)
     if suffix in TEXT_SUFFIXES:
         geometries, found = _read_text(source)
     elif suffix in GDAL_SUFFIXES:
-        geometries, found, name = _read_gdal(source, layer)
+        geometries, found, name = _read_gdal(source, layer.removeprefix("layername="))
     else:
         raise bad_file(source, "vector.format", f"is not a vector file. Give {KINDS}.")
     gone = shapely.is_missing(geometries) | shapely.is_empty(geometries)
@@ -122,12 +123,6 @@ def read_vectors(path: File, *, crs: str | None = None) -> Vectors:
         sentence = f"{x[i]:.10g}, {y[i]:.10g} is not in degrees, as {stated.name} is. Give its CRS."
         raise bad_file(name, "vector.not_degrees", sentence, crs=stated.name)
     return vectors
-
-
-def _split_layer(path: File) -> tuple[str, str | None]:
-    """Return the file and the layer of ``file|layername=layer``, as QGIS writes it."""
-    file, _, layer = str(path).partition(LAYER_MARK)
-    return file, layer.removeprefix("layername=") or None
 
 
 def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool) -> Vectors:
@@ -165,12 +160,15 @@ def load_pyogrio() -> Any:
     return optional_library("pyogrio", "vector", "Read and write vector files")
 
 
-def _read_gdal(path: Path, layer: str | None) -> tuple[Geometries, str | None, str]:
+def _read_gdal(path: Path, layer: str) -> tuple[Geometries, str | None, str]:
     """Return geometries (None for a missing one), CRS and name."""
-    pyogrio = load_pyogrio()
+    pyogrio, suffix = load_pyogrio(), path.suffix.lower()
     try:
         names = [str(name) for name, kind in pyogrio.list_layers(path) if kind is not None]
-        layer = layer or (names[0] if len(names) == 1 else None)
+        if suffix == ".gpx":  # it always has the layers of waypoints, routes and tracks
+            count = partial(pyogrio.read_info, path, force_feature_count=True)
+            names = [one for one in names if count(layer=one)["features"]]
+        layer = layer or (names[0] if len(names) == 1 else "")
         if layer in names:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # M values, which are not needed, are lost
@@ -182,10 +180,10 @@ def _read_gdal(path: Path, layer: str | None) -> tuple[Geometries, str | None, s
         raise bad_file(path, "vector.damaged", f"cannot be read ({first}).") from error
     if layer not in names:
         sentence = f"has the layers {', '.join(names)}. Name one: {path.name}|layername=NAME."
-        raise bad_file(path, "vector.layer", sentence, layer=layer, layers=names)
+        raise bad_file(path, "vector.layer", sentence, layer=layer or None, layers=names)
     name = str(path) if layer == path.stem else f"{path}, layer {layer}"
     crs = meta["crs"]
-    if path.suffix.lower() in (".geojson", ".json") and crs == WGS84:
+    if suffix in (".geojson", ".json") and crs == WGS84:
         crs = WGS84_3D if shapely.has_z(geometries).any() else WGS84
     return geometries, crs, name
 
@@ -194,50 +192,43 @@ def _read_text(path: Path) -> tuple[Geometries, str | None]:
     """Return the geometries of a text file, and the CRS that it names.
 
     A comment ``# crs: EPSG:25830`` above the rest names it; for longitude and latitude it is
-    WGS 84.
+    WGS 84. A point of a table whose height is empty has none.
     """
     lines = tables.read_lines(path)
     numbered = enumerate(lines, start=1)
-    used = [(n, line) for n, line in numbered if line.strip() and line.lstrip()[0] != "#"]
-    if not used:
+    texts = [(n, line) for n, line in numbered if line.strip() and line.lstrip()[0] != "#"]
+    if not texts:
         raise bad_file(path, "vector.empty", "is empty.")
-    is_wkt = _WKT.match(used[0][1])
-    geometries, crs = (_from_wkt(path, used), None) if is_wkt else _from_table(path)
-    return geometries, tables.stated_crs(lines[:20]) or crs
-
-
-def _from_wkt(path: Path, lines: list[tuple[int, str]]) -> Geometries:
-    """Return the geometry of each numbered line."""
-    geometries = np.empty(len(lines), dtype=object)
-    for row, (line, text) in enumerate(lines):
+    if not _WKT.match(texts[0][1]):
+        kinds = ("x", "y"), ("longitude", "latitude"), ("wkt",)
+        table = tables.read_table(path, *kinds, spellings=COLUMNS)
+        if not table.has("wkt"):
+            # degrees of x and y are those of the CRS
+            unit = ["" if one in tables.DEGREES else one for one in table.unit]
+            is_degrees = not table.has("x", "y")
+            axes = ("longitude", "latitude") if is_degrees else ("x", "y")
+            table = replace(table, unit=unit)
+            plan, z = table.of(axes), table.where_there(("z",))[:, 0]
+            points = np.asarray(shapely.points(np.column_stack([plan, z])))
+            geometries = np.where(np.isfinite(z), points, shapely.force_2d(points))
+            return geometries, tables.stated_crs(lines[:20]) or (WGS84 if is_degrees else None)
+        texts = list(zip(table.line, table.column("wkt"), strict=True))
+    geometries = np.empty(len(texts), dtype=object)
+    for row, (line, text) in enumerate(texts):
         try:
             geometries[row] = shapely.from_wkt(text.strip())
         except (shapely.errors.ShapelyError, ValueError) as error:
             why = str(error).split(":", 1)[-1].strip()
             sentence = f"line {line} is not WKT ({why}). Write one complete geometry a line."
             raise bad_file(path, "vector.wkt", sentence, line=line) from error
-    return geometries
-
-
-def _from_table(path: Path) -> tuple[Geometries, str | None]:
-    """Return the points, or the geometries, of a table; a point whose height is empty has none."""
-    kinds = ("x", "y"), ("longitude", "latitude"), ("wkt",)
-    table = tables.read_table(path, *kinds, spellings=COLUMNS)
-    # degrees of x and y are those of the CRS
-    table = replace(table, unit=["" if one in tables.DEGREES else one for one in table.unit])
-    if table.has("wkt"):
-        return _from_wkt(path, list(zip(table.line, table.column("wkt"), strict=True))), None
-    axes, crs = (("x", "y"), None) if table.has("x", "y") else (("longitude", "latitude"), WGS84)
-    plan, z = table.of(axes), table.where_there(("z",))[:, 0]
-    points = np.asarray(shapely.points(np.column_stack([plan, z])))
-    return np.where(np.isfinite(z), points, shapely.force_2d(points)), crs
+    return geometries, tables.stated_crs(lines[:20])
 
 
 class Shoreline(NamedTuple):
     """Points on the edge of the water, shape (n, 3): metres, the cloud's CRS, z NaN if unknown.
 
     `counts`, shape (n,), is how many independent observations each point is worth: one that was
-    measured or digitised 1, those between the vertices of a digitised line less; see `_worth`.
+    measured or digitised 1, those between the vertices of a digitised line less.
     """
 
     xyz: FloatArray
@@ -263,6 +254,12 @@ def read_shoreline(
     would make the fit look better than it is. A line without heights gives a point at least every
     `SPACING_M`, as each gets a height from the cloud. For the arguments see `read_vectors` and
     `in_cloud_crs`.
+
+    A digitised line is off at each vertex by some amount, and between two vertices by an
+    interpolation of their errors. Straight interpolation between independent errors has two thirds
+    of their variance, so a line of v vertices is worth 2 v / 3 points that scatter like those on
+    it, however many points it is divided into. Nor are points worth more if they are so dense that
+    neighbours get their heights from the same part of the cloud.
     """
     vectors = in_cloud_crs(read_vectors(path, crs=crs), cloud_crs, heights=True)
     parts = _single_parts(vectors.geometries)
@@ -275,32 +272,21 @@ def read_shoreline(
     if count > MOST_POINTS:
         sentence = f"would give {count:.3g} points. Check its CRS and unit, or thin it out."
         raise bad_file(vectors.name, "water.shoreline_too_long", sentence, count=count)
-    given = _vertices(np.concatenate([points, measured]))
-    between = [_vertices(np.array([shapely.segmentize(line, SPACING_M)])) for line in drawn]
-    xyz = np.vstack([given, *between])
-    worth = [_worth(line, len(one)) for line, one in zip(drawn, between, strict=True)]
-    counts = np.concatenate([np.ones(len(given)), *worth])
-    known, notes = xyz[np.isfinite(xyz[:, 2]), 2], vectors.notes
+    found = [_vertices(np.concatenate([points, measured]))]
+    counts = [np.ones(len(found[0]))]
+    for line in drawn:
+        found.append(_vertices(np.array([shapely.segmentize(line, SPACING_M)])))
+        total, vertices = len(found[-1]), float(len(line.coords) - line.is_closed)
+        apart = max(line.length / (2.0 * SHORE_RADIUS_M), 1.0)
+        worth = 2.0 / 3.0 * vertices if vertices < total else vertices
+        counts.append(np.full(total, min(1.0, min(worth, apart) / total)))
+    xyz, notes = np.vstack(found), vectors.notes
+    known = xyz[np.isfinite(xyz[:, 2]), 2]
     if len(known) >= FEW and not known.any():  # a flat drawing
         xyz[:, 2] = np.nan
         sentence = f"{vectors.name}: all {len(known)} heights are exactly 0; they are ignored."
         notes = (*notes, PcfixWarning("water.zero_heights", sentence, count=len(known)))
-    return Shoreline(xyz, vectors.name, notes, counts)
-
-
-def _worth(line: Any, points: int) -> FloatArray:
-    """Return how many independent observations each of the points along a line is worth.
-
-    A digitised line is off at each vertex by some amount, and between two vertices by an
-    interpolation of their errors. Straight interpolation between independent errors has two thirds
-    of their variance, so a line of v vertices is worth 2 v / 3 points that scatter like those on
-    it, however many points it is divided into. Nor are points worth more if they are so dense that
-    neighbours get their heights from the same part of the cloud.
-    """
-    vertices = len(line.coords) - line.is_closed
-    apart = max(line.length / (2.0 * SHORE_RADIUS_M), 1.0)
-    drawn = 2.0 / 3.0 * vertices if vertices < points else float(vertices)
-    return np.full(points, min(1.0, min(drawn, apart) / points))
+    return Shoreline(xyz, vectors.name, notes, np.concatenate(counts))
 
 
 def _single_parts(geometries: Geometries) -> Geometries:
@@ -359,52 +345,46 @@ class Layer(NamedTuple):
     style: str = ""
 
 
-def check_layers(path: Path) -> None:
+def check_layers(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> None:
     """Refuse what `write_layers` cannot write."""
-    if path.suffix.lower() != ".gpkg":
-        sentence = f"{path}: lines are written as GeoPackage. Give a name in .gpkg."
-        raise SettingError("output.suffix", sentence, path=path)
+    check_output(path, overwrite=overwrite, inputs=inputs, suffixes=(".gpkg",))
     load_pyogrio()
 
 
 def write_layers(
     path: File, layers: Sequence[Layer], crs: CRS | str | None, *, overwrite: bool
 ) -> None:
-    """Write layers in a CRS as one GeoPackage."""
-    target = check_output(path, overwrite=overwrite)
+    """Write layers in a CRS as one GeoPackage, with their styles as QGIS stores them."""
+    write, target = load_pyogrio().raw.write, check_output(path, overwrite=overwrite)
     wkt = None if crs is None else parse_crs(crs, "the cloud").to_wkt()
+    styled = [one for one in layers if one.style]
+    names, styles = [one.name for one in styled], [one.style for one in styled]
+    texts = {
+        "f_table_catalog": "", "f_table_schema": "", "f_geometry_column": "geom",
+        "f_table_name": names, "styleName": names, "styleQML": styles, "styleSLD": "",
+        "description": "pcfix", "owner": "",
+    }  # fmt: skip
+    columns = {name: np.full(len(styled), value, object) for name, value in texts.items()}
+    columns["useAsDefault"] = np.ones(len(styled), bool)
+    columns["update_time"] = np.full(len(styled), "2020-01-01", "datetime64[ms]")
     with temporary_output(target) as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a cloud may have no CRS
         try:
             for number, one in enumerate(layers):
                 geometry = shapely.to_wkb(np.array([*one.geometries, None], object)[:-1])
-                load_pyogrio().raw.write(
+                write(
                     temporary, geometry, [np.asarray(v) for v in one.values.values()],
                     list(one.values), layer=one.name, crs=wkt, driver="GPKG",
                     geometry_type=one.kind, append=number > 0,
                     **({} if number else {"dataset_options": OLDER}),
                 )  # fmt: skip
-            if styled := [one for one in layers if one.style]:
-                load_pyogrio().raw.write(
-                    temporary, None, *_styles(styled), layer=STYLES, driver="GPKG", append=True,
-                    crs=None, geometry_type=None,
+            if styled:
+                write(
+                    temporary, None, [*columns.values()], [*columns], layer=STYLES, driver="GPKG",
+                    append=True, crs=None, geometry_type=None,
                 )  # fmt: skip
         except RuntimeError as error:
             raise cannot_write(target, error, temporary) from error
-
-
-def _styles(layers: Sequence[Layer]) -> tuple[list[Any], list[str]]:
-    """Return the columns of the table of styles as QGIS writes it, and their names."""
-    columns: dict[str, Any] = {
-        "f_table_catalog": "", "f_table_schema": "", "f_geometry_column": "geom",
-        "f_table_name": [one.name for one in layers], "styleName": [one.name for one in layers],
-        "styleQML": [one.style for one in layers], "styleSLD": "", "description": "pcfix",
-        "owner": "",
-    }  # fmt: skip
-    fields = {name: np.full(len(layers), value, object) for name, value in columns.items()}
-    fields["useAsDefault"] = np.ones(len(layers), bool)
-    fields["update_time"] = np.full(len(layers), "2020-01-01", "datetime64[ms]")
-    return [*fields.values()], [*fields]
 
 
 def read_frame(path: Path, layer: str) -> GeoDataFrame:

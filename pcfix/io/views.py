@@ -1,32 +1,26 @@
 """Read view lists, which say which cameras contributed to each point of a dense cloud.
 
-Read a list with `read_views`, or make one of tie points with `track_views`; then `ViewMatch` gives
+Read a list with `read_views`, or make one of tie points with `track_views`. `ViewMatch` then gives
 its cameras to the rows of a cloud, chunk by chunk.
 
 COLMAP's stereo fusion writes ``fused.ply.vis`` next to ``fused.ply``. It is little-endian: a uint64
-number of points; then for each vertex of ``fused.ply`` a uint32 number of images and their uint32
-numbers, counted from 0 (COLMAP's source, mvs/fusion.cc and mvs/model.cc). The dense PLY of OpenMVS,
-and so of ODM, has two lists at each vertex: ``view_indices``, image numbers from 0, and
-``view_weights`` (OpenMVS's source, libs/MVS/PointCloud.cpp and apps/InterfaceCOLMAP). Both name the
-images whose depth maps were fused at the point, not the images that these were matched against.
+number of points; then for each point a uint32 number of images and their uint32 numbers, from 0
+(COLMAP's source, mvs/fusion.cc and mvs/model.cc). The dense PLY of OpenMVS, and so of ODM, has two
+lists at each vertex: ``view_indices``, image numbers from 0, and ``view_weights`` (OpenMVS's
+source, libs/MVS/PointCloud.cpp). Both name the images whose depth maps were fused at the point.
 
-An image number counts in the order of the dense matcher, which the list does not state:
-
-- COLMAP counts the registered images of its sparse model, not IMAGE_ID: in some versions in the
-  order of ``images.bin`` or ``images.txt``, in others by ascending IMAGE_ID, and with rigs by
-  ascending FRAME_ID (``Reconstruction::RegImageIds``).
-- OpenMVS uses the order of its importer: that of ``images.txt`` for InterfaceCOLMAP, that of the
-  shots of the undistorted reconstruction for OpenSfM's exporter (ODM).
-
-So every order that a sparse model next to the list allows is a candidate, then that of the given
-cameras, and the frames decide: nearly every listed camera must have the apparent point in its
-frame. With numbers off by one, a quarter of the cameras of an ordinary block do not.
+An image number counts in the order of the dense matcher, which the list does not state. COLMAP
+counts the registered images of its sparse model: in some versions in the order of ``images.bin`` or
+``images.txt``, in others by ascending IMAGE_ID, and with rigs by ascending FRAME_ID
+(``Reconstruction::RegImageIds``). OpenMVS counts as its importer does, mostly in the order of
+``images.txt``. So every order that a sparse model next to the list allows is a candidate, then that
+of the given cameras. The geometry decides: nearly every listed camera must have the apparent point
+in its frame. With numbers off by one, a quarter of the cameras of an ordinary block do not.
 
 A row of the cloud gets the list of the same row if its position agrees to a fraction of the point
-spacing. Every other row gets the list of the nearest point within a tolerance, which is as strict:
-on a real dense cloud, points 5 cm apart hardly have a camera in common. A list without positions
-is matched by row number; then the numbers of points must agree, and the listed cameras must have
-the points in their frames, chunk by chunk.
+spacing, else the list of the nearest point within a tolerance. This is as strict, because on a real
+dense cloud points 5 cm apart hardly have a camera in common. A list without positions is matched by
+row number. Then the numbers of points must agree, and the geometry is tested chunk by chunk.
 """
 
 from __future__ import annotations
@@ -53,12 +47,26 @@ from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, Views
 from pcfix.options.declare import File
 from pcfix.sums import LEAST, MOST, SAME, Sums
 
-COLMAP_LIST = "COLMAP view list"
 _HEAD = 8
 _IMAGES, _WEIGHTS = "view_indices", "view_weights"
 _OTHERS = (b"LASF", b"MVSI", b"PK\x03\x04", b"SQLi")
 """The first bytes of files that people give instead: clouds, scenes, archives, databases."""
 _REMEDY = "Give COLMAP's fused.ply.vis or OpenMVS's dense PLY, as the software wrote it."
+LEAST_SHARE = 0.95
+"""Of listed cameras whose frame holds the point: 1.00 on a real dense cloud, 0.75 with image
+numbers off by one, 0.4 in a random order."""
+MARGIN = 0.02
+"""Of the frame's sides: other lens models or adjustments move an edge by less."""
+SAMPLE_POINTS = 20_000
+_PLACES = (".", "sparse", "sparse/0")
+_FRAME_HEAD, _DATA = struct.Struct("<II7dI"), struct.Struct("<iIQ")
+_SAME = 0.05
+"""A fraction of the spacing within which two positions are those of one point."""
+_ROUNDING = 1.01 * np.sqrt(3.0)
+"""Of three coordinates that are each off by half a step, relative to that half step."""
+_MANY = 0.1
+"""A share of points without a list from which on the user is warned."""
+_NEIGHBOURS = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,12 +122,13 @@ def read_views(path: File, cameras: Cameras, *, to_cloud: Points | None = None) 
         head = stream.read(4)
     if head in _OTHERS:
         raise bad_file(found, "views.not_one", f"is not a view list. {_REMEDY}")
-    vis, read = found.with_name(f"{found.name}.vis"), _openmvs
+    vis = found.with_name(f"{found.name}.vis")
     if not head.startswith(b"ply"):
-        read = _colmap
+        views = _colmap(found)
     elif read_header(found).item(_IMAGES, is_list=True) is None and vis.is_file():
-        found, read = vis, _colmap
-    views = read(found)
+        views = _colmap(vis)
+    else:
+        views = _openmvs(found)
     return _placed(replace(views, orders=image_orders(views, cameras)), cameras, to_cloud)
 
 
@@ -153,15 +162,8 @@ def _placed(views: ViewList, cameras: Cameras, to_cloud: Points | None) -> ViewL
         return views
     xyz = views.xyz if to_cloud is None else to_cloud(views.xyz)
     xyz = np.ascontiguousarray(xyz, np.float64)
-    try:
-        placed = replace(views, xyz=xyz, spacing_m=spacing_m(xyz))
-        return fitted(placed, cameras, xyz, np.arange(len(views)))
-    except InputError:
-        if views.what != COLMAP_LIST:
-            raise
-    sentence = f"{views.path}: the PLY file beside it is in another frame and is not used."
-    note = PcfixWarning("views.other_frame", sentence, path=views.path)
-    return replace(views, xyz=None, notes=(*views.notes, note))
+    placed = replace(views, xyz=xyz, spacing_m=spacing_m(xyz))
+    return fitted(placed, cameras, xyz, np.arange(len(views)))
 
 
 def _colmap(path: Path) -> ViewList:
@@ -175,7 +177,7 @@ def _colmap(path: Path) -> ViewList:
     if not count or records is None or _HEAD + records.end < path.stat().st_size:
         sentence = f"is no complete COLMAP view list of {count:,} points. {_REMEDY}"
         raise bad_file(path, "views.damaged", sentence, points=count)
-    raw = ViewList(path, COLMAP_LIST, _listed(path, records))
+    raw = ViewList(path, "COLMAP view list", _listed(path, records))
     bare = path.with_suffix("")
     ply = bare if bare.suffix.lower() == ".ply" else bare.with_suffix(".ply")
     if not ply.is_file():
@@ -234,19 +236,6 @@ def _listed(path: Path, records: Records) -> Views:
     return Views(start, image, kind="depth-maps")
 
 
-LEAST_SHARE = 0.95
-"""Of listed cameras whose frame holds the point: 1.00 on a real dense cloud, 0.75 with image
-numbers off by one, 0.4 in a random order."""
-
-MARGIN = 0.02
-"""Of the frame's sides: other lens models or adjustments move an edge by less."""
-
-SAMPLE_POINTS = 20_000
-
-_PLACES = (".", "sparse", "sparse/0")
-_FRAME_HEAD, _DATA = struct.Struct("<II7dI"), struct.Struct("<iIQ")
-
-
 def image_orders(raw: ViewList, cameras: Cameras) -> tuple[ImageOrder, ...]:
     """Return the orders that the image numbers may follow, the most likely first."""
     found = []
@@ -272,39 +261,33 @@ def image_orders(raw: ViewList, cameras: Cameras) -> tuple[ImageOrder, ...]:
 
 
 def _orders(model: Path) -> list[tuple[str, list[str]]]:
-    """Return the orders of the images of a sparse model, and their names."""
+    """Return the orders of the images of a sparse model, and their names.
+
+    See https://colmap.github.io/format.html for ``frames.bin``, which models with rigs have.
+    """
     paths = [model / f"images.{suffix}" for suffix in ("bin", "txt")]
     path = next((path for path in paths if path.is_file()), None)
     if path is None:
         return []
     images = read_images(path, points=False)
     name = {image.identifier: image.name for image in images}
-    by_frame = [name[i] for i in _by_frame(model) if i in name]
-    orders = [
-        (f"the frames of {model}", by_frame if len(by_frame) == len(images) else []),
-        (f"the images of {model}", [image.name for image in images]),
-        (f"the images of {model} by IMAGE_ID", [name[i] for i in sorted(name)]),
-    ]
+    orders = []
+    if (model / "frames.bin").is_file():
+        data, at, frames = (model / "frames.bin").read_bytes(), _HEAD, {}
+        for _ in range(*struct.unpack_from("<Q", data)):
+            frame_id, *_, count = _FRAME_HEAD.unpack_from(data, at)
+            at += _FRAME_HEAD.size
+            entries = [_DATA.unpack_from(data, at + _DATA.size * i) for i in range(count)]
+            at += _DATA.size * count
+            frames[frame_id] = sorted(
+                (sensor, image) for kind, sensor, image in entries if not kind
+            )
+        by_frame = [name[image] for i in sorted(frames) for _, image in frames[i] if image in name]
+        if len(by_frame) == len(images):
+            orders.append((f"the frames of {model}", by_frame))
+    orders.append((f"the images of {model}", [image.name for image in images]))
+    orders.append((f"the images of {model} by IMAGE_ID", [name[i] for i in sorted(name)]))
     return [(what, names) for what, names in orders if names]
-
-
-def _by_frame(model: Path) -> list[int]:
-    """Return the image ids of a model with rigs by their frames, in the order of COLMAP.
-
-    See https://colmap.github.io/format.html for ``frames.bin``.
-    """
-    path = model / "frames.bin"
-    if not path.is_file():
-        return []
-    data, at, frames = path.read_bytes(), 8, {}
-    for _ in range(*struct.unpack_from("<Q", data)):
-        frame_id, *_, images = _FRAME_HEAD.unpack_from(data, at)
-        at += _FRAME_HEAD.size
-        end = at + _DATA.size * images
-        entries = [_DATA.unpack_from(data, place) for place in range(at, end, _DATA.size)]
-        frames[frame_id] = sorted((sensor, image) for kind, sensor, image in entries if kind == 0)
-        at = end
-    return [image for i in sorted(frames) for _, image in frames[i]]
 
 
 def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -> ViewList:
@@ -317,41 +300,25 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -
         return replace(views, orders=views.orders[:1])
     step = max(1, len(rows) // SAMPLE_POINTS)
     some = views.listed.take(rows[::step])
-    seen_xyz = np.repeat(xyz[::step], np.diff(some.start), axis=0)
-    shares = [share_seen(cameras, order.camera[some.camera], seen_xyz) for order in views.orders]
-    known = [(share, i) for i, share in enumerate(shares) if share is not None]
-    if not known:
+    points = np.repeat(xyz[::step], np.diff(some.start), axis=0)
+    sizes = np.array([(lens.width, lens.height) for lens in cameras.lenses])
+    shares = []
+    for order in views.orders:
+        camera = order.camera[some.camera].astype(np.int64)
+        known = np.flatnonzero(camera >= 0)
+        if len(known):
+            size = sizes[camera[known]]
+            image_xy = straight_images(points[known], camera[known], cameras)
+            inside = (image_xy >= -MARGIN * size) & (image_xy <= (1.0 + MARGIN) * size)
+            shares.append((float(np.mean(inside.all(axis=1))), order))
+    if not shares:
         return views
-    share, best = max(known, key=lambda pair: pair[0])
+    share, best = max(shares, key=lambda pair: pair[0])
     if share < LEAST_SHARE:
         sentence = f"only {100 * share:.0f} % of the listed cameras have their point in the frame."
         sentence += " Put the sparse model beside the list, or give its offset (--cameras-offset)."
         raise bad_file(views.path, "views.other_images", sentence, share=share)
-    return replace(views, orders=(views.orders[best],), share_seen=share)
-
-
-def share_seen(cameras: Cameras, camera: npt.NDArray[np.int32], xyz: FloatArray) -> float | None:
-    """Return the share of cameras whose frame holds their point, None without any.
-
-    `camera`, shape (m,), has rows of cameras with rotations and lenses, of which negative ones do
-    not count; `xyz`, shape (m, 3), the point of each.
-    """
-    known = np.flatnonzero(camera >= 0)
-    if not len(known):
-        return None
-    size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera[known]]
-    image_xy = straight_images(xyz[known], camera[known].astype(np.int64), cameras)
-    inside = (image_xy >= -MARGIN * size) & (image_xy <= (1.0 + MARGIN) * size)
-    return float(np.mean(inside.all(axis=1)))
-
-
-_SAME = 0.05
-"""A fraction of the spacing within which two positions are those of one point."""
-_ROUNDING = 1.01 * np.sqrt(3.0)
-"""Of three coordinates that are each off by half a step, relative to that half step."""
-_MANY = 0.1
-"""A share of points without a list from which on the user is warned."""
-_NEIGHBOURS = 20_000
+    return replace(views, orders=(best,), share_seen=share)
 
 
 class ViewMatch:
@@ -372,15 +339,10 @@ class ViewMatch:
         self._tree: Any = None  # a cKDTree of the list's positions, when one is needed
         if views.xyz is not None:
             # a match may be off by the rounding of both files, or by a share of the spacing
-            spacing_m = views.spacing_m or 0.0
             rounding_m = _ROUNDING * (step_m / 2 + views.resolution_m)
+            spacing_m = views.spacing_m or 0.0
             self.tolerance_m = max(rounding_m, views.tolerance_spacings * spacing_m)
             self._same_m = max(rounding_m, _SAME * spacing_m)
-            if rounding_m > spacing_m / 2:
-                sentence = f"{views.path}: positions are rounded to {rounding_m:.2g} m, for points"
-                sentence += f" {spacing_m:.2g} m apart. Points may get lists of their neighbours."
-                values = {"rounding_m": rounding_m, "spacing_m": spacing_m}
-                self.notes.append(PcfixWarning("views.rounding", sentence, **values))
         elif points != len(views):
             sentence = f"has {len(views):,} points, the cloud {points}. Put its PLY file beside it."
             values = {"listed": len(views), "points": points}
@@ -432,11 +394,11 @@ class ViewMatch:
     ) -> IntArray:
         """Return the list's row of each point, -1 if it has none, and count the matches."""
         row = np.full(len(xyz), -1)
-        beside = listed[first_row : first_row + len(xyz)]
-        apart_m = np.linalg.norm(beside - xyz[: len(beside)], axis=1)
-        near = apart_m <= self._same_m
-        row[: len(beside)][near] = first_row + np.flatnonzero(near)
-        report.by_row = int(np.count_nonzero(near))
+        same_row = listed[first_row : first_row + len(xyz)]
+        apart_m = np.linalg.norm(same_row - xyz[: len(same_row)], axis=1)
+        near = np.flatnonzero(apart_m <= self._same_m)
+        row[near] = first_row + near
+        report.by_row = len(near)
         rest = np.flatnonzero(row < 0)
         if not len(rest):
             return row

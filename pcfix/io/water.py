@@ -11,6 +11,7 @@ PROJ can only guess.
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -182,6 +183,8 @@ _UNITS_M = {
     "us-ft": 1200.0 / 3937.0, "ftus": 1200.0 / 3937.0, "us survey foot": 1200.0 / 3937.0,
 }  # fmt: skip
 MOST_CELLS = 50_000_000
+ROUGH_DEG = 3.0
+"""A slope by noise alone that moves a point by more than one percent of its depth."""
 _EDGE_POINTS = 33
 _AT_ONCE = 1_000_000
 
@@ -230,6 +233,15 @@ def read_water_raster(
         near = None if bounds is None else from_cloud(_edge(bounds))
         heights, t, more = _read(source, name, near)
     title = name.replace("\\", "/").rpartition("/")[2]
+    # noise of the cells, against their neighbours: waves are smooth over a few cells
+    around = (heights[:-2, 1:-1] + heights[2:, 1:-1] + heights[1:-1, :-2] + heights[1:-1, 2:]) / 4
+    noise = np.abs(heights[1:-1, 1:-1] - around)
+    noise_m = 1.48 * float(np.nanmedian(noise)) if np.isfinite(noise).any() else 0.0
+    slope_deg = math.degrees(math.atan(noise_m / math.sqrt(abs(t.determinant))))
+    if slope_deg > ROUGH_DEG:
+        sentence = f"{name}: the water surface is rough ({noise_m:.2f} m, slopes of {slope_deg:.0f}"
+        sentence += " degrees). Smooth it, or fit a level to it."
+        more += (PcfixWarning("water.rough", sentence, noise_m=noise_m),)
     for note in notes + more:
         warnings.warn(note, stacklevel=3)
     if to_cloud is None and t.b == t.d == 0.0 and t.a > 0.0 > t.e:  # north-up in the cloud's CRS

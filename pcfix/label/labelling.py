@@ -51,6 +51,8 @@ class LabelCounts(Sums):
     water_surface: int = 0  # of class 41 now because they are in the band
     stale: int = 0  # class 40 or 41 in the input and neither now; set to 1 with `reset`
     water_unknown: int = 0  # without a known height of the water
+    # depth of the point that is nearest to the water surface, negative above it, metres
+    least_m: float = field(default=np.inf, metadata=LEAST)
     # points below the water, how many of them are excluded, and their corners
     below: int = 0
     outside_mask: int = 0
@@ -143,6 +145,7 @@ class Labelling:
             water_surface=int(at_surface.sum()),
             stale=int((before & ~(wet | at_surface)).sum()),
             water_unknown=int(np.isnan(part.surface.height_m).sum()),
+            least_m=float(np.fmin.reduce(part.surface.height_m - part.xyz[:, 2], initial=np.inf)),
         )
 
     def _is_respected(self, classes: Classes) -> BoolArray:

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from pcfix.io.cameras import read_cameras
 from pcfix.io.tides import (
     ImageTimes,
     TideTable,
@@ -21,9 +20,7 @@ from pcfix.io.tides import (
 from tests.utils.codes import refused
 from tests.utils.shared import needs
 
-pytestmark = pytest.mark.quick_but(
-    "test_any_gauge_zero", "test_exif", "test_heights_in_a_metashape_project"
-)
+pytestmark = pytest.mark.quick_but("test_any_gauge_zero", "test_exif")
 
 CAMERAS, real = needs("cameras")
 
@@ -168,12 +165,3 @@ def test_heights_in_images(tmp_path, text):
     for place in (tmp_path, tmp_path / "cameras.csv"):
         found = read_altitudes(place, ["folder/a", "b", "c"])
         np.testing.assert_array_equal(found, [30.1, np.nan, np.nan])
-
-
-@real
-def test_heights_in_a_metashape_project():
-    path = CAMERAS / "metashape" / "easyidp_wheat_psx" / "wheat_tanashi.psx"
-    found = read_altitudes(path, read_cameras(path).labels)
-    assert len(found) == 138
-    assert found[:3].tolist() == [30.0, 29.9, 29.8]
-    assert np.ptp(found) < 2.0

@@ -63,7 +63,7 @@ class Source:
     @cached_property
     def text(self) -> str:
         """The first bytes as text, without a byte order mark."""
-        return self.head.decode("utf-8-sig", errors="replace")
+        return tables.decoded(self.head)
 
     @cached_property
     def names(self) -> frozenset[str]:

@@ -51,20 +51,16 @@ class Column:
     description: str  # in the file, at most 31 letters
     saturates: bool = False  # the largest value means "or more"
     least: int | None = None  # in steps of the scale
-    earlier: str = ""  # another type, which earlier versions wrote where the values needed it
 
 
 COLUMNS = (
-    Column("ShiftX", "shift_m", "int32", 0.0, "true minus apparent X", earlier="int16"),
-    Column("ShiftY", "shift_m", "int32", 0.0, "true minus apparent Y", earlier="int16"),
-    Column("ShiftZ", "shift_m", "int32", 0.0, "true minus apparent Z", earlier="int16"),
+    Column("ShiftX", "shift_m", "int32", 0.0, "true minus apparent X"),
+    Column("ShiftY", "shift_m", "int32", 0.0, "true minus apparent Y"),
+    Column("ShiftZ", "shift_m", "int32", 0.0, "true minus apparent Z"),
     # a submerged point is never at zero depth
-    Column("WaterDepth", "depth_m", "uint32", 0.001, "below the water surface, m", least=1,
-           earlier="uint16"),
-    Column("RayMiss", "ray_miss_m", "uint16", 0.0001, "rms distance from the rays, m", True,
-           earlier="uint32"),
-    Column("SigmaZ", "sigma_z_m", "uint16", 0.0001, "formal standard error of Z, m", True,
-           earlier="uint32"),
+    Column("WaterDepth", "depth_m", "uint32", 0.001, "below the water surface, m", least=1),
+    Column("RayMiss", "ray_miss_m", "uint16", 0.0001, "rms distance from the rays, m", True),
+    Column("SigmaZ", "sigma_z_m", "uint16", 0.0001, "formal standard error of Z, m", True),
     Column("Incidence", "incidence_deg", "uint16", 0.1, "largest angle in air, deg"),
     Column("RayCount", "ray_count", "uint16", 1.0, "rays intersected", True),
     Column("SourceClass", "", "uint8", 1.0, "class before the correction"),

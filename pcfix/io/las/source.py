@@ -11,7 +11,7 @@ import math
 import os
 import struct
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -49,7 +49,10 @@ _ONE_STREAM, _LAYERED = 1, 3
 """Compressors of LAZ: one without chunks, and one that stores the dimensions separately."""
 _VARIABLE_CHUNKS = 2**32 - 1
 _PANIC = "PanicException"
-"""What lazrs raises, too, where the packed points make no sense; it is under no name to import."""
+"""lazrs raises this, too, if the compressed points are damaged; it cannot be imported."""
+_OTHER_CLOUDS = {b"ply\n": "PLY", b"ply\r": "PLY", b"ASTM": "E57"}
+_UNITS, _OWN_CODE = {9001: "metre", 9002: "foot", 9003: "US survey foot"}, 32767
+"""GeoTIFF codes of units (EPSG), and the least of the codes that only a user knows."""
 
 MOST_SCALE_M = 1000.0
 """Largest step of coordinates that a header may state."""
@@ -64,9 +67,6 @@ CHUNK_POINTS = 400_000
 
 CHUNK_BYTES = 500_000_000
 """The same where records are so long that fewer points are as much."""
-
-KEPT_BYTES = 200_000_000
-"""Point records of a cloud that are kept when it is gone through more than once."""
 
 
 Box = tuple[float, float, float, float]
@@ -205,6 +205,9 @@ def las_errors(path: Path) -> Iterator[None]:
             raise
         reason = str(error).strip().rstrip(".") or type(error).__name__
         sentence = f"is damaged, or is not a LAS or LAZ file ({reason}). Export or copy it again."
+        if "PointWise" in reason:
+            sentence = "has the point-wise compression of early LASzip versions, which pcfix cannot"
+            sentence += " read. Convert it with LAStools (laszip) or CloudCompare."
         raise bad_file(path, "cloud.damaged", sentence) from error
 
 
@@ -218,23 +221,14 @@ class LasSource:
     """
 
     def __init__(
-        self,
-        path: File,
-        jobs: int | None = None,
-        *,
-        kept: list[laspy.ScaleAwarePointRecord] | None = None,
-        part: CloudPart | None = None,
+        self, path: File, jobs: int | None = None, *, part: CloudPart | None = None
     ) -> None:
-        """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable.
-
-        The chunks of a small cloud are put into `kept`, for the next reader, and must not be
-        changed.
-        """
+        """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable."""
         self.path, self.part = check_input(path), part
         with las_errors(self.path):
             with self.path.open("rb") as stream:
-                if stream.read(4) in (b"ply\n", b"ply\r"):
-                    sentence = "is a PLY file. Convert it to LAZ with CloudCompare or PDAL."
+                if other := _OTHER_CLOUDS.get(stream.read(4)):
+                    sentence = f"is a {other} file. Convert it to LAZ with CloudCompare or PDAL."
                     raise bad_file(self.path, "cloud.ply", sentence)
                 self.vlrs, self.evlrs = read_records(stream)
                 stream.seek(IDENTITY_PLACE)
@@ -252,7 +246,6 @@ class LasSource:
             self.header = copy(self.header)
             self.header.point_count = part.points
             self.header.mins, self.header.maxs = part.mins, part.maxs
-        self._kept = kept if len(self) * self.header.point_format.size <= KEPT_BYTES else None
 
     def __enter__(self) -> LasSource:
         return self
@@ -276,46 +269,40 @@ class LasSource:
         if stated == 0:
             raise bad_file(self.path, "cloud.empty", "contains no points.")
         # points that the header does not count would be lost
-        packed = self.header.are_points_compressed
-        least, most = self._points_of_chunks() if packed else self._points_of_records()
+        least, most = self._points_held()
         if not least <= stated <= most:
             held = f"{least:,}" if least == most else f"{least:,} to {most:,}"
             sentence = f"its header counts {stated:,} points, but it holds {held}. Export it again."
             raise bad_file(self.path, "cloud.count", sentence, stated=stated)
 
-    def _points_of_records(self) -> tuple[int, float]:
-        """Return how many point records fit between the header and what follows the points.
+    def _points_held(self) -> tuple[int, float]:
+        """Return the least and the largest number of points that the file may hold.
 
-        Zeros behind the last point are padding. A file that is cut short is found on reading.
+        A file that is cut short is found on reading.
         """
-        stated, size = len(self), self.header.point_format.size
-        start = self.header.offset_to_point_data
-        ends = [self.path.stat().st_size]
-        for name in ("start_of_first_evlr", "start_of_waveform_data_packet_record"):
-            place = getattr(self.header, name, None) or 0
-            ends += [place] if place > start else []
-        held = (min(ends) - start) // size
-        if held > stated:
+        start, record = self.header.offset_to_point_data, self.header.point_format.size
+        size = self.path.stat().st_size
+        if not self.header.are_points_compressed:
+            for name in ("start_of_first_evlr", "start_of_waveform_data_packet_record"):
+                place = getattr(self.header, name, None) or 0
+                size = min(size, place) if place > start else size
+            held = (size - start) // record
             with self.path.open("rb") as stream:
-                stream.seek(start + stated * size)
-                held = held if any(stream.read(size)) else stated
-        return held, np.inf
-
-    def _points_of_chunks(self) -> tuple[int, float]:
-        """Return the least and the largest number of points that the chunks of a LAZ file hold."""
+                stream.seek(start + len(self) * record)
+                is_padded = held > len(self) and not any(stream.read(record))
+            return len(self) if is_padded else held, np.inf
         laszip = next((v.record_data for v in self.vlrs if v.user_id == "laszip encoded"), b"")
         (compressor,) = struct.unpack_from("<H", laszip)
         (chunk_points,) = struct.unpack_from("<I", laszip, 12)
         if compressor == _ONE_STREAM or chunk_points == _VARIABLE_CHUNKS:
             return 0, np.inf
-        start, size = self.header.offset_to_point_data + 8, self.path.stat().st_size
         with self.path.open("rb") as stream:
-            stream.seek(start - 8)
+            stream.seek(start)
             (table,) = struct.unpack("<q", stream.read(8))
             if table == -1:  # written by software that cannot seek backwards
                 stream.seek(-8, os.SEEK_END)
                 (table,) = struct.unpack("<q", stream.read(8))
-            if not start <= table <= size - 8:
+            if not start + 8 <= table <= size - 8:
                 raise ValueError(f"its chunk table is at byte {table:,} of {size:,}")
             stream.seek(table + 4)
             (chunks,) = struct.unpack("<I", stream.read(4))
@@ -323,43 +310,21 @@ class LasSource:
                 raise ValueError(f"{chunks:,} chunks in {table - start:,} bytes")
             last = 1
             if compressor == _LAYERED:  # these chunks state their number of points
-                stream.seek(start - 8)
+                stream.seek(start)
                 sizes = [size for _, size in lazrs.read_chunk_table(stream, lazrs.LazVlr(laszip))]
-                stream.seek(start + sum(sizes[:-1]) + self.header.point_format.size)
+                stream.seek(start + 8 + sum(sizes[:-1]) + record)
                 (last,) = struct.unpack("<I", stream.read(4))
         return (chunks - 1) * chunk_points + last, chunks * chunk_points
 
-    def chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
-        """Yield all points, in order, at most `CHUNK_POINTS` at a time, or a larger node of COPC.
+    def chunks(self, part: CloudPart | None = None) -> Iterator[laspy.ScaleAwarePointRecord]:
+        """Yield all points, or those of a part, in order, at most `CHUNK_POINTS` at a time.
 
-        An `InputError` if the file ends before its last point.
+        A larger node of COPC is one chunk. An `InputError` if the file ends before its last point.
         """
-        if self._kept is not None:
-            if sum(map(len, self._kept)) == len(self):
-                yield from self._kept
-                return
-            self._kept.clear()
-        some = self._all_chunks() if self.part is None else self.chunks_within(self.part)
-        for points in some:
-            if self._kept is not None:
-                self._kept.append(points)
-            yield points
-
-    def _all_chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
-        read = 0
-        most = max(1, min(CHUNK_POINTS, CHUNK_BYTES // self.header.point_format.size))
-        while read < self.points_of_file:
-            with las_errors(self.path):
-                points = self._reader.read_points(most)
-            if len(points) < min(most, self.points_of_file - read):
-                held = f"{read + len(points):,} of {self.points_of_file:,} points"
-                sentence = f"it ends after {held}. Copy it again."
-                raise bad_file(self.path, "cloud.count", sentence, stated=self.points_of_file)
-            read += len(points)
-            yield points
-
-    def chunks_within(self, part: CloudPart) -> Iterator[laspy.ScaleAwarePointRecord]:
-        """Yield the points of a part, as they are in the file."""
+        part = part or self.part
+        if part is None:
+            yield from self._all_chunks()
+            return
         if part.resolution is not None and not is_copc(self.header):
             sentence = "is not COPC and has no coarser levels to read. Omit --read-resolution."
             raise SettingError("cloud.not_copc", f"{self.path}: {sentence}", path=self.path)
@@ -375,6 +340,19 @@ class LasSource:
                 inside = part.holds(points)
                 if inside.any():
                     yield points[inside]
+
+    def _all_chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
+        read = 0
+        most = max(1, min(CHUNK_POINTS, CHUNK_BYTES // self.header.point_format.size))
+        while read < self.points_of_file:
+            with las_errors(self.path):
+                points = self._reader.read_points(most)
+            if len(points) < min(most, self.points_of_file - read):
+                held = f"{read + len(points):,} of {self.points_of_file:,} points"
+                sentence = f"it ends after {held}. Copy it again."
+                raise bad_file(self.path, "cloud.count", sentence, stated=self.points_of_file)
+            read += len(points)
+            yield points
 
     def dimension(self, points: laspy.ScaleAwarePointRecord, name: str) -> FloatArray:
         """Return one dimension of a chunk, scaled, as float64.
@@ -462,29 +440,51 @@ def read_xyz(path: File) -> FloatArray:
 
 
 def stated_crs(source: LasSource) -> CRS | None:
-    """Return the coordinate system of a cloud, or None; an `InputError` if it cannot be read."""
+    """Return the coordinate system of a cloud, or None; an `InputError` if it cannot be read.
+
+    laspy does not read the vertical part of GeoTIFF keys.
+    """
+    from pyproj import CRS
+    from pyproj.crs import CompoundCRS
     from pyproj.exceptions import CRSError
 
     try:
         with las_errors(source.path):
             crs: CRS | None = source.header.parse_crs()
+        code = _geo_keys(source).get(4096, 0)
+        if crs is not None and len(crs.axis_info) == 2 and 1024 <= code < _OWN_CODE:
+            with suppress(CRSError):  # a code of a datum or an ellipsoid, as earlier software wrote
+                vertical = CRS.from_epsg(code)
+                if vertical.is_vertical:
+                    crs = CRS(CompoundCRS(f"{crs.name} + {vertical.name}", [crs, vertical]))
     except CRSError as error:
         sentence = f"its CRS cannot be read ({shortened(str(error))}). Set it again."
         raise bad_file(source.path, "cloud.crs", sentence) from error
     return crs
 
 
+def _geo_keys(source: LasSource) -> dict[int, int]:
+    """Return the values of the GeoTIFF keys that name the CRS; none if it is WKT."""
+    if any((vlr.user_id, vlr.record_id) == ("LASF_Projection", 2112) for vlr in source.vlrs):
+        return {}
+    listed = source.header.vlrs.get("GeoKeyDirectoryVlr")
+    keys = (key for vlr in listed for key in vlr.geo_keys if key.tiff_tag_location == 0)
+    return {key.id: key.value_offset for key in keys}
+
+
 def metric_crs(source: LasSource) -> CRS | None:
     """Return the coordinate system of a cloud in metres, or None if it states none.
 
-    An `InputError` if its plan coordinates are in degrees, feet or another unit.
+    An `InputError` if its coordinates or heights are in degrees, feet or another unit.
     """
-    crs = stated_crs(source)
-    if crs is None:
-        return None
-    units = {axis.unit_name for axis in crs.axis_info[:2]}
+    crs, keys = stated_crs(source), _geo_keys(source)
+    name, axes = ("", []) if crs is None else (crs.name, crs.axis_info)
+    # GeoTIFF keys may state other units of plan and heights than the CRS has
+    codes = {keys.get(key, 9001) for key in (3076, 4099)}
+    units = {_UNITS.get(code, f"EPSG:{code}") for code in codes if 0 < code < _OWN_CODE}
+    units |= {axis.unit_name for axis in axes}
     if not units.issubset(METRES):
-        unit = " and ".join(sorted(units))
-        sentence = f"its CRS {crs.name} is in {unit}. Reproject the cloud to metres first."
-        raise bad_file(source.path, "cloud.crs_unit", sentence, crs=crs.name)
+        unit = " and ".join(sorted(units.difference(METRES)))
+        sentence = f"its CRS {name} is in {unit}. Reproject the cloud to metres first."
+        raise bad_file(source.path, "cloud.crs_unit", sentence, crs=name)
     return crs

@@ -12,7 +12,6 @@ import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from copy import deepcopy
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +34,8 @@ from pcfix.io.las.source import (
     RecordList,
     append_evlrs,
     backend,
-    las_errors,
     part_report,
+    stated_crs,
 )
 from pcfix.model import FloatArray
 from pcfix.version import __version__
@@ -44,13 +43,10 @@ from pcfix.version import __version__
 EXTRA_BYTES = ("LASF_Spec", 4)
 _EXTRA, _SCALED = struct.Struct("<2xBB32s76xd16xd16x32s"), 0b11000
 """An extra dimension: type, options, name, scale, offset and description; both are given."""
+_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32")
 USER_ID = "pcfix"
-_SETTINGS = (1, "pcfix settings (JSON)")
-BEFORE = (
-    *("version", "point_format", "identity", "global_encoding"),
-    *("offsets", "steps", "added_wkt", "undescribed"),
-)
-"""What the VLR says of the file before the correction."""
+NOTES = {"settings": 1, "cleaning": 2, "labelling": 3}
+"""VLRs of pcfix: one of a correction, and one for each cleaning or labelling."""
 _SEAL = "sha256"
 """Of the rest of what it says: what is not as it was written leads to another cloud."""
 
@@ -68,74 +64,130 @@ def corrected_header(
     `InputError` if the cloud already has a dimension of one of these names, or was corrected
     before.
     """
-    old = source.header
     if any(is_ours(v) for v in source.vlrs):
         sentence = "was already corrected by pcfix. Use the original, or undo it: 'pcfix restore'."
         raise bad_file(source.path, "cloud.corrected", sentence)
-    there = set(old.point_format.dimension_names)
+    there = set(source.header.point_format.dimension_names)
     twice = next((column.name for column in columns if column.name in there), None)
     if twice is not None:
         sentence = f"already has a dimension {twice}. Rename it, or use --dimensions none."
         raise bad_file(source.path, "cloud.dimension_exists", sentence, dimension=twice)
-    params, records = _extra_bytes(columns, old.scales)
-    header, vlrs, described, changes = _upgraded(source, params)
-    header.offsets = old.offsets - np.array(steps) * old.scales
+    part = part_report(source.part)
+
+    def note(before: dict[str, Any]) -> VLR:
+        """Return the VLR of the correction."""
+        settings = {**content, **({} if part is None else {"part": part})}
+        settings["before"] = {**before, "steps": list(steps)}
+        return _note("settings", {**settings, _SEAL: _seal_of(settings)})
+
+    header = _upgraded(source, columns, note)
+    header.offsets = source.header.offsets - np.array(steps) * source.header.scales
+    return header
+
+
+def noted_header(source: LasSource, kind: str, content: dict[str, Any]) -> laspy.LasHeader:
+    """Return the header of a file with other classes or flags: LAS 1.4, its records, and a note."""
+    return _upgraded(source, (), lambda before: _note(kind, content))
+
+
+def _upgraded(
+    source: LasSource, columns: tuple[Column, ...], note: Callable[[dict[str, Any]], VLR]
+) -> laspy.LasHeader:
+    """Return the input's header in LAS 1.4 with dimensions added, and a note of what it was."""
+    old = source.header
+    point_format = laspy.PointFormat(UPGRADE[old.point_format.id])
+    point_format.dimensions.extend(old.point_format.extra_dimensions)
+    described, undescribed = _described(source)
+    for dimension in undescribed:
+        size, name = dimension.num_bits // 8, dimension.name.encode()
+        described.append(_EXTRA.pack(0, size, name, 0.0, 0.0, b""))
+    for column in columns:
+        scale = column_scale(column, old.scales)
+        scaled, offset = (None, None) if scale == 1.0 else (np.array([scale]), np.zeros(1))
+        point_format.add_extra_dimension(
+            laspy.ExtraBytesParams(column.name, column.dtype, column.description, offset, scaled)
+        )
+        number, texts = _TYPES.index(column.dtype) + 1, (column.name, column.description)
+        name, description = (text.encode() for text in texts)
+        options, step = (0, 0.0) if scaled is None else (_SCALED, scale)
+        described.append(_EXTRA.pack(number, options, name, step, 0.0, description))
+    vlrs, crs = list(source.vlrs), None
+    if old.point_format.id < 6 and not old.global_encoding.wkt:  # formats 6 and up want WKT
+        crs = stated_crs(source)
+    if crs is not None:
+        wkt = WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL")).record_data_bytes()
+        vlrs.append(VLR("LASF_Projection", 2112, "OGC COORDINATE SYSTEM WKT", wkt))
     before = {
         "version": str(old.version),
         "point_format": old.point_format.id,
         "identity": source.identity.decode("latin-1"),
         "global_encoding": old.global_encoding.value,
         "offsets": old.offsets.tolist(),
-        "steps": list(steps),
-        **changes,
+        "added_wkt": crs is not None,
+        "undescribed": [dimension.name for dimension in undescribed],
     }
-    part = part_report(source.part)
-    settings = {**content, **({} if part is None else {"part": part}), "before": before}
-    note = _note(_SETTINGS, {**settings, _SEAL: _seal_of(settings)})
-    _set_records(header, [*vlrs, note], described + records)
-    return header
-
-
-def noted_header(source: LasSource, note: VLR) -> laspy.LasHeader:
-    """Return the header of a file with other classes or flags: LAS 1.4, its records, and a note.
-
-    Notes of earlier times stay before it.
-    """
-    header, vlrs, described, _ = _upgraded(source, [])
-    _set_records(header, [*vlrs, note], described)
-    return header
-
-
-def _upgraded(
-    source: LasSource, params: list[laspy.ExtraBytesParams]
-) -> tuple[laspy.LasHeader, list[VLR], bytes, dict[str, Any]]:
-    """Return the input's header in LAS 1.4 with dimensions added, and what is yet to be put in it.
-
-    That is its records and the description of its dimensions; last, what of these is new.
-    """
-    old = source.header
-    header = _copied(old)
-    point_format = laspy.PointFormat(UPGRADE[old.point_format.id])
-    point_format.dimensions.extend(old.point_format.extra_dimensions)
-    for param in params:
-        point_format.add_extra_dimension(param)
     version = max(old.version, laspy.header.Version(1, 4))
+    header = _header(source, version, point_format, [*vlrs, note(before)], described)
+    header.global_encoding.wkt = header.global_encoding.wkt or crs is not None
+    return header
+
+
+def restored_header(source: LasSource, before: dict[str, Any], drop: set[str]) -> laspy.LasHeader:
+    """Return the header that a corrected file had before, by `before` of its own VLR.
+
+    The extra dimensions that pcfix added go: `drop`.
+    """
+    extra = list(source.header.point_format.extra_dimensions)
+    point_format = laspy.PointFormat(before["point_format"])
+    point_format.dimensions.extend(d for d in extra if d.name not in drop)
+    vlrs = [v for v in source.vlrs if not is_ours(v)]
+    if before["added_wkt"]:
+        del vlrs[max(i for i, v in enumerate(vlrs) if v.user_id == "LASF_Projection")]
+    gone = drop.union(before["undescribed"])
+    described = zip(_described(source)[0], extra, strict=False)
+    records = [record for record, dimension in described if dimension.name not in gone]
+    version = laspy.header.Version.from_str(before["version"])
+    header = _header(source, version, point_format, vlrs, records)
+    header.global_encoding.value = before["global_encoding"]
+    header.offsets = np.array(before["offsets"], dtype=np.float64).reshape(3)
+    return header
+
+
+def _described(source: LasSource) -> tuple[list[bytes], list[Any]]:
+    """Return the records of the input's extra dimensions, and the dimensions without a record."""
+    dimensions = list(source.header.point_format.extra_dimensions)
+    data = b"".join(v.record_data for v in source.vlrs if _is_extra_bytes(v))
+    count = len(data) // _EXTRA.size if dimensions else 0
+    records = [data[i * _EXTRA.size : (i + 1) * _EXTRA.size] for i in range(count)]
+    return records, dimensions[count:]
+
+
+def _header(
+    source: LasSource, version: Any, point_format: laspy.PointFormat, vlrs: list[VLR],
+    described: list[bytes],
+) -> laspy.LasHeader:  # fmt: skip
+    """Return a copy of the input's header with another format and other records.
+
+    The description of the extra dimensions stays where it was among these, or comes last. laspy
+    cannot write every name of the system and the software; `las_writer` does.
+    """
+    header = deepcopy(source.header)
+    header.system_identifier = header.generating_software = ""
     header.set_version_and_point_format(version, point_format)
-    vlrs = [v for v in source.vlrs if not _is_layout(v)]
-    crs = None
-    if old.point_format.id < 6 and not header.global_encoding.wkt:  # formats 6 and up want WKT
-        with las_errors(source.path):
-            crs = old.parse_crs()
-    if crs is not None:
-        wkt = WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL")).record_data_bytes()
-        vlrs.append(VLR("LASF_Projection", 2112, "OGC COORDINATE SYSTEM WKT", wkt))
-        header.global_encoding.wkt = True
-    described, undescribed = _extra_bytes_of(source)
-    for dimension in undescribed:
-        size = dimension.num_bits // 8
-        described += _EXTRA.pack(0, size, dimension.name.encode(), 0.0, 0.0, b"")
-    names = [dimension.name for dimension in undescribed]
-    return header, vlrs, described, {"added_wkt": crs is not None, "undescribed": names}
+    places = [i for i, v in enumerate(vlrs) if _is_extra_bytes(v)]
+    # those of LAZ and COPC describe how the input is laid out on disk
+    layout = ("laszip encoded", "copc")
+    records = RecordList(v for v in vlrs if not (_is_extra_bytes(v) or v.user_id in layout))
+    data = b"".join(described)
+    if data and places:
+        head = vlrs[places[0]].head
+        head = head[:20] + struct.pack("<H", len(data)) + head[22:]
+        before = [v for v in vlrs[: places[0]] if v.user_id not in layout]
+        records.insert(len(before), Record(head, data))
+    elif data:
+        records.append(VLR(*EXTRA_BYTES, "Extra Bytes Record", data))
+    header._vlrs = records  # laspy's setter would rewrite some
+    return header
 
 
 def corrected_identity(source: LasSource) -> bytes:
@@ -144,99 +196,17 @@ def corrected_identity(source: LasSource) -> bytes:
     return source.identity[:32] + name + source.identity[64:]  # the generating software
 
 
-def restored_header(source: LasSource, before: dict[str, Any], drop: set[str]) -> laspy.LasHeader:
-    """Return the header that a corrected file had before, by `before` of its own VLR.
-
-    The extra dimensions that pcfix added go: `drop`.
-    """
-    header = _copied(source.header)
-    extra = list(source.header.point_format.extra_dimensions)
-    point_format = laspy.PointFormat(before["point_format"])
-    point_format.dimensions.extend(d for d in extra if d.name not in drop)
-    header.set_version_and_point_format(
-        laspy.header.Version.from_str(before["version"]), point_format
-    )
-    header.global_encoding.value = before["global_encoding"]
-    header.offsets = np.array(before["offsets"], dtype=np.float64).reshape(3)
-    vlrs = [v for v in source.vlrs if not _is_layout(v) and not is_ours(v)]
-    if before["added_wkt"]:
-        last = max(i for i, v in enumerate(vlrs) if v.user_id == "LASF_Projection")
-        del vlrs[last]
-    size = _EXTRA.size
-    records, _ = _extra_bytes_of(source)
-    described = [records[i : i + size] for i in range(0, len(records), size)]
-    gone = drop.union(before["undescribed"])
-    kept = [r for r, d in zip(described, extra, strict=False) if d.name not in gone]
-    _set_records(header, vlrs, b"".join(kept))
-    return header
-
-
-def _extra_bytes(
-    columns: tuple[Column, ...], scales: FloatArray
-) -> tuple[list[laspy.ExtraBytesParams], bytes]:
-    """Return the dimensions for laspy's point format and the bytes of their VLR records."""
-    params, records = [], b""
-    for column in columns:
-        scale = column_scale(column, scales)
-        scaled = None if scale == 1.0 else np.array([scale])
-        offset = None if scale == 1.0 else np.zeros(1)
-        params.append(
-            laspy.ExtraBytesParams(column.name, column.dtype, column.description, offset, scaled)
-        )
-        number = ["uint8", "int8", "uint16", "int16", "uint32", "int32"].index(column.dtype) + 1
-        texts = column.name.encode(), column.description.encode()
-        options, step = (0, 0.0) if scaled is None else (_SCALED, scale)
-        records += _EXTRA.pack(number, options, texts[0], step, 0.0, texts[1])
-    return params, records
-
-
-def _copied(header: laspy.LasHeader) -> laspy.LasHeader:
-    """Return a copy without the names that laspy cannot always write; `las_writer` sets them."""
-    copy = deepcopy(header)
-    copy.system_identifier = copy.generating_software = ""
-    return copy
-
-
-def _is_layout(vlr: VLR) -> bool:
-    """Whether a record describes how this very file is laid out on disk."""
-    return vlr.user_id in ("laszip encoded", "copc")
-
-
 def _is_extra_bytes(vlr: VLR) -> bool:
     return (vlr.user_id, vlr.record_id) == EXTRA_BYTES
 
 
-def _extra_bytes_of(source: LasSource) -> tuple[bytes, list[Any]]:
-    """Return the description of the input's extra dimensions, and those that it leaves out."""
-    dimensions = list(source.header.point_format.extra_dimensions)
-    records = b"".join(v.record_data for v in source.vlrs if _is_extra_bytes(v))
-    count = len(records) // _EXTRA.size if dimensions else 0
-    return records[: count * _EXTRA.size], dimensions[count:]
-
-
-def _set_records(header: laspy.LasHeader, vlrs: list[VLR], described: bytes) -> None:
-    """Put records in the header, past laspy's setter, which would rewrite some.
-
-    The description of the extra bytes stays where it was, or comes last.
-    """
-    places = [i for i, v in enumerate(vlrs) if _is_extra_bytes(v)]
-    records = [v for v in vlrs if not _is_extra_bytes(v)]
-    if described and places:
-        head = vlrs[places[0]].head
-        head = head[:20] + struct.pack("<H", len(described)) + head[22:]
-        records.insert(places[0], Record(head, described))
-    elif described:
-        records.append(VLR(*EXTRA_BYTES, "Extra Bytes Record", described))
-    header._vlrs = RecordList(records)
-
-
 def is_ours(vlr: VLR) -> bool:
     """Whether a VLR is the one that says how a file was corrected."""
-    return bool(vlr.user_id == USER_ID and vlr.record_id == _SETTINGS[0])
+    return bool(vlr.user_id == USER_ID and vlr.record_id == NOTES["settings"])
 
 
-def _note(record: tuple[int, str], content: dict[str, Any]) -> VLR:
-    return VLR(USER_ID, *record, _json(content))
+def _note(kind: str, content: dict[str, Any]) -> VLR:
+    return VLR(USER_ID, NOTES[kind], f"pcfix {kind} (JSON)", _json(content))
 
 
 def _json(content: dict[str, Any]) -> bytes:
@@ -245,11 +215,6 @@ def _json(content: dict[str, Any]) -> bytes:
 
 def _seal_of(content: dict[str, Any]) -> str:
     return hashlib.sha256(_json(content)).hexdigest()[:16]
-
-
-# a file has one of these for each cleaning or labelling
-cleaning_vlr = partial(_note, (2, "pcfix cleaning (JSON)"))
-labelling_vlr = partial(_note, (3, "pcfix labelling (JSON)"))
 
 
 def own_settings(vlrs: Iterable[VLR]) -> Any:
@@ -265,10 +230,8 @@ def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any]:
     """
     with record_errors(path):
         content: dict[str, Any] | None = own_settings(vlrs)
-        if content is not None:
-            _ = content["settings"]["dimensions"], [content["before"][key] for key in BEFORE]
-            if content.pop(_SEAL) != _seal_of(content):
-                raise ValueError("its checksum differs")
+        if content is not None and content.pop(_SEAL) != _seal_of(content):
+            raise ValueError("its checksum differs")
     if content is None:
         sentence = "was not corrected by pcfix; there is nothing to undo."
         raise bad_file(path, "cloud.not_corrected", sentence)
