@@ -354,7 +354,15 @@ def block_of(material: Material, ties: TiePoints, sigma_px: float) -> Block:
     ties = replace(ties, xyz=true_start(ties.xyz, water, n, wet))
     sigma, more = np.full(len(ties.views.camera), sigma_px), dict[str, Any]()
     if control is not None:
-        _check_under_water(control, water, material.level_sigma_m)
+        deep = [] if water is None else used_as_dry(control, water, material.level_sigma_m)
+        if deep:
+            raise GeometryError(
+                "gcps.under_water",
+                f"Control points below the water surface are not marked as under water:"
+                f" {', '.join(deep)}. Put yes into the column under_water, or check the height"
+                " datum and the water level.",
+                points=deep,
+            )
         marks, of_marks = marks_of(control)
         conditions, under_water, xyz = _on_surfaces(material, control, marks, m)
         views = Views(
@@ -404,26 +412,17 @@ def _on_surfaces(
     return Conditions(names, rows, sigma_m, material.parallel), under_water, xyz
 
 
-def _check_under_water(
-    control: GroundControl, water: WaterSurface | None, level_sigma_m: float
-) -> None:
-    """Refuse points far below the water surface that are not marked as under water."""
-    if water is None:
-        return
+def used_as_dry(
+    control: GroundControl, water: WaterSurface, level_sigma_m: float = 0.0
+) -> list[str]:
+    """Return the names of points below the water that are not marked as under water.
+
+    As control points of an adjustment without water they bend it: the images show them higher.
+    """
     level = surface_above(water, control.xyz).height_m
     least = level - 3.0 * np.hypot(control.sigma_m[:, 2], level_sigma_m)
     deep = (control.xyz[:, 2] < least) & ~control.under_water
-    if deep.any():
-        i = int(np.argmax(deep))
-        raise GeometryError(
-            "gcps.under_water",
-            f"Control point {control.names[i]} (height {control.xyz[i, 2]:.3f} m) lies below the"
-            f" water surface ({level[i]:.3f} m), but is not marked as under water. Put yes into the"
-            " column under_water, or check the height datum and the water level.",
-            point=control.names[i],
-            height_m=float(control.xyz[i, 2]),
-            level_m=float(level[i]),
-        )
+    return [control.names[i] for i in np.flatnonzero(deep)]
 
 
 def gnss_with_sigma(

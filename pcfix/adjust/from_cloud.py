@@ -33,7 +33,6 @@ from scipy.special import chdtri
 
 from pcfix.adjust.block import (
     Block,
-    LogRow,
     Progress,
     Unknowns,
     check_datum,
@@ -48,10 +47,9 @@ from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import (
     Problem,
     Solution,
-    counts_of,
     intersect_fixed,
+    log_row,
     prepare,
-    priors_at,
     solved_cameras,
     survey_cost,
 )
@@ -269,13 +267,12 @@ def solve_unaware(
         if moved is None or not size < LARGE_STEP_M:
             break
         now = moved
-        cost = survey_cost(problem, now) + priors_at(problem, now)[0]
-        row = LogRow(1, number, *counts_of(problem, now))
+        row = log_row(problem, now.state, 1, number)
         log.append(row)
         if progress is not None:
             progress(row)
         if size < CLOSE_M:
-            return replace(now, cost=cost, log=log)
+            return replace(now, cost=survey_cost(problem, now), log=log)
     raise _unsolved(f"the steps do not converge (last step {size:.2g} m)")
 
 
@@ -297,18 +294,17 @@ OWN_SIGMA_M = 1.0
 LEAST_IMAGES_OF_POINT, LEAST_POINTS, LEAST_IMAGES = 3, 10, 5
 
 
-class Mended(NamedTuple):
-    """The poses if they had absorbed the refraction, and the errors that this implies."""
+class Unbent(NamedTuple):
+    """The poses if they had absorbed the refraction, and the error that this implies."""
 
     cameras: Cameras  # those with enough points
     row: IntArray  # (k,), their rows among all cameras
-    land_m: FloatArray  # (m,), by how much land is too low now
-    bed_m: FloatArray  # (w,), the same of the bed after its correction with the present poses
+    error_m: float  # RMS, heights of the land now, or if there is none of the corrected bed
 
 
-def mended(
+def unbent(
     xyz: FloatArray, cameras: Cameras, water: WaterSurface, refractive_index: float
-) -> Mended:
+) -> Unbent:
     """Return the poses that an adjustment with water would have found; the block stays in place.
 
     Parameters
@@ -335,5 +331,6 @@ def mended(
     trial = _trial(CloudBlock(block, cameras, ties.xyz), Unknowns(lens=("f",)), SIGMA_PX, None)
     problem, found = trial.problem, trial.found
     higher = found.state.xyz[:, 2] + problem.origin[2] - intersect_fixed(block).xyz[:, 2]
-    known = np.isfinite(higher)
-    return Mended(solved_cameras(problem, found), row, higher[~wet & known], higher[wet & known])
+    is_land = ~wet if (~wet & np.isfinite(higher)).any() else wet
+    error_m = float(np.sqrt(np.nanmean(higher[is_land] ** 2)))
+    return Unbent(solved_cameras(problem, found), row, error_m)

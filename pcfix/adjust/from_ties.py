@@ -87,11 +87,8 @@ def adjust_ties(
         if weak or more:
             clean, now = _with_lens(clean, now, (*kept, *more), outliers, progress)
             problem, now, precision = _settled(clean, now, LAST_ROUND + 2, estimate, progress)
-    factor, shared = disagreement_of(problem, now, precision)
-    factor = factor * common_errors(problem, precision)
+    factor = disagreement_of(problem, now, precision) * common_errors(problem, precision)
     precision = precision_of(problem, now, precision.sigma0, factor)
-    quality = weighed(clean, now)[1] if estimate else []
-    notes += [*quality, *shared]
     counted = np.isfinite(block.sigma_px) & problem.of_ties
     share = 1.0 - float(problem.used[counted].mean())
     if share >= MANY_OUT:
@@ -152,7 +149,7 @@ def _settled(
     """
     if estimate:
         problem = with_sigma(problem, noise_px(problem, now, robust=False))
-        problem = weighed(problem, now)[0]
+        problem = weighed(problem, now)
     now = solve(problem, now, number=number, progress=progress)
     return problem, now, precision_of(problem, now, sigma0_of(problem, now))
 

@@ -303,12 +303,8 @@ SIGMAS, OF_GNSS = 3.0, 2.0
 """An offset is reported if it exceeds so many of its standard errors, and so many standard
 deviations of a position: smaller ones come from fixed lens parameters, and move the bed by less."""
 
-WEAK, FEW = 3.0, 6
-"""A datum is weak if the standard error of a centre exceeds so many of a position, or (adjusted by
-the cloud) if there are fewer positions and control points."""
-
-IN_LINE = 0.1
-"""Spread of positions across a line, over that along it, below which they lie on it."""
+FEW = 6
+"""GNSS positions and control points; fewer hardly determine the weight of a cloud."""
 
 BED_GSD = 1.5
 """Standard error of the heights of the bed, in ground pixels, that is worth a warning."""
@@ -345,65 +341,45 @@ def offset_of(found: Adjusted) -> tuple[FloatArray, FloatArray] | None:
 
 
 def datum_notes(found: Adjusted) -> list[PcfixWarning]:
-    """Return warnings if GNSS positions are a weak datum, or have a significant offset."""
+    """Return warnings if GNSS positions are few for a cloud, or have a significant offset."""
     known = np.isfinite(found.gnss_residual_m)
     if not known.any() or found.unknowns.poses != "free" or found.unknowns.free_network:
         return []
-    stated_m = float(np.median(found.block.gnss_sigma_m[known]))
-    places, line = _line(found)
-    control = sum(row.role == "control" for row in found.control)
-    notes, values = [], {"gnss": len(places), "control": control}
-    what = f"{len(places)} GNSS positions{', on a line,' if line is not None else ''} and {control}"
-    remedy = "Give positions of more images, spread over the block, or control points."
-    if found.source == "cloud" and len(places) + control < FEW:
-        words = f"Only {what} control points determine the weight of the cloud. {remedy}"
-        notes.append(PcfixWarning("gnss.few", words, **values))
-    if found.precision is None or found.source == "cloud":
-        return notes
-    sigma = found.precision.centre_sigma_m.max(axis=1)
-    if sigma.max() > WEAK * stated_m:
-        image = found.cameras.labels[int(sigma.argmax())]
-        words = (
-            f"{what} control points are a weak datum: the largest standard error of a projection"
-            f" centre is {sigma.max():.2f} m ({image}), that of a position {stated_m:.2f} m."
-            f" {remedy}"
+    if found.source == "cloud":
+        count, control = (
+            int(known.all(axis=1).sum()),
+            sum(r.role == "control" for r in found.control),
         )
-        more = {"sigma_m": float(sigma.max()), "image": image, "in_line": line is not None}
-        notes.append(PcfixWarning("gnss.weak", words, **values, **more))
+        if count + control >= FEW:
+            return []
+        words = (
+            f"Only {count} GNSS positions and {control} control points determine the weight of the"
+            " cloud. Give positions of more images, spread over the block, or control points."
+        )
+        return [PcfixWarning("gnss.few", words, gnss=count, control=control)]
+    stated_m = float(np.median(found.block.gnss_sigma_m[known]))
     offset_m, sigma_m = offset_of(found) or (np.zeros(3), np.zeros(3))
     is_off = np.abs(offset_m) > np.maximum(SIGMAS * sigma_m, OF_GNSS * stated_m)
-    if is_off.any():
-        parts = [
-            f"{abs(m):.2f} m {side[int(m < 0.0)]} the projection centres (standard error"
-            f" {sigma:.2f} m)"
-            for m, sigma, side, off in zip(offset_m, sigma_m, SIDES, is_off, strict=True)
-            if off
-        ]
-        level = ""
-        if is_off[2] and found.water is not None:
-            level = f", or a water level that is too {'low' if offset_m[2] > 0.0 else 'high'}"
-        words = (
-            f"The GNSS positions lie {' and '.join(parts)}: an antenna lever arm, another"
-            f" datum{level}. The block followed them. Correct them, or omit them if there are"
-            " control points."
-        )
-        more = {"offset_m": offset_m.tolist(), "sigma_m": sigma_m.tolist()}
-        notes.append(PcfixWarning("gnss.offset_found", words, **more))
-    return notes
-
-
-def _line(found: Adjusted) -> tuple[FloatArray, FloatArray | None]:
-    """Return the GNSS positions that were used, and the direction of the line they lie on."""
-    places = found.block.gnss_xyz[np.isfinite(found.gnss_residual_m[:, :2]).all(axis=1)]
-    if len(places) < 2:
-        return places, None
-    off = places[:, :2] - places[:, :2].mean(axis=0)
-    _, spread, axes = np.linalg.svd(off, full_matrices=False)
-    return places, np.append(axes[0], 0.0) if spread[1] < IN_LINE * spread[0] else None
+    if not is_off.any():
+        return []
+    parts = [
+        f"{abs(m):.2f} m {side[int(m < 0.0)]} the projection centres (standard error {sigma:.2f} m)"
+        for m, sigma, side, off in zip(offset_m, sigma_m, SIDES, is_off, strict=True)
+        if off
+    ]
+    level = ""
+    if is_off[2] and found.water is not None:
+        level = f", or a water level that is too {'low' if offset_m[2] > 0.0 else 'high'}"
+    words = (
+        f"The GNSS positions lie {' and '.join(parts)}: an antenna lever arm, another datum{level}."
+        " The block followed them. Correct them, or omit them if there are control points."
+    )
+    more = {"offset_m": offset_m.tolist(), "sigma_m": sigma_m.tolist()}
+    return [PcfixWarning("gnss.offset_found", words, **more)]
 
 
 def bed_notes(found: Adjusted) -> list[PcfixWarning]:
-    """Return a warning if the heights of the bed are imprecise, with the cause."""
+    """Return a warning if the heights of the bed are imprecise."""
     precision, bed = found.precision, found.is_wet & found.is_observed
     if precision is None or precision.point_sigma_m is None or not bed.any():
         return []
@@ -413,24 +389,9 @@ def bed_notes(found: Adjusted) -> list[PcfixWarning]:
     gsd = sigma_m / (away_m / focal)
     if gsd < BED_GSD:
         return []
-    why, (places, line), values = "", _line(found), {"sigma_m": sigma_m, "gsd": gsd}
-    of_focal = precision.sigma_of("f")
-    if line is not None and not any(row.role == "control" for row in found.control):
-        about = np.asarray(found.cameras.rotations) @ line
-        turn = np.einsum("ki,kij,kj->k", about, precision.pose_covariance[:, :3, :3], about)
-        values["tilt_deg"] = float(np.degrees(np.sqrt(np.median(turn))))
-        why = (
-            f" The {len(places)} GNSS positions lie on a line, so the tilt across it has a standard"
-            f" error of {values['tilt_deg']:.2f} deg. Give control points beside it, or fly another"
-            " strip."
-        )
-    elif of_focal is not None and of_focal / focal * away_m > 0.5 * sigma_m:
-        why = (
-            f" Most of it comes from the focal length (standard error {of_focal:.2g}). Give a"
-            " calibrated lens or control points."
-        )
     words = (
         f"The heights of the bed have a standard error of {sigma_m:.2f} m ({gsd:.1f} ground"
-        f" pixels).{why}"
+        " pixels). Give control points, GNSS positions of more images that do not lie on one line,"
+        " or a calibrated lens."
     )
-    return [PcfixWarning("adjust.imprecise_bed", words, **values)]
+    return [PcfixWarning("adjust.imprecise_bed", words, sigma_m=sigma_m, gsd=gsd)]

@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
 
 from pcfix.adjust.block import CODES, INDEX, PORT, SHAPE, lens_parameter, moved_lens, words_of
 from pcfix.adjust.normal import point_covariances
@@ -157,9 +156,6 @@ LIMITS = {
 LEAST_BEND_M = 0.02
 """Standard error of the curvature of the water from which it is undetermined, as the level's."""
 
-SURE = 0.01
-"""Probability that flat water appears to be curved by chance."""
-
 
 def correlated(precision: Precision) -> list[PcfixWarning]:
     """Return a warning for each two unknowns that are hardly separated, the strongest first.
@@ -196,7 +192,7 @@ def undetermined(precision: Precision) -> list[PcfixWarning]:
 
 
 def shape_notes(precision: Precision, wet_xy: FloatArray) -> list[PcfixWarning]:
-    """Return a warning if a free shape of the water is undetermined, or a plane.
+    """Return a warning if a free shape of the water is undetermined.
 
     Parameters
     ----------
@@ -210,22 +206,16 @@ def shape_notes(precision: Precision, wet_xy: FloatArray) -> list[PcfixWarning]:
     x, y = wet_xy.T
     terms, plane = np.column_stack([x * x, x * y, y * y]), np.column_stack([np.ones(len(x)), x, y])
     terms = terms - plane @ np.linalg.lstsq(plane, terms, rcond=None)[0]
-    by, sigma = np.array([[precision.shared[i].added, precision.shared[i].sigma] for i in rows]).T
+    sigma = np.array([precision.shared[i].sigma for i in rows])
     covariance = precision.correlation[np.ix_(rows, rows)] * sigma * sigma[:, None]
-    chi2 = float(by @ np.linalg.solve(covariance, by))
-    bend = float(np.sqrt(np.mean((terms @ by) ** 2)))
     error = float(np.sqrt(np.mean(np.einsum("mi,ij,mj->m", terms, covariance, terms))))
-    figures = (
-        f"curvature {1000.0 * bend:.2g} mm (RMS over the bed), standard error"
-        f" {1000.0 * error:.2g} mm. Remove shape from --free"
-    )
-    code, words = "adjust.flat", f"the water is not curved: {figures}."
-    if error > LEAST_BEND_M:
-        code = "adjust.shape_undetermined"
-        words = f"the shape of the water is undetermined: {figures}, or mark waterline points."
-    elif chi2 > chdtri(len(rows), SURE):
+    if error <= LEAST_BEND_M:
         return []
-    return [PcfixWarning(code, words, bend_m=bend, sigma_m=error)]
+    words = (
+        "the shape of the water is undetermined: the curvature over the bed has a standard error of"
+        f" {1000.0 * error:.2g} mm. Remove shape from --free, or mark waterline points."
+    )
+    return [PcfixWarning("adjust.shape_undetermined", words, sigma_m=error)]
 
 
 # The ensemble

@@ -13,7 +13,6 @@ from pcfix.adjust.block import (
     INDEX,
     LEAST_VIEWS,
     NAMES,
-    NO_CONDITIONS,
     PORT,
     SHAPE,
     WATER,
@@ -32,9 +31,10 @@ from pcfix.adjust.problem import (
     Problem,
     Solution,
     intersect_fixed,
+    intersected,
+    off_surfaces,
     port_of,
     solved_cameras,
-    surface_distances,
     surface_numbers,
     water_of,
 )
@@ -150,19 +150,11 @@ def adjusted_of(
 
 def _with_check_points(problem: Problem, now: Solution) -> FloatArray:
     """Return the points, world frame, with check points intersected from the adjusted cameras."""
-    block, xyz = problem.block, now.state.xyz + problem.origin
-    rows = block.tie_points + np.flatnonzero(block.is_check)
-    rows = rows[np.diff(block.start)[rows] >= LEAST_VIEWS]
-    if len(rows) == 0:
-        return xyz
-    whole = replace(
-        block, cameras=solved_cameras(problem, now), xyz=xyz, water=water_of(problem, now.state),
-        conditions=NO_CONDITIONS, port=port_of(block, now.state.water),
-        refractive_index=float(now.state.water[INDEX]),
-        sigma_px=np.where(np.isin(block.owner, rows), 1.0, np.inf),
-    )  # fmt: skip
-    xyz[rows] = intersect_fixed(whole).xyz[rows]
-    return xyz
+    block, owner = problem.block, problem.block.owner
+    is_check = np.isin(owner, block.tie_points + np.flatnonzero(block.is_check))
+    several = np.diff(block.start)[owner] >= LEAST_VIEWS
+    checks = problem.weighted(np.where(is_check & several, 1.0, 0.0))
+    return intersected(checks, now.state)[0].xyz + problem.origin
 
 
 def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlRow]:
@@ -182,19 +174,18 @@ def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlR
 def _on_surfaces(problem: Problem, now: Solution) -> list[Plain]:
     """Return the stated and found distances of marked points from each surface, metres."""
     given, block, found = problem.block.conditions, problem.block, list[Plain]()
-    if not len(given.on):
-        return []
-    off = np.where(np.diff(block.start) > 0, surface_distances(problem, now), np.nan)
+    points, left = off_surfaces(problem, now.state)
+    off_m = left * given.sigma_m[points]
     for number, name in enumerate((WATER, *given.names)):
-        rows = np.flatnonzero((given.on == number) & np.isfinite(off))
-        if len(rows):
-            worst = rows[np.argmax(np.abs(off[rows]))]
+        is_on = given.on[points] == number
+        if is_on.any():
+            worst = points[is_on][np.abs(off_m[is_on]).argmax()]
             found.append({
                 "surface": name,
-                "points": len(rows),
-                "sigma_m": rms(given.sigma_m[rows]),
-                "rms_m": rms(off[rows]),
-                "largest_m": abs(off[worst]),
+                "points": is_on.sum(),
+                "sigma_m": rms(given.sigma_m[points[is_on]]),
+                "rms_m": rms(off_m[is_on]),
+                "largest_m": np.abs(off_m[is_on]).max(),
                 "largest_point": block.control_names[worst - block.tie_points],
             })  # fmt: skip
     return found
@@ -281,10 +272,9 @@ def rms(values: FloatArray) -> FloatArray:
 
 def _counts(a: Adjusted) -> Plain:
     """Return the numbers of points and of observations."""
-    roles, observed = [row.role for row in a.control], a.is_observed
-    ties = len(a.xyz) - len(a.block.is_check)  # check points are among the last ones
-    is_check = np.concatenate([np.zeros(ties, np.bool_), a.block.is_check])
-    of_check = is_check[a.block.owner]
+    roles, observed, block = [row.role for row in a.control], a.is_observed, a.block
+    is_check = np.zeros(len(a.xyz), np.bool_)
+    is_check[len(a.xyz) - len(block.is_check) :] = block.is_check
     return {
         "points": {
             "all": observed.sum(),
@@ -296,9 +286,7 @@ def _counts(a: Adjusted) -> Plain:
         },
         "observations": {
             "used": a.used.sum(),
-            "left_out": (~a.used & ~of_check).sum(),
-            "of_check_points": of_check.sum(),
-            "out_of_sight": (np.isnan(a.residual_px).any(axis=1) & a.used).sum(),
+            "left_out": (~a.used & ~is_check[block.owner]).sum(),
         },
     }
 
@@ -332,8 +320,6 @@ def _lens(a: Adjusted) -> list[Plain]:
             unknown = NAMES[code] if len(groups) == 1 else f"{NAMES[code]} of sensor {place}"
             rows.append({
                 "sensor": first.sensor or f"sensor {place}",
-                "images": len(images),
-                "lenses": len({original[i] for i in images}),
                 "name": NAMES[code],
                 "before": lens_parameter(first, code),
                 "after": lens_parameter(after, code),

@@ -28,7 +28,6 @@ from pcfix.adjust.normal import UNDAMPED, residuals, sparse_matrix, sparse_rows_
 from pcfix.adjust.precision import Precision
 from pcfix.adjust.problem import Problem, Solution, water_of
 from pcfix.adjust.solve import reduced_at, solver
-from pcfix.errors import PcfixWarning
 from pcfix.model import FloatArray, IntArray
 from pcfix.water.surface import surface_above
 
@@ -40,9 +39,6 @@ SURE = 0.99
 
 MOST_TILES, POINTS_PER_TILE, FRAME_TILES = 400, 25, 48
 ALONE, FRAME = "observations of different quality", "places in the frame"
-NOTED = 0.44
-"""Variance by the frame, over the formal one, that is worth a note: standard errors 1.2 times."""
-
 LEAST_GROUPS = 10
 """Fewer groups do not give a variance."""
 
@@ -52,64 +48,37 @@ shifts features with their slope, and outliers of the original adjustment are mi
 Focal length and principal point absorb it, so that poses and bed are right, and residuals do not
 show it. Rendered blocks, whose lens is known, had up to 1.5 times this."""
 
-POSE = ("angle about x", "angle about y", "angle about z", "centre x", "centre y", "centre z")
 
+def disagreement_of(problem: Problem, found: Solution, formal: Precision) -> FloatArray:
+    """Return by which factors standard errors must grow for shared errors, shape (6 + g,).
 
-def disagreement_of(
-    problem: Problem, found: Solution, formal: Precision
-) -> tuple[FloatArray, list[PcfixWarning]]:
-    """Return by which factors standard errors must grow for shared errors, and a warning.
-
-    Parameters
-    ----------
-    formal : Precision
-        From the normal matrix.
-
-    Returns
-    -------
-    factor : array, shape (6 + g,)
-        For the parameters of `POSE` and the shared unknowns.
-    notes : list of PcfixWarning
+    They are those of the angles and centres of all poses, and of the shared unknowns; `formal` is
+    the precision by the normal matrix.
     """
     groups, added = _groups_by_sharing(problem, found), np.zeros(6 + len(problem.names))
     counts = {words: len(np.unique(group)) for words, group in groups.items()}
     matrix, right = reduced_at(problem, found)
     solve_for, spread = solver(matrix), problem.spread(found.state)
     if counts[ALONE] < LEAST_GROUPS or solve_for is None:
-        return 1.0 + added, []
+        return 1.0 + added
     drawn = np.random.default_rng(1).normal(0.0, formal.sigma0, problem.given.image_xy.shape)
     *pulls, field, rest = _pulls_of(problem, found, groups, drawn)
     # the first group is that of drawn residuals, whose variances are by chance
     by_chance, *shares = (_share_of(problem, formal, solve_for(spread.T @ p.T)) for p in pulls)
-    shared = list[str]()
     for words, share in zip(groups, shares, strict=False):
         is_more = share > fdtri(counts[words] - 1, counts[ALONE] - 1, SURE) * by_chance
         if counts[words] < LEAST_GROUPS or not is_more.any():
             continue
         more = np.where(is_more, share - by_chance, 0.0)
-        added, shared = added + more, [*shared, words]
+        added = added + more
         if words == ALONE:
             by_chance = by_chance + more
     if counts[FRAME] >= LEAST_GROUPS:
         field = field @ spread
         rest -= field @ solve_for(np.column_stack([field.T, right]))
         likely = _likely_field(problem, groups[FRAME], formal.sigma0, rest) @ field
-        more = _share_of(problem, formal, solve_for(likely.T))
-        added = added + more
-        shared += [FRAME] if (more > NOTED).any() else []
-    factor = np.sqrt(1.0 + added)
-    if not shared:
-        return factor, []
-    worst = (*POSE, *problem.names)[int(np.argmax(factor))]
-    note = PcfixWarning(
-        "adjust.shared_errors",
-        f"Errors are shared by {', '.join(shared)}. Standard errors include them; they grow up to"
-        f" {factor.max():.1f} times ({worst}).",
-        groups=shared,
-        factor=float(factor.max()),
-        worst=worst,
-    )
-    return factor, [note]
+        added = added + _share_of(problem, formal, solve_for(likely.T))
+    return np.sqrt(1.0 + added)
 
 
 def common_errors(problem: Problem, formal: Precision) -> FloatArray:
@@ -246,29 +215,28 @@ LEAST_RATIO = 1.2
 """Of standard deviations; below it other weights would gain a fiftieth of a standard error."""
 
 
-def weighed(problem: Problem, now: Solution) -> tuple[Problem, list[PcfixWarning]]:
-    """Weight tie points by the noise of their group, and return a warning if groups differ.
+def weighed(problem: Problem, now: Solution) -> Problem:
+    """Weight tie points by the noise of their group, if groups differ.
 
     Each side of the water and each sensor has its own variance of unit weight: weighted squares
     over its share of the redundancy, of which each point takes three. Groups whose variances differ
     (F-test), and by enough to matter, are weighted by their own (Foerstner 1979, one step).
     """
-    given, block, noise = problem.given, problem.block, dict[str, float]()
+    given, block, groupings = problem.given, problem.block, list[IntArray]()
     weight, owner, water = given.weight, block.owner, water_of(problem, now.state)
-    sensors = [f"of sensor {i}" for i in range(1, int(given.group.max()) + 2)]
-    groupings = [(sensors, given.group[given.camera])]
     if water is not None:
         xyz = now.state.xyz + problem.origin
         wet = block.wet & (surface_above(water, xyz).height_m > xyz[:, 2])
-        groupings.insert(0, (["on land", "under water"], wet[owner].astype(np.int64)))
+        groupings.append(wet[owner].astype(np.int64))
+    groupings.append(given.group[given.camera])
     r = residuals(now.state, given)
     used = problem.of_ties & problem.used & np.isfinite(r).all(axis=1)
     square = (np.where(used[:, None], r, 0.0) ** 2).sum(axis=1)
     redundancy = 2.0 - 3.0 / np.maximum(np.bincount(owner, used)[owner], 2.0)
-    for names, group in groupings:
-        rows = [used & (group == i) for i in range(len(names))]
+    for group in groupings:
+        rows = [used & (group == i) for i in range(int(group.max()) + 1)]
         points = np.array([len(np.unique(owner[row])) for row in rows])
-        if len(names) < 2 or points.min() < LEAST_POINTS:
+        if len(rows) < 2 or points.min() < LEAST_POINTS:
             continue
         free = np.array([redundancy[row].sum() for row in rows])
         each = [(square[row] * weight[row] ** 2).sum() for row in rows] / free
@@ -279,14 +247,4 @@ def weighed(problem: Problem, now: Solution) -> tuple[Problem, list[PcfixWarning
         weight = weight.copy()
         for row, variance in zip(rows, each, strict=True):
             weight[row] /= np.sqrt(variance)
-        px = np.sqrt([square[row].sum() for row in rows] / free).tolist()
-        noise |= dict(zip(names, px, strict=True))
-    if not noise:
-        return problem, []
-    words = ", ".join(f"{px:.2f} px {name}" for name, px in noise.items())
-    note = PcfixWarning(
-        "adjust.noise_differs",
-        f"The noise of tie points differs: {words}. Each group is weighted by its own.",
-        noise_px=noise,
-    )
-    return problem.weighted(weight), [note]
+    return problem.weighted(weight)

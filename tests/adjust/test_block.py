@@ -142,7 +142,7 @@ def test_control_under_water():
     control = scene().control
     assert control.under_water.any()
     silent = replace(control, under_water=np.zeros(len(control.names), bool))
-    name = control.names[int(np.argmax(control.under_water))]
-    with refused("gcps.under_water", point=name):
+    names = [control.names[i] for i in np.flatnonzero(control.under_water)]
+    with refused("gcps.under_water", points=names):
         gathered(control=silent)
     assert gathered(control=silent, water=None).control_names == control.names

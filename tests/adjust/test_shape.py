@@ -77,14 +77,10 @@ def test_noise():
     assert np.mean(chi2) == pytest.approx(6.0, abs=3.0 * np.sqrt(12.0 / repeats))
 
 
-@pytest.mark.parametrize(
-    ("points", "bend", "sigma_px", "code"),
-    [(600, (0.0, 0.0, 0.0), None, "adjust.flat"), (60, BEND, 8.0, "adjust.shape_undetermined")],
-)
-def test_notes(points, bend, sigma_px, code):
-    made = scene(points, tuple(bend))
-    _, found, precision = adjusted(block_of(made, control=True, sigma_px=sigma_px))
-    assert notes_of(made, found, precision) == [code]
+def test_undetermined_shape():
+    made = scene(60)
+    _, found, precision = adjusted(block_of(made, control=True, sigma_px=8.0))
+    assert notes_of(made, found, precision) == ["adjust.shape_undetermined"]
 
 
 def test_same_as_scipy():
