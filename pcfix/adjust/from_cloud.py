@@ -35,7 +35,6 @@ from pcfix.adjust.block import (
     Block,
     Progress,
     Unknowns,
-    check_datum,
     plain_block,
     some_cameras,
     ties_of_cloud,
@@ -135,41 +134,29 @@ def adjust_cloud(
         gain = (chosen.misfit - more.misfit) / max(chosen.misfit / chosen.redundancy, 1.0)
         if gain > chdtri(extra * len(chosen.problem.groups), SURE):
             chosen = more
-    notes = _notes(chosen, lens_sets)
-    # only GNSS and control points have noise
+    # only GNSS and control points have noise; the precision is about that with tie points of the
+    # standard deviation of the cloud
     sigma0 = float(np.sqrt(chosen.misfit / chosen.redundancy))
-    try:  # about as precise as with tie points of this standard deviation
-        known = precision_of(chosen.problem, chosen.found, max(sigma0, 1.0))
-    except GeometryError as error:
-        known = None
-        words = f"The precision of the poses is unknown, and SigmaZ will not include it: {error}"
-        notes.append(PcfixWarning("adjust.no_precision", words, reason=error.code))
+    known = precision_of(chosen.problem, chosen.found, max(sigma0, 1.0))
+    notes = _notes(chosen, lens_sets)
     found = adjusted_of(chosen.problem, chosen.found, known, notes, "cloud")
     return replace(found, sigma0=sigma0, redundancy=chosen.redundancy)
 
 
 def _check(block: Block, unknowns: Unknowns) -> None:
     """Refuse what needs measured tie points."""
-    check_datum(block, unknowns)
     has_gnss = bool((block.gnss_weights > 0.0).any())
     if (unknowns.free_network and not has_gnss) or unknowns.poses != "free":
-        words = (
-            "Without tie points the poses must be free, and need GNSS positions or control points."
-            " Give --gnss or --gcps, or a model with tie points."
-        )
-        raise GeometryError("adjust.cloud_needs_datum", words)
-    if any(unknowns.water_sigma):
-        words = (
-            "Level, tilt and refractive index can be free with measured tie points only. Give a"
-            " model with tie points, or fix the water."
-        )
-        raise GeometryError("adjust.cloud_needs_water", words)
-    if len(block.conditions.on):
-        words = (
-            "Points on the water or on a plane need measured tie points. Give a model with tie"
-            " points, or remove the roles waterline and on:NAME from --gcps."
-        )
-        raise GeometryError("adjust.cloud_has_conditions", words)
+        code, words = "needs_datum", "the poses must be free, with GNSS positions or control points"
+    elif any(unknowns.water_sigma):
+        code, words = "needs_water", "level, tilt and refractive index must be fixed"
+    elif len(block.conditions.on):
+        code = "has_conditions"
+        words = "points cannot lie on the water or on planes (waterline, on:NAME)"
+    else:
+        return
+    words = f"Without tie points {words}. Change that, or give a model with tie points."
+    raise GeometryError(f"adjust.cloud_{code}", words)
 
 
 def _notes(chosen: Trial, lens_sets: list[tuple[str, ...]]) -> list[PcfixWarning]:
@@ -178,18 +165,17 @@ def _notes(chosen: Trial, lens_sets: list[tuple[str, ...]]) -> list[PcfixWarning
     fixed = dict.fromkeys(name for names in lens_sets for name in names if name not in free)
     words = (
         f"No tie points: {count:,} images of points of the cloud were used with a standard"
-        f" deviation of {chosen.sigma_px:g} px. Lens parameters free: {', '.join(free) or 'none'}"
-        + (f" (undetermined and fixed: {', '.join(fixed)})." if fixed else ".")
+        f" deviation of {chosen.sigma_px:g} px. Lens parameters free: {', '.join(free) or 'none'}."
     )
-    sigma = {"sigma_px": chosen.sigma_px}
-    notes = [PcfixWarning("adjust.by_cloud", words, free=list(free), fixed=list(fixed), **sigma)]
+    values = {"free": list(free), "fixed": list(fixed), "sigma_px": chosen.sigma_px}
+    notes = [PcfixWarning("adjust.by_cloud", words, **values)]
     if chosen.sigma_px >= POOR_PX:
         words = (
             f"Points of the cloud fit GNSS and control points only with {chosen.sigma_px:g} px, so"
             " bed and focal length may be wrong by more than all figures say. Give tie points,"
             " control points or a calibrated lens."
         )
-        notes.append(PcfixWarning("adjust.poor_cloud", words, **sigma))
+        notes.append(PcfixWarning("adjust.poor_cloud", words, sigma_px=chosen.sigma_px))
     return notes
 
 

@@ -55,21 +55,6 @@ _REMEDY = (
 )
 
 
-def unknowns_of(rules: AdjustRules, lens: tuple[str, ...]) -> Unknowns:
-    """Return what is free, with these lens parameters."""
-    tilt = None if rules.sigma_tilt is None else float(np.tan(np.radians(rules.sigma_tilt)))
-    stated = {"level": rules.sigma_level, "tilt": tilt, "index": rules.sigma_index}
-    surface: dict[str, float] = dict.fromkeys(rules.free, np.inf)
-    surface |= {name: sigma for name, sigma in stated.items() if sigma is not None}
-    return Unknowns(
-        poses=rules.poses,
-        fixed_images=rules.fixed_images,
-        lens=lens,
-        surface=surface,
-        free_network=rules.datum == "free",
-    )
-
-
 def adjust_block(
     material: Material,
     rules: AdjustRules,
@@ -99,10 +84,23 @@ def adjust_block(
             " --cloud'."
         )
         raise GeometryError("cameras.no_overlap", words, path=material.name)
-    block = block_of(material, ties, rules.sigma_image or FIRST_SIGMA_PX)
-    unknowns = unknowns_of(rules, lens)
+    tilt = None if rules.sigma_tilt is None else float(np.tan(np.radians(rules.sigma_tilt)))
+    stated = {"level": rules.sigma_level, "tilt": tilt, "index": rules.sigma_index}
+    surface: dict[str, float] = dict.fromkeys(rules.free, np.inf)
+    surface |= {name: sigma for name, sigma in stated.items() if sigma is not None}
+    is_free = rules.datum == "free"
+    unknowns = Unknowns(rules.poses, rules.fixed_images, lens, surface, free_network=is_free)
+    sigma_px, level_sigma_m = rules.sigma_image or FIRST_SIGMA_PX, surface.get("level", 0.0)
+    block = block_of(material, ties, sigma_px, level_sigma_m)
     check_datum(block, unknowns, material.no_gnss)
-    _check_wet(material.water, block.xyz[: len(ties.xyz)])
+    xyz, water = block.xyz[: len(ties.xyz)], material.water
+    wet = len(xyz) if water is None else int((surface_above(water, xyz).height_m > xyz[:, 2]).sum())
+    if wet < SMALL_WATER:
+        words = (
+            f"Only {wet} of {len(xyz):,} points lie below the water, so there is no refraction to"
+            " adjust. Check the water level, or use an ordinary bundle adjustment."
+        )
+        raise GeometryError("water.below_points", words, wet=wet, points=len(xyz))
     kept, notes = _well_seen(material.name, block)
     block = restricted(block, kept)
     if cloud_xyz is None:
@@ -118,34 +116,20 @@ def adjust_block(
             sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), lens]))
         given = CloudBlock(block, some_cameras(original, kept), apparent)
         found = adjust_cloud(given, unknowns, sets, progress)
-    notes += [*_check_dry(material.water, found), *found.notes]
-    if found.precision is not None:
-        notes += [*undetermined(found.precision), *correlated(found.precision)]
-        if found.precision.members is None:
-            words = (
-                f"The block is too large ({len(block.cameras):,} images) for covariances of its"
-                " points, and the correction cannot use the errors of the poses."
-            )
-            notes.append(PcfixWarning("adjust.too_large", words, images=len(block.cameras)))
-        wet = found.is_wet & np.isfinite(found.xyz).all(axis=1)
-        notes += shape_notes(found.precision, (found.xyz - found.problem.origin)[wet, :2])
+    notes += [*_check_dry(water, found), *found.notes]
+    notes += [*undetermined(found.precision), *correlated(found.precision)]
+    if found.precision.members is None:
+        words = (
+            f"The block is too large ({len(block.cameras):,} images) for covariances of its points,"
+            " and the correction cannot use the errors of the poses."
+        )
+        notes.append(PcfixWarning("adjust.too_large", words, images=len(block.cameras)))
+    on_bed = found.is_wet & np.isfinite(found.xyz).all(axis=1)
+    notes += shape_notes(found.precision, (found.xyz - found.problem.origin)[on_bed, :2])
     return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])
 
 
 # Checks of what goes in
-
-
-def _check_wet(water: WaterSurface | None, xyz: FloatArray) -> None:
-    """Check that some points lie below the water."""
-    if water is None:
-        return
-    below = int((surface_above(water, xyz).height_m > xyz[:, 2]).sum())
-    if below < SMALL_WATER:
-        words = (
-            f"Only {below} of {len(xyz):,} points lie below the water, so there is no refraction to"
-            " adjust. Check the water level, or use an ordinary bundle adjustment."
-        )
-        raise GeometryError("water.below_points", words, wet=below, points=len(xyz))
 
 
 def _well_seen(name: str, block: Block) -> tuple[IntArray, list[PcfixWarning]]:
@@ -380,10 +364,10 @@ def datum_notes(found: Adjusted) -> list[PcfixWarning]:
 
 def bed_notes(found: Adjusted) -> list[PcfixWarning]:
     """Return a warning if the heights of the bed are imprecise."""
-    precision, bed = found.precision, found.is_wet & found.is_observed
-    if precision is None or precision.point_sigma_m is None or not bed.any():
+    sigma, bed = found.precision.point_sigma_m, found.is_wet & found.is_observed
+    if sigma is None or not bed.any():
         return []
-    sigma_m = float(np.nanmedian(precision.point_sigma_m[bed, 2]))
+    sigma_m = float(np.nanmedian(sigma[bed, 2]))
     focal = float(np.median([lens.focal for lens in found.cameras.lenses or ()]))
     away_m = float(np.median(found.cameras.centres[:, 2]) - np.median(found.xyz[bed, 2]))
     gsd = sigma_m / (away_m / focal)

@@ -144,21 +144,21 @@ def prepare(
     origin = np.round(cameras.centres.mean(axis=0)) if origin is None else origin
     group, groups = sensor_groups(lenses)
     codes = [usable_codes(lenses[images[0]], unknowns.lens) for images in groups]
-    for what in ("tilt", "shape"):
-        if unknowns.surface.get(what) and isinstance(water, WaterMesh | WaterRaster):
-            words = (
-                f"The {what} of the water can be free for a level or plane only, not for a mesh or"
-                " raster."
-            )
-            raise GeometryError("adjust.fixed_surface", words, unknown=what)
+    free = [what for what in ("level", "tilt", "shape") if unknowns.surface.get(what)]
+    if free and isinstance(water, WaterMesh | WaterRaster):
+        words = (
+            f"The {free[0]} of the water can be free for a level or plane only, not for a mesh or"
+            " raster. Fix it."
+        )
+        raise GeometryError("adjust.fixed_surface", words, unknown=free[0])
     numbers = surface_numbers(block, origin)
     planes, plane_names, axis, alike = _planes(block, origin, numbers)
     # columns of the shared unknowns: lenses, then surface and planes
     first_lens = np.concatenate([[0], np.cumsum([len(one) for one in codes])]).astype(np.int64)
-    free = [sigma != 0.0 for sigma in unknowns.water_sigma]
-    free += [len(WATER_NAMES) + i not in alike for i in range(len(planes))]
-    column = np.full(len(free), -1, np.int64)
-    column[free] = first_lens[-1] + np.arange(sum(free))
+    is_free = [sigma != 0.0 for sigma in unknowns.water_sigma]
+    is_free += [len(WATER_NAMES) + i not in alike for i in range(len(planes))]
+    column = np.full(len(is_free), -1, np.int64)
+    column[is_free] = first_lens[-1] + np.arange(sum(is_free))
     for number, other in alike.items():
         column[number] = column[other]
     names = [
@@ -166,9 +166,7 @@ def prepare(
         for i, of_sensor in enumerate(codes, start=1)
         for code in of_sensor
     ]
-    names += [
-        name for name, is_free in zip((*WATER_NAMES, *plane_names), free, strict=True) if is_free
-    ]
+    names += [name for name, one in zip((*WATER_NAMES, *plane_names), is_free, strict=True) if one]
     shared = len(names)
     names += MOTIONS if unknowns.poses == "similarity" else ()
     row, table = lens_table(lenses)
@@ -304,18 +302,12 @@ def port_row(port: Port | None) -> FloatArray:
 def water_of(problem: Problem, state: State) -> WaterSurface | None:
     """Return the water surface of a state, world frame."""
     water, origin = problem.block.water, problem.origin
+    if not isinstance(water, WaterPlane):
+        return water
+    if problem.given.curved:
+        return _curved_raster(problem, state)
     level, b, c = (float(value) for value in state.water[:3])
-    match water:
-        case WaterPlane() if problem.given.curved:
-            return _curved_raster(problem, state)
-        case WaterPlane():
-            return WaterPlane(level + origin[2] - (b * origin[0] + c * origin[1]), b, c)
-        case WaterRaster() if level:
-            return replace(water, height_m=water.height_m + level)
-        case WaterMesh() if level:
-            return replace(water, vertices=water.vertices + np.array([0.0, 0.0, level]))
-        case _:
-            return water
+    return WaterPlane(level + origin[2] - (b * origin[0] + c * origin[1]), b, c)
 
 
 def _curved_raster(problem: Problem, state: State) -> WaterRaster:

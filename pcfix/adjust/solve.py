@@ -42,7 +42,6 @@ def solve(
     problem: Problem,
     start: Solution,
     loss: int = SQUARES,
-    number: int = 1,
     progress: Progress | None = None,
     close: float = CLOSE,
 ) -> Solution:
@@ -52,8 +51,6 @@ def solve(
     ----------
     loss : int
         `SQUARES`, `HUBER` or `CAUCHY` of `pcfix.adjust.normal`.
-    number : int
-        Of the round, for the log.
     close : float
         Two steps in a row that lower the cost by less than this share end the round.
     """
@@ -65,7 +62,7 @@ def solve(
         )
     damping, up, calm = FIRST_DAMPING, 2.0, 0
     least_cost = EXACT * max(int(problem.used.sum()), 1)
-    log = list(start.log)
+    log, number = list(start.log), 1 + max((row.round for row in start.log), default=0)
     for step in range(MOST_STEPS):
         # raise the damping until a step lowers the cost
         while (

@@ -20,14 +20,7 @@ from pcfix.adjust.block import (
     with_places,
 )
 from pcfix.adjust.block import taken as taken_ties
-from pcfix.adjust.methods import (
-    LEAST_TIES,
-    adjust_block,
-    check_control,
-    check_images,
-    check_marks,
-    unknowns_of,
-)
+from pcfix.adjust.methods import LEAST_TIES, adjust_block, check_control, check_images, check_marks
 from pcfix.adjust.result import Adjusted
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
@@ -124,7 +117,6 @@ def adjust_into(
 ) -> Adjusted:  # fmt: skip
     """Adjust the cameras of some inputs; of the options all others count. See `adjust_cameras`."""
     # 1. The block, its water, and what was surveyed
-    water_unknowns = unknowns_of(given, ())
     if folder is not None:
         known = [*paths_in(inputs), *paths_in(given)]
         check_folder(folder, known, mark=SUMMARY, overwrite=given.overwrite)
@@ -162,8 +154,7 @@ def adjust_into(
     material = Material(
         name, original, water, index_of(given.index, given.index_formula)[0], gnss, control,
         inputs.port, None if given.lens is None else _calibration(given.lens, original),
-        None if mask is None else mask.inside, water_unknowns.surface.get("level", 0.0), reason,
-        given.parallel,
+        None if mask is None else mask.inside, reason, given.parallel,
     )  # fmt: skip
 
     # 2. Tie points as they were measured, or points of the cloud
@@ -278,11 +269,9 @@ def _write(folder: Path, found: Adjusted, model: str) -> None:
     before = before_of(found)
     with temporary_folder(folder) as draft:
         _write_models(draft, found)
-        sigma = found.unknowns.surface
-        moved = sigma.get("level") or sigma.get("shape")
-        if moved and isinstance(found.water, WaterRaster):
+        if found.unknowns.surface.get("shape") and isinstance(found.water, WaterRaster):
             write_water_raster(draft / WATER_FILE, found.water, found.cameras.crs)
-        if found.precision is not None and found.precision.members is not None:
+        if found.precision.members is not None:
             write_members(draft, found.precision.members)
         summary = {"model": model, **adjustment_dict(found, before)}
         text = json.dumps(summary, indent=2, allow_nan=False) + "\n"

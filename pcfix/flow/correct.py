@@ -198,7 +198,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     counts = figures.as_dict()
     if options.unsure != "withhold":
         counts["unsure"] = None
-    not_moved = sum(counts["uncorrected"].values()) + int(figures.outcomes[Outcome.NOT_CARRIED])
+    not_moved = sum(counts["uncorrected"].values()) + int(figures.outcomes[Outcome.NOT_TRANSFERRED])
     transfer, moved = plan.transfer, plan.survey.level_offset_m
     made, detected, water = plan.made, _detected(plan, tally), str(plan.found.surface)
     uncertainty = figures.uncertainty(made)
@@ -240,7 +240,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         water=water,
         water_fit=plan.found.as_dict(),
         uncertainty=uncertainty,
-        carried=transfer.as_dict(tally.transfer) if transfer and tally.transfer else None,
+        transfer=transfer.as_dict(tally.transfer) if transfer and tally.transfer else None,
         made=made,  # the reconstruction type, and why
         # other notes on the cloud, also in `warnings`
         told=[one for one in map(str, detected) if made is None or one not in made["because"]],

@@ -5,8 +5,6 @@ All words are made of the plain values of `adjustment_dict`, so that a resumed r
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from pcfix.adjust.block import words_of
@@ -16,17 +14,13 @@ from pcfix.grid.colours import DIFFERENCE, UNCERTAINTY
 from pcfix.grid.maps import Maps, MapsBuilder
 from pcfix.model import FloatArray
 from pcfix.report.map_data import Layer
-from pcfix.report.page import AFTER, Picture, Report, Table, label_plan, new_figure, render
+from pcfix.report.page import Picture, Report, Table, label_plan, new_figure, render
 from pcfix.report.text import Rows, RowTable, filled, share
 from pcfix.sums import nice_step
 
 MOST_POINTS = 6000
-COLUMNS = 14
-"""Cells over the width of an image, for mean residual vectors."""
-LEAST_IN_CELL = 4
 ARROW = 0.07
 """Length of a large arrow, as a share of the longer side of the block."""
-ARROW_LOOK: Plain = {"angles": "xy", "scale_units": "xy", "zorder": 3}
 
 WHERE = (("land", "on land"), ("water", "under water"))
 MOST_LISTED = 12
@@ -45,8 +39,8 @@ _FACTS: RowTable = (
     ("water", "none", "no_water"),
     ("port", "--port {port_found[port]}", "port"),
     ("{label}", "{after:.6g}{unit}, fixed", "*held"),
-    ("on {surface}", "{points:,} marked points, distance RMS {rms_m:z.4f} m (given {sigma_m:g} m),"
-     " largest {largest_m:z.4f} m ({largest_point})", "*on_surfaces"),
+    ("on {surface}", "{points:,} marked points, distance RMS {rms_m:z.4f} m (given {sigma_m:g} m)",
+     "*on_surfaces"),
     ("poses", "RMS movement of the centres {poses[moved_rms_m]:.3f} m", "moved"),
     ("", "mean east, north, up {poses[moved_mean_m]:+z.3f} m, largest"
      " {poses[moved_largest_m]:.3f} m ({poses[moved_largest_image]}); RMS rotation"
@@ -100,7 +94,7 @@ def adjustment_page(adjusted: Adjusted, before: Intersected) -> str:
     `before` are residuals and points before, of `before_of`.
     """
     d = adjustment_dict(adjusted, before)
-    maps, layers = _map(adjusted, before)
+    (maps, layers), picture = _map(adjusted, before), block_picture(d, adjusted)
     how = "without refraction" if d["water"] is None else "with refraction at the water"
     lead = (
         f"{d['images']:,} images and {d['points']['all']:,} points were adjusted"
@@ -116,7 +110,7 @@ def adjustment_page(adjusted: Adjusted, before: Intersected) -> str:
         warnings=all_notes(d),
         maps=maps,
         layers=layers,
-        pictures=pictures_of(d, adjusted),
+        pictures=[] if picture is None else [picture],
         tables=[table for table in tables if table.rows],
     )
     return render(report)
@@ -150,7 +144,7 @@ def _facts(d: Plain) -> Rows:
             elif not (name.startswith("tilt") and row["after"] == 0.0):
                 held.append(named)
     motions = []
-    if d["poses_are"] == "similarity" and d["precision"] is not None:
+    if d["poses_are"] == "similarity":
         motions = [_named(row["name"]) | row for row in d["precision"]["shared"][-7:]]
     return filled(_FACTS, d | {
         "poses_words": _poses_words(d), "o": o, "kind": kinds[d["source"]],
@@ -159,7 +153,7 @@ def _facts(d: Plain) -> Rows:
         "lens_is_fixed": not d["lens"], "unknowns": unknowns, "motions": motions, "held": held,
         "no_water": water is None,
         "moved": is_free and d["poses"]["moved_rms_m"],
-        "is_precise": is_free and d["precision"] is not None and d["precision"]["images"],
+        "is_precise": is_free and d["precision"]["images"],
         "surveyed": [
             {"role": role, "count": len(d[role]["points"]), **d[role]}
             for role in ("control", "check") if d[role] is not None
@@ -226,7 +220,7 @@ def _map(a: Adjusted, before: Intersected) -> tuple[Maps, list[Layer]]:
 
 
 def _correlation_table(d: Plain) -> Table:
-    p = d["precision"] or {"shared": [], "correlation": []}
+    p = d["precision"]
     names = [row["name"].replace("_", " ") for row in p["shared"]]
     rows = [
         [name, *(fixed(value, 3, "+") for value in row)]
@@ -269,16 +263,10 @@ def _residual_table(d: Plain) -> Table:
     return Table("Residuals and precision on land and under water", header, rows)
 
 
-# Pictures
+# Picture
 
 
-def pictures_of(d: Plain, adjusted: Adjusted) -> list[Picture]:
-    """Return the pictures of an adjustment."""
-    drawn = _block(d, adjusted), _vectors(adjusted)
-    return [picture for picture in drawn if picture is not None]
-
-
-def _block(d: Plain, a: Adjusted) -> Picture | None:
+def block_picture(d: Plain, a: Adjusted) -> Picture | None:
     """Draw how far the projection centres moved, and their differences from GNSS, as arrows."""
     moved, off = a.cameras.centres - a.block.cameras.centres, a.gnss_residual_m
     shown: list[tuple[str, FloatArray]] = []
@@ -303,7 +291,7 @@ def _block(d: Plain, a: Adjusted) -> Picture | None:
         longer, reach = ARROW * side / key, max(float(np.abs(up).max()), 1e-6)
         arrows = axes.quiver(
             x, y, dx, dy, up, cmap=DIFFERENCE, scale=1.0 / longer, clim=(-reach, reach),
-            edgecolor="0.3", linewidth=0.5, width=0.007, **ARROW_LOOK,
+            edgecolor="0.3", linewidth=0.5, width=0.007, angles="xy", scale_units="xy", zorder=3,
         )  # fmt: skip
         axes.plot(x, y, "o", color="0.2", markersize=1.5, zorder=2)
         figure.colorbar(arrows, ax=axes, label="Up (m)", shrink=0.8)
@@ -318,35 +306,3 @@ def _block(d: Plain, a: Adjusted) -> Picture | None:
         " difference from the GNSS position; their colour shows the vertical part."
     )
     return Picture("block", "Projection centres", alt, figure)
-
-
-def _vectors(a: Adjusted) -> Picture | None:
-    """Draw mean residual vectors over the image, of the sensor with most observations."""
-    from scipy.stats import binned_statistic_2d
-
-    groups, of_group = a.problem.groups, a.problem.given.group[a.block.camera]
-    main = int(np.bincount(of_group[a.used], minlength=1).argmax())
-    lens = (a.block.cameras.lenses or ())[groups[main][0]]
-    rows = a.used & (of_group == main) & np.isfinite(a.residual_px).all(axis=1)
-    bins = [COLUMNS, max(1, round(lens.height * COLUMNS / lens.width))]
-    (u, v), limits = a.block.image_xy[rows].T, [[0.0, lens.width], [0.0, lens.height]]
-    found: Any = binned_statistic_2d
-    means = found(u, v, a.residual_px[rows].T, "mean", bins, limits).statistic
-    count = found(u, v, u, "count", bins, limits).statistic
-    column, row = np.nonzero(count >= LEAST_IN_CELL)
-    du, dv = means[:, column, row]
-    largest = float(np.hypot(du, dv).max(initial=0.0))
-    if not largest > 0.0:
-        return None
-    u, v = (column + 0.5) * lens.width / bins[0], (row + 0.5) * lens.height / bins[1]
-    key, scale = nice_step(largest / 2.0), largest * COLUMNS / (1.6 * lens.width)
-    figure, axes = new_figure(8.0, 8.0 * lens.height / lens.width + 0.7)
-    arrows = axes.quiver(u, v, du, dv, color=AFTER, scale=scale, width=0.004, **ARROW_LOOK)
-    axes.quiverkey(arrows, 0.85, 1.04, key, f"{key:g} {lens.unit}", labelpos="E")
-    axes.set(xlim=(0.0, lens.width), ylim=(lens.height, 0.0), aspect="equal")
-    axes.set(xlabel=f"u ({lens.unit})", ylabel=f"v ({lens.unit})")
-    alt = (
-        "Mean residuals (measured minus computed) by place in the image, enlarged; sensor"
-        f" {lens.sensor or main + 1}. Lens and poses did not absorb these."
-    )
-    return Picture("residual_vectors", "Residuals over the image", alt, figure)

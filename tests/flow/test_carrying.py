@@ -81,9 +81,9 @@ def test_same_cameras(cloud, old):
     land = np.array(before.z) > WATER_M + 0.01
     assert land.sum() > 900
     assert not shift_of(carried)[land].any()
-    assert told.carried["shift_m"]["max"] == 0.0
-    seen = told.carried["not_carried"]
-    assert told.carried["points"] + seen + sum(told.uncorrected.values()) == len(before)
+    assert told.transfer["shift_m"]["max"] == 0.0
+    seen = told.transfer["not_transferred"]
+    assert told.transfer["points"] + seen + sum(told.uncorrected.values()) == len(before)
 
 
 def test_land_and_bed(cloud, old):
@@ -107,19 +107,19 @@ def test_land_and_bed(cloud, old):
     )
     assert not np.array(after.RayCount)[land].any()
     assert not np.array(after.SourceClass)[land & carried].any()
-    assert told.carried["land"] == (land & carried).sum()
+    assert told.transfer["land"] == (land & carried).sum()
     way = np.linalg.norm(similar(came) - came, axis=1)[carried]
-    assert told.carried["points"] == carried.sum()
-    assert told.carried["shift_m"]["rms"] == pytest.approx(np.sqrt((way**2).mean()), abs=1e-4)
-    assert told.carried["shift_m"]["max"] == pytest.approx(way.max(), abs=1e-4)
-    assert f"({told.carried['land']:,} on land)" in summary_text(told)
+    assert told.transfer["points"] == carried.sum()
+    assert told.transfer["shift_m"]["rms"] == pytest.approx(np.sqrt((way**2).mean()), abs=1e-4)
+    assert told.transfer["shift_m"]["max"] == pytest.approx(way.max(), abs=1e-4)
+    assert f"({told.transfer['land']:,} on land)" in summary_text(told)
 
 
 def test_unseen_points(cloud, old):
     told, before, after = correct(cloud, cameras=adjusted(old), adjusted_from=old)
     result = snell(before.xyz, adjusted(old), WATER_M, adjusted_from=old)
-    behind = result.outcome == Outcome.NOT_CARRIED
-    assert told.carried["not_carried"] == behind.sum() > 10
+    behind = result.outcome == Outcome.NOT_TRANSFERRED
+    assert told.transfer["not_transferred"] == behind.sum() > 10
     assert not shift_of(after)[behind].any()
     assert np.array(after.withheld)[behind].all()
     assert np.array_equal(
@@ -284,7 +284,7 @@ def test_run(tmp_path):
     request = request_of(record)
     assert isinstance(request, Request)
     assert request.adjusted_from == str(scene / "cameras.csv")
-    assert json.loads(record.read_text())["steps"]["correct"]["result"]["carried"]["land"] > 0
+    assert json.loads(record.read_text())["steps"]["correct"]["result"]["transfer"]["land"] > 0
 
 
 @free
@@ -299,11 +299,11 @@ def test_rendered_block(tmp_path, views):
     )  # fmt: skip
     las = laspy.read(tmp_path / "out.las")
     bed, land = errors_gsd(las)
-    assert told.carried["points"] == told.points
+    assert told.transfer["points"] == told.points
     # the noise of the matcher: with the true cameras from the start it leaves as much
     assert np.sqrt((land**2).mean()) < 0.7
     assert np.sqrt((bed**2).mean()) < 0.95
-    assert told.carried["shift_m"]["mean_z"] > 1.0
+    assert told.transfer["shift_m"]["mean_z"] > 1.0
     pcfix.restore_file(tmp_path / "out.las", tmp_path / "back.las")
     assert (tmp_path / "back.las").read_bytes() == (FREE / "cloud.las").read_bytes()
 
