@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from pcfix.adjust.block import CODES, INDEX, PORT, SHAPE, lens_parameter, moved_lens, words_of
 from pcfix.adjust.normal import UNDAMPED, sparse_rows_of
 from pcfix.adjust.problem import Problem, Solution, polynomial
-from pcfix.adjust.solve import BED, moved_by, reduced_at, singular, solver
+from pcfix.adjust.solve import moved_by, reduced_at, singular, solver
 from pcfix.errors import PcfixWarning
 from pcfix.model import Cameras, FloatArray, WaterPlane, WaterRaster, WaterSurface
 
@@ -192,10 +192,11 @@ def correlated(precision: Precision) -> list[PcfixWarning]:
         r, pair = float(precision.correlation[i, j]), [names[j], names[i]]
         if pair[0][0] == pair[1][0] == "k":
             continue
-        is_bed = [name in BED for name in pair]
-        remedy = ", or give control points at several heights" if sum(is_bed) == 1 else ""
         one, other = (f"the {words_of(name)[0]}" for name in pair)
-        words = f"{one} and {other} are strongly correlated (r = {r:.3f}). Fix one of them{remedy}."
+        words = (
+            f"{one} and {other} are strongly correlated (r = {r:.3f}). Fix one of them, or give"
+            " control points at several heights."
+        )
         notes.append(PcfixWarning("adjust.correlated", words, unknowns=[one, other], correlation=r))
     return sorted(notes, key=lambda note: -abs(note.values["correlation"]))
 
