@@ -185,8 +185,14 @@ def _trial(
     m, owner = given.block.tie_points, given.block.owner
     block = replace(given.block, sigma_px=np.where(owner < m, sigma_px, given.block.sigma_px))
     problem, start = prepare(block, unknowns)
+    # the Jacobians of the straight collinearity at the original solution
     before, at_rest = prepare(replace(block, cameras=given.original), unknowns)
-    tests = straight_columns(before, at_rest, given.apparent_xyz - before.origin)
+    o, nowhere = len(owner), np.zeros(len(block.xyz), np.bool_)
+    dry = before.given._replace(wet=nowhere, weight=np.ones(o))
+    apparent = np.ascontiguousarray(given.apparent_xyz - before.origin)
+    rows = linearised(at_rest.state._replace(xyz=apparent), dry, UNDAMPED, 0, len(apparent))
+    tests = np.zeros((o, 2, SHARED + dry.shared))
+    tests[rows.observation[rows.is_image]] = rows.columns[rows.is_image]
     found = solve_unaware(problem, start, tests[: block.start[m]], progress)
     marks, weight = problem.used & (owner >= m), problem.given.weight
     r = residuals(found.state, problem.given)[marks]
@@ -200,28 +206,6 @@ def _trial(
 # The equations
 
 
-def straight_columns(problem: Problem, start: Solution, apparent_xyz: FloatArray) -> FloatArray:
-    """Return the Jacobians of the straight collinearity at the original solution.
-
-    Parameters
-    ----------
-    apparent_xyz : array, shape (m, 3)
-        The points of the original adjustment, block frame.
-
-    Returns
-    -------
-    array, shape (o, 2, 9 + g)
-        By pose, point and shared unknowns; the residuals are orthogonal to these columns.
-    """
-    o = len(problem.given.camera)
-    dry = problem.given._replace(wet=np.zeros(len(problem.given.wet), np.bool_), weight=np.ones(o))
-    state = start.state._replace(xyz=np.ascontiguousarray(apparent_xyz))
-    rows = linearised(state, dry, UNDAMPED, 0, len(apparent_xyz))
-    tests = np.zeros((o, 2, SHARED + problem.given.shared))
-    tests[rows.observation[rows.is_image]] = rows.columns[rows.is_image]
-    return tests
-
-
 def solve_unaware(
     problem: Problem, start: Solution, tests: FloatArray, progress: Progress | None = None
 ) -> Solution:
@@ -233,8 +217,9 @@ def solve_unaware(
         Of `pcfix.adjust.problem.prepare`; points of the cloud were observed where the original
         cameras image them.
     tests : array, shape (t, 2, 9 + g)
-        Of `straight_columns`, for the points of the cloud. The others, control points, are adjusted
-        by least squares.
+        Jacobians of the straight collinearity at the original solution, by pose, point and shared
+        unknowns, for the points of the cloud. The others, control points, are adjusted by least
+        squares.
     """
     given = problem.given._replace(tests=tests)
     tested = replace(problem, given=given)

@@ -144,13 +144,6 @@ def prepare(
     origin = np.round(cameras.centres.mean(axis=0)) if origin is None else origin
     group, groups = sensor_groups(lenses)
     codes = [usable_codes(lenses[images[0]], unknowns.lens) for images in groups]
-    free = [what for what in ("level", "tilt", "shape") if unknowns.surface.get(what)]
-    if free and isinstance(water, WaterMesh | WaterRaster):
-        words = (
-            f"The {free[0]} of the water can be free for a level or plane only, not for a mesh or"
-            " raster. Fix it."
-        )
-        raise GeometryError("adjust.fixed_surface", words, unknown=free[0])
     numbers = surface_numbers(block, origin)
     planes, plane_names, axis, alike = _planes(block, origin, numbers)
     # columns of the shared unknowns: lenses, then surface and planes
@@ -304,14 +297,10 @@ def water_of(problem: Problem, state: State) -> WaterSurface | None:
     water, origin = problem.block.water, problem.origin
     if not isinstance(water, WaterPlane):
         return water
-    if problem.given.curved:
-        return _curved_raster(problem, state)
-    level, b, c = (float(value) for value in state.water[:3])
-    return WaterPlane(level + origin[2] - (b * origin[0] + c * origin[1]), b, c)
-
-
-def _curved_raster(problem: Problem, state: State) -> WaterRaster:
-    """Return water of the second order as a raster over all images and points."""
+    if not problem.given.curved:
+        level, b, c = (float(value) for value in state.water[:3])
+        return WaterPlane(level + origin[2] - (b * origin[0] + c * origin[1]), b, c)
+    # water of the second order as a raster over all images and points
     known = state.xyz[np.isfinite(state.xyz).all(axis=1)]
     places = np.vstack([state.centres[:, :2], known[:, :2]])
     low, high = places.min(axis=0), places.max(axis=0)
@@ -319,8 +308,8 @@ def _curved_raster(problem: Problem, state: State) -> WaterRaster:
     cell = float((high - low).max()) / CELLS
     columns, rows = np.maximum(np.ceil((high - low) / cell).astype(int), 2)
     x, y = low[0] + cell * (np.arange(columns) + 0.5), high[1] - cell * (np.arange(rows) + 0.5)
-    height = polynomial(state.water, x[None, :], y[:, None]) + problem.origin[2]
-    left, top = float(problem.origin[0] + low[0]), float(problem.origin[1] + high[1])
+    height = polynomial(state.water, x[None, :], y[:, None]) + origin[2]
+    left, top = float(origin[0] + low[0]), float(origin[1] + high[1])
     return WaterRaster(height, left, top, (cell, cell), "water of second order")
 
 

@@ -113,9 +113,12 @@ def adjusted_of(
     source: Source,
 ) -> Adjusted:  # fmt: skip
     """Return a solution as a result, with check points intersected."""
-    block, state = problem.block, now.state
-    xyz = _with_check_points(problem, now)
-    r = residuals(state._replace(xyz=xyz - problem.origin), problem.given)
+    block, owner, state = problem.block, problem.block.owner, now.state
+    # check points have no weight yet
+    is_check = np.isin(owner, block.tie_points + np.flatnonzero(block.is_check))
+    is_check &= np.diff(block.start)[owner] >= LEAST_VIEWS
+    with_checks, _ = intersected(problem.weighted(np.where(is_check, 1.0, 0.0)), state)
+    xyz, r = with_checks.xyz + problem.origin, residuals(with_checks, problem.given)
     water = water_of(problem, state)
     none = -np.inf if block.port is None else np.inf  # behind a port everything is under water
     level = np.full(len(xyz), none) if water is None else surface_above(water, xyz).height_m
@@ -144,15 +147,6 @@ def adjusted_of(
         problem=problem,
         solution=now,
     )
-
-
-def _with_check_points(problem: Problem, now: Solution) -> FloatArray:
-    """Return the points, world frame, with check points intersected from the adjusted cameras."""
-    block, owner = problem.block, problem.block.owner
-    is_check = np.isin(owner, block.tie_points + np.flatnonzero(block.is_check))
-    several = np.diff(block.start)[owner] >= LEAST_VIEWS
-    checks = problem.weighted(np.where(is_check & several, 1.0, 0.0))
-    return intersected(checks, now.state)[0].xyz + problem.origin
 
 
 def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlRow]:

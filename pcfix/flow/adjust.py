@@ -45,6 +45,7 @@ from pcfix.model import (
     TiePoints,
     Views,
     WaterDimension,
+    WaterMesh,
     WaterPlane,
     WaterRaster,
     WaterSurface,
@@ -141,7 +142,7 @@ def adjust_into(
         )
         raise SettingError("water.dimension", words, value=str(water))
     check_images(name, original, water, given.fixed_images)
-    _check_free(given, inputs.port)
+    _check_free(given, water, inputs.port)
     gnss, reason, notes = _gnss(original, name, given)
     control = given.gcps
     gcps = "gcps" if isinstance(control, GroundControl) else str(control)
@@ -186,9 +187,11 @@ def adjust_into(
     return found
 
 
-def _check_free(given: AdjustOptions, port: Port | None) -> None:
+def _check_free(given: AdjustOptions, water: WaterSurface | None, port: Port | None) -> None:
     """Refuse unknowns that water or port do not have."""
     what, known = "the water", [*WATER_UNKNOWNS[:4]]
+    if isinstance(water, WaterMesh | WaterRaster):
+        what, known = "a mesh or raster of water", ["index"]
     if port is not None:
         is_flat = isinstance(port, FlatPort)
         what = "a flat port" if is_flat else "a dome"
@@ -198,7 +201,7 @@ def _check_free(given: AdjustOptions, port: Port | None) -> None:
         if name not in known:
             raise SettingError(
                 "option.choice",
-                f"--free {name}: {what} has no {name}. Use {', '.join(known)}.",
+                f"--free {name}: {what} has no free {name}. Use {', '.join(known)}.",
                 option="free",
                 value=name,
             )

@@ -63,12 +63,11 @@ def diagnose_in_passing(
     if inputs.adjusted_from is not None:
         words = "adjusted with refraction (--adjusted-from)"
         return found | {"absorbed": False, "words": words}, None
-    path = None if isinstance(inputs.cameras, Cameras) else inputs.cameras
     seen = [(one.straight, one.is_fused) for one in plan.verdicts if one.straight is not None]
-    name, n = "cameras" if path is None else str(path), plan.options.refractive_index
+    name = "cameras" if isinstance(inputs.cameras, Cameras) else str(inputs.cameras)
+    n = plan.options.refractive_index
     neighbours = neighbours_sign(*seen[-1][0], is_fused=seen[-1][1]) if seen else None
     try:
-        is_large = path is not None and _size_of(Path(path)) > QUICK_BYTES
         diagnosis = diagnosed(
             cameras, plan.found.surface, n, ties=ties, gnss=_gnss_of(cameras, name),
             view=plan.view, neighbours=neighbours, in_passing=True,
@@ -89,12 +88,7 @@ def diagnose_in_passing(
         did = "absorbed" if diagnosis.absorbed else "did not absorb"
         words = f"{did} the refraction, by {decided.name}{'; see the warning' * bool(sentence)}"
     else:
-        why = f"no tie points and no GNSS positions; {EXPORT}"
-        silent = [one.name for one in diagnosis.signs if one.name in ("tie points", "GNSS")]
-        if is_large:
-            why = f"the file is larger than {QUICK_BYTES / 1e6:g} MB; use 'pcfix cameras'"
-        elif silent:
-            why = f"{' and '.join(silent)} of the file tell too little (see 'pcfix cameras')"
+        why = f"no tie points or GNSS positions of the file show it quickly; {EXPORT}"
         words = f"not checked for absorbed refraction: {why}"
     signs = diagnosis.as_dict()["signs"]
     return {"absorbed": diagnosis.absorbed, "words": words, "signs": signs}, warning
