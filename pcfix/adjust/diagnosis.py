@@ -40,7 +40,7 @@ from pcfix.water.fit import heights_from_cloud
 from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:  # not quick to load
-    from pcfix.adjust.from_cloud import Unbent
+    from pcfix.adjust.from_cloud import Undone
     from pcfix.adjust.problem import Intersected
 
 ORDER = ("tie points", "GNSS", "bed", "land", "neighbours")
@@ -208,11 +208,11 @@ def tie_point_sign(straight: Intersected, refracted: Intersected, depth_m: Float
 # GNSS
 
 
-def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, unbent: Unbent) -> Sign:
+def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, undone: Undone) -> Sign:
     """Look for the pattern in which this water bends the block in adjusted minus GNSS positions.
 
     The pattern is the centres minus those that an adjustment with water finds without the GNSS
-    (`pcfix.adjust.from_cloud.unbent`).
+    (`pcfix.adjust.from_cloud.undo_absorption`).
 
     Parameters
     ----------
@@ -225,14 +225,14 @@ def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, unben
     off = b pattern + shift, turn and scale of the block + noise, by least squares. The noise is
     that of the residuals, or that stated of the GNSS if it is larger.
     """
-    centres, off_m = centres[unbent.row], off_m[unbent.row]
+    centres, off_m = centres[undone.row], off_m[undone.row]
     rows = np.isfinite(off_m)
     y, base = off_m[rows], similarity_gradients(centres - centres.mean(axis=0))[rows]
-    clear = _rest((centres - unbent.cameras.centres)[rows], base)
+    clear = _rest((centres - undone.cameras.centres)[rows], base)
     share = float(clear @ y) / max(float(clear @ clear), 1e-300)
     left = _rest(y, np.column_stack([base, clear]))
     noise = float(np.linalg.norm(left) / np.sqrt(max(len(y) - 8, 1)))
-    stated = sigma_m[unbent.row][rows]
+    stated = sigma_m[undone.row][rows]
     if np.isfinite(stated).any() and np.nanmedian(stated) < MOST_STATED_M:
         noise = max(noise, float(np.nanmedian(stated)))
     sigma = noise / max(float(np.linalg.norm(clear)), 1e-150)
@@ -244,7 +244,7 @@ def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, unben
     is_useful = share <= MOST_SHARE and sigma <= MOST_SIGMA
     speaks = _exceeds(share, sigma, SHARE) if is_useful else None
     figures = {"share": share, "sigma_share": sigma, "rms_m": rms}
-    return Sign("GNSS", speaks, words, figures, unbent.error_m)
+    return Sign("GNSS", speaks, words, figures, undone.error_m)
 
 
 def _rest(y: FloatArray, columns: FloatArray) -> FloatArray:
@@ -379,7 +379,7 @@ def _signs_of_rays(
     is_open = not in_passing or all(sign.speaks is None for sign in signs)
     if not any(sign.speaks for sign in signs) and not (is_known and is_open):
         return signs
-    from pcfix.adjust.from_cloud import unbent  # not quick to load
+    from pcfix.adjust.from_cloud import undo_absorption  # not quick to load
 
     count, most = len(cameras), QUICK_IMAGES if in_passing else MOST_IMAGES
     wanted = max(CLOUD_POINTS, POINTS_PER_IMAGE * count)
@@ -390,7 +390,7 @@ def _signs_of_rays(
         if apparent is None:  # points of the cloud, evenly spread over it
             every = max(1, view.points // wanted)
             apparent = np.vstack([np.zeros((0, 3)), *(one.xyz[::every] for one in view.chunks())])
-        true = unbent(apparent[:: max(1, len(apparent) // wanted)], cameras, water, n)
+        true = undo_absorption(apparent[:: max(1, len(apparent) // wanted)], cameras, water, n)
     except GeometryError as error:
         words = f"the pattern of absorbed refraction is unknown ({error})"
         return signs + [Sign("GNSS", None, words)] * is_known

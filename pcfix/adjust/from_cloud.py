@@ -265,7 +265,7 @@ OWN_SIGMA_M = 1.0
 LEAST_IMAGES_OF_POINT, LEAST_POINTS, LEAST_IMAGES = 3, 10, 5
 
 
-class Unbent(NamedTuple):
+class Undone(NamedTuple):
     """The poses if they had absorbed the refraction, and the error that this implies."""
 
     cameras: Cameras  # those with enough points
@@ -273,9 +273,9 @@ class Unbent(NamedTuple):
     error_m: float  # RMS, heights of the land now, or if there is none of the corrected bed
 
 
-def unbent(
+def undo_absorption(
     xyz: FloatArray, cameras: Cameras, water: WaterSurface, refractive_index: float
-) -> Unbent:
+) -> Undone:
     """Return the poses that an adjustment with water would have found; the block stays in place.
 
     Parameters
@@ -304,4 +304,4 @@ def unbent(
     higher = found.state.xyz[:, 2] + problem.origin[2] - intersect_fixed(block).xyz[:, 2]
     is_land = ~wet if (~wet & np.isfinite(higher)).any() else wet
     error_m = float(np.sqrt(np.nanmean(higher[is_land] ** 2)))
-    return Unbent(solved_cameras(problem, found), row, error_m)
+    return Undone(solved_cameras(problem, found), row, error_m)

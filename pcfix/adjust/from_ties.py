@@ -142,7 +142,7 @@ def _settled(
     """Return the least squares solution without outliers, and its precision.
 
     The noise is now estimated from all residuals, long tails included, so that GNSS and control
-    points, whose standard deviations are given, get the right weight beside the images.
+    points, whose standard deviations are given, get the right weight relative to the images.
     """
     if estimate:
         problem = weighed(with_noise(problem, now, robust=False), now)

@@ -101,8 +101,8 @@ def adjust_block(
             " adjust. Check the water level, or use an ordinary bundle adjustment."
         )
         raise GeometryError("water.below_points", words, wet=wet, points=len(xyz))
-    kept, notes = _well_seen(material.name, block)
-    block = restricted(block, kept)
+    rows, notes = _well_seen(material.name, block)
+    block = restricted(block, rows)
     if cloud_xyz is None:
         found = adjust_ties(
             block, unknowns, progress, sigma_px=rules.sigma_image, outliers=rules.outliers,
@@ -114,7 +114,7 @@ def adjust_block(
         sets = [lens]
         if chooses_lens:
             sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), lens]))
-        given = CloudBlock(block, some_cameras(original, kept), apparent)
+        given = CloudBlock(block, some_cameras(original, rows), apparent)
         found = adjust_cloud(given, unknowns, sets, progress)
     notes += [*_check_dry(water, found), *found.notes]
     notes += [*undetermined(found.precision), *correlated(found.precision)]
@@ -134,21 +134,21 @@ def adjust_block(
 
 def _well_seen(name: str, block: Block) -> tuple[IntArray, list[PcfixWarning]]:
     """Return the rows of the images that can be adjusted, and a warning about others."""
-    kept, count = well_seen(block), len(block.cameras)
-    if len(kept) < 2:
+    rows, count = well_seen(block), len(block.cameras)
+    if len(rows) < 2:
         words = (
-            f"{name}: only {len(kept)} of {count} images have enough observations for a pose. Give"
+            f"{name}: only {len(rows)} of {count} images have enough observations for a pose. Give"
             " a model with more tie points."
         )
-        raise GeometryError("ties.few_images", words, path=name, images=len(kept))
-    lost = np.setdiff1d(np.arange(count), kept)
+        raise GeometryError("ties.few_images", words, path=name, images=len(rows))
+    lost = np.setdiff1d(np.arange(count), rows)
     if not len(lost):
-        return kept, []
+        return rows, []
     words = (
         f"{len(lost)} of {count} images (first {block.cameras.labels[lost[0]]}) have too few"
         " observations for a pose and were excluded."
     )
-    return kept, [PcfixWarning("ties.few_in_image", words, images=len(lost))]
+    return rows, [PcfixWarning("ties.few_in_image", words, images=len(lost))]
 
 
 def check_images(

@@ -57,19 +57,20 @@ def disagreement_of(problem: Problem, found: Solution, formal: Precision) -> Flo
     given, block, added = problem.given, problem.block, np.zeros(6 + len(problem.names))
     # random groups of points, neighbouring points, points of an image, and places in the frame
     tiles = min(MOST_TILES, len(block.xyz) // POINTS_PER_TILE)
-    alone = np.random.default_rng(0).integers(0, max(tiles, 1), len(block.xyz))[block.owner]
+    randomly = np.random.default_rng(0).integers(0, max(tiles, 1), len(block.xyz))[block.owner]
     near = _tiles(found.state.xyz[:, :2], tiles)[block.owner]
     size = np.array([(lens.width, lens.height) for lens in block.cameras.lenses or ()])
     place = _tiles(given.image_xy / size[given.camera], FRAME_TILES)
     place += given.group[given.camera] * (place.max(initial=0) + 1)
     frame = np.unique(place, return_inverse=True)[1]
     matrix, right = reduced_at(problem, found)
-    solve_for, spread, least = solver(matrix), problem.spread(found.state), len(np.unique(alone))
+    solve_for, spread = solver(matrix), problem.spread(found.state)
+    least = len(np.unique(randomly))
     if least < LEAST_GROUPS or solve_for is None:
         return 1.0 + added
     # the first group has drawn residuals: the variances that random groups have by chance
     drawn = np.random.default_rng(1).normal(0.0, formal.sigma0, given.image_xy.shape)
-    groups = [alone, alone, near, given.camera]
+    groups = [randomly, randomly, near, given.camera]
     *pulls, field, rest = _pulls_of(problem, found, groups, frame, drawn)
     by_chance, *shares = (_share_of(problem, formal, solve_for(spread.T @ p.T)) for p in pulls)
     for group, share in zip(groups[1:], shares, strict=True):
@@ -77,7 +78,7 @@ def disagreement_of(problem: Problem, found: Solution, formal: Precision) -> Flo
         is_more = share > fdtri(count - 1, least - 1, SURE) * by_chance
         more = np.where(is_more & (count >= LEAST_GROUPS), share - by_chance, 0.0)
         added = added + more
-        if group is alone:
+        if group is randomly:
             by_chance = by_chance + more
     if frame.max() + 1 >= LEAST_GROUPS:
         field = field @ spread

@@ -7,7 +7,7 @@ import pytest
 
 from pcfix.adjust.block import true_start
 from pcfix.adjust.diagnosis import bed_sign, gnss_sign, tie_point_sign
-from pcfix.adjust.from_cloud import unbent
+from pcfix.adjust.from_cloud import undo_absorption
 from pcfix.adjust.problem import intersect_fixed
 from pcfix.model import WaterPlane
 from tests.utils.bent_blocks import GNSS_M, LEVEL_M, N, TrueBlock
@@ -27,7 +27,7 @@ def tie_sign(true, cameras, n=N):
 def gnss_signs(cameras, apparent):
     off = cameras.centres - cameras.gnss.xyz
     sigma = np.full(off.shape, GNSS_M)
-    found = unbent(apparent, cameras, WATER, N)
+    found = undo_absorption(apparent, cameras, WATER, N)
     assert len(found.row) == len(cameras)
     return gnss_sign(cameras.centres, off, sigma, found), found
 
