@@ -266,12 +266,10 @@ def check_control(found: Adjusted, name: str) -> None:
     if not gross.any():
         return
     worst = int(np.argmax(np.where(gross, px, 0.0)))
-    others = len(np.unique(point[gross])) - 1
     name_of_worst = block.control_names[point[worst] - block.tie_points]
     words = (
         f"{name}: control point {name_of_worst} does not fit: its error is {px[worst]:.0f} px or"
-        f" {sigmas[worst]:.0f} standard deviations{f' ({others} more do not)' if others else ''}."
-        f" {_REMEDY}"
+        f" {sigmas[worst]:.0f} standard deviations. {_REMEDY}"
     )
     values = {"point": name_of_worst, "off_px": float(px[worst])}
     raise GeometryError("gcps.gross_error", words, path=name, **values)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -82,7 +82,6 @@ class Adjusted:
     problem: Problem  # with the weights of the last round
     solution: Solution
     port: Port | None = None  # adjusted
-    on_surfaces: list[Plain] = field(default_factory=list)  # of points on the water or on planes
 
     @property
     def is_observed(self) -> BoolArray:
@@ -143,7 +142,6 @@ def adjusted_of(
         control=_control_rows(block, xyz, r),
         notes=notes,
         port=port_of(block, state.water),
-        on_surfaces=_on_surfaces(problem, now),
         problem=problem,
         solution=now,
     )
@@ -233,7 +231,7 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
         "lens": _lens(a),
         "water": _water(a),
         "port_found": _port(a),
-        "on_surfaces": a.on_surfaces,
+        "on_surfaces": _on_surfaces(a.problem, a.solution),
         "poses": _poses(a),
         "precision": _precision(a.precision),
         "gnss": _gnss(a),
