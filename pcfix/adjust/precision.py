@@ -29,7 +29,7 @@ from pcfix.model import Cameras, FloatArray, WaterPlane, WaterRaster, WaterSurfa
 DENSE_UP_TO = 12_000
 """Unknowns up to which the whole inverse is computed (1.2 GB)."""
 
-MOST_POINTS, POINTS_AT_ONCE = 10_000, 500
+MOST_POINTS, POINTS_AT_ONCE = 50_000, 500
 """Points whose standard errors are computed, and how many at a time, which limits the memory."""
 
 SINGULAR = 1e-12
