@@ -152,7 +152,7 @@ def _check(block: Block, unknowns: Unknowns) -> None:
         code, words = "needs_water", "level, tilt and refractive index must be fixed"
     elif len(block.conditions.on):
         code = "has_conditions"
-        words = "points cannot lie on the water or on planes (waterline, on:NAME)"
+        words = "no point of --gcps can lie on the water or on a plane (waterline, on:NAME)"
     else:
         return
     words = f"Without tie points {words}. Change that, or give a model with tie points."
