@@ -113,7 +113,7 @@ class Diagnosis:
         if self.decided_by is None or not self.absorbed:
             return None
         land = [sign for sign in self.signs if sign.name == "land" and sign.speaks]
-        return next(iter(land), self.decided_by).error_m
+        return (land or [self.decided_by])[-1].error_m
 
     def sentence(self, command: str, because: str = "") -> str:
         """Return a warning with the command that helps; empty if the poses seem right.
