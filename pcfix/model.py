@@ -387,7 +387,7 @@ class Outcome(IntEnum):
     NO_CAMERA = 2
     ONE_CAMERA = 3
     PARALLEL_RAYS = 4
-    NOT_CARRIED = 5
+    NOT_TRANSFERRED = 5
     """It could not be transferred to the adjusted cameras."""
     FLAT_RAYS = 6
     """Two cameras or more see it, but fewer than two within the largest angle."""
@@ -458,7 +458,9 @@ class Correction:
     @property
     def submerged(self) -> BoolArray:
         """Points below the water surface."""
-        return np.asarray((self.outcome != Outcome.LAND) & (self.outcome != Outcome.NOT_CARRIED))
+        return np.asarray(
+            (self.outcome != Outcome.LAND) & (self.outcome != Outcome.NOT_TRANSFERRED)
+        )
 
     @property
     def corrected(self) -> BoolArray:

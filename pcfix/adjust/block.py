@@ -35,8 +35,8 @@ WATER_NAMES = (
 )
 """Parameters of the refracting surface: of the water, then of a housing port.
 
-The water is z = a + b x + c y + d x^2 + e x y + f y^2 about the origin of the block; over a mesh or
-raster, level is a height added to it and the others are unused.
+The water is z = a + b x + c y + d x^2 + e x y + f y^2 about the origin of the block; a mesh or
+raster stays where it is.
 """
 INDEX, SHAPE, PORT, PLANES = 3, 4, 7, 11
 """Positions of the index, of d, e, f, of the port's parameters, and of planes (`Conditions`)."""
@@ -50,10 +50,10 @@ WORDS = {
     "tilt_y": "water tilt along y", "index": "refractive index", "shape_xx": "water shape x^2",
     "shape_xy": "water shape x y", "shape_yy": "water shape y^2", "distance": "port distance",
     "centre_x": "dome centre x", "centre_y": "dome centre y", "centre_z": "dome centre z",
+    **{one: f"block {one}" for one in MOTIONS},
+    **{one: f"distortion {one}" for one in ("p1", "p2", *(f"k{i}" for i in range(1, 9)))},
 }  # fmt: skip
 """What a surveyor calls the shared unknowns."""
-WORDS |= {f"k{i}": f"distortion k{i}" for i in range(1, 9)}
-WORDS |= {"p1": "distortion p1", "p2": "distortion p2"} | {one: f"block {one}" for one in MOTIONS}
 
 UNITS = {"level": " m", "tilt": " m/m", "shape": " /m", "distance": " m", "centre": " m",
          "shift": " m", "turn": " rad"}  # fmt: skip
@@ -236,10 +236,9 @@ def check_datum(block: Block, unknowns: Unknowns, reason: str = "") -> None:
 FOCAL, CX, CY, B1, B2, P1, P2, K1 = range(8)
 """Codes of the lens parameters; k1, k2, ... follow from `K1` on."""
 
-CODES = {"f": FOCAL, "cx": CX, "cy": CY, "b1": B1, "b2": B2, "p1": P1, "p2": P2}
-CODES |= {f"k{i + 1}": K1 + i for i in range(8)}
-NAMES = {code: name for name, code in CODES.items()}
-_FIELDS = {FOCAL: "focal", CX: "principal_x", CY: "principal_y", B1: "b1", B2: "b2"}
+NAMES = ("f", "cx", "cy", "b1", "b2", "p1", "p2", *(f"k{i}" for i in range(1, 9)))
+CODES = {name: code for code, name in enumerate(NAMES)}
+_FIELDS = ("focal", "principal_x", "principal_y", "b1", "b2")
 
 
 def sensor_groups(lenses: tuple[Lens, ...]) -> tuple[IntArray, list[list[int]]]:
@@ -265,7 +264,7 @@ def usable_codes(lens: Lens, names: tuple[str, ...]) -> tuple[int, ...]:
 
 def lens_parameter(lens: Lens, code: int) -> float:
     """Return a parameter of a lens; zero for terms that its polynomial does not have."""
-    if code in _FIELDS:
+    if code < P1:
         return float(getattr(lens, _FIELDS[code]))
     values, place = (lens.radial, code - K1) if code >= K1 else (lens.tangential, code - P1)
     return float(values[place]) if place < len(values) else 0.0
@@ -276,7 +275,7 @@ def moved_lens(lens: Lens, codes: tuple[int, ...], by: FloatArray) -> Lens:
     changes: dict[str, Any] = {}
     radial, tangential = [*lens.radial], [*lens.tangential]
     for code, step in zip(codes, by.tolist(), strict=True):
-        if code in _FIELDS:
+        if code < P1:
             changes[_FIELDS[code]] = getattr(lens, _FIELDS[code]) + step
             continue
         terms, at, least = (radial, code - K1, 0) if code >= K1 else (tangential, code - P1, 2)
@@ -329,13 +328,14 @@ class Material:
     calibrated: Lens | None = None  # replaces the lenses of the cameras
     # Whether points, by x and y, may be under water; everywhere without it.
     inside: Callable[[FloatArray, FloatArray], BoolArray] | None = None
-    level_sigma_m: float = 0.0  # infinite if the level is free
     no_gnss: str = ""  # why GNSS positions of the camera file are not used
     # parallel planes on which control points lie, perhaps with the water
     parallel: tuple[str, ...] = ()
 
 
-def block_of(material: Material, ties: TiePoints, sigma_px: float) -> Block:
+def block_of(
+    material: Material, ties: TiePoints, sigma_px: float, level_sigma_m: float = 0.0
+) -> Block:
     """Return the block of tie points and surveyed points.
 
     Parameters
@@ -345,6 +345,8 @@ def block_of(material: Material, ties: TiePoints, sigma_px: float) -> Block:
         Apparent points, in the frame of the cameras.
     sigma_px : float
         Standard deviation of their image coordinates.
+    level_sigma_m : float
+        Standard deviation of the water level, infinite if it is free.
     """
     water, n, cameras = material.water, material.refractive_index, material.original
     if material.calibrated is not None:
@@ -354,7 +356,15 @@ def block_of(material: Material, ties: TiePoints, sigma_px: float) -> Block:
     ties = replace(ties, xyz=true_start(ties.xyz, water, n, wet))
     sigma, more = np.full(len(ties.views.camera), sigma_px), dict[str, Any]()
     if control is not None:
-        _check_under_water(control, water, material.level_sigma_m)
+        deep = [] if water is None else used_as_dry(control, water, level_sigma_m)
+        if deep:
+            raise GeometryError(
+                "gcps.under_water",
+                f"Control points below the water surface are not marked as under water:"
+                f" {', '.join(deep)}. Put yes into the column under_water, or check the height"
+                " datum and the water level.",
+                points=deep,
+            )
         marks, of_marks = marks_of(control)
         conditions, under_water, xyz = _on_surfaces(material, control, marks, m)
         views = Views(
@@ -404,26 +414,17 @@ def _on_surfaces(
     return Conditions(names, rows, sigma_m, material.parallel), under_water, xyz
 
 
-def _check_under_water(
-    control: GroundControl, water: WaterSurface | None, level_sigma_m: float
-) -> None:
-    """Refuse points far below the water surface that are not marked as under water."""
-    if water is None:
-        return
+def used_as_dry(
+    control: GroundControl, water: WaterSurface, level_sigma_m: float = 0.0
+) -> list[str]:
+    """Return the names of points below the water that are not marked as under water.
+
+    An adjustment without water that used them is bent, as its images show them higher.
+    """
     level = surface_above(water, control.xyz).height_m
     least = level - 3.0 * np.hypot(control.sigma_m[:, 2], level_sigma_m)
     deep = (control.xyz[:, 2] < least) & ~control.under_water
-    if deep.any():
-        i = int(np.argmax(deep))
-        raise GeometryError(
-            "gcps.under_water",
-            f"Control point {control.names[i]} (height {control.xyz[i, 2]:.3f} m) lies below the"
-            f" water surface ({level[i]:.3f} m), but is not marked as under water. Put yes into the"
-            " column under_water, or check the height datum and the water level.",
-            point=control.names[i],
-            height_m=float(control.xyz[i, 2]),
-            level_m=float(level[i]),
-        )
+    return [control.names[i] for i in np.flatnonzero(deep)]
 
 
 def gnss_with_sigma(
@@ -541,25 +542,19 @@ def with_places(ties: TiePoints, cameras: Cameras) -> TiePoints:
     The sum of squared distances from the rays is minimised, which is good enough as a start.
     """
     lost = np.flatnonzero(~np.isfinite(ties.xyz).all(axis=1) & (np.diff(ties.views.start) >= 2))
-    if len(lost) == 0 or cameras.lenses is None or cameras.rotations is None:
-        return ties
-    some = taken(ties, lost)
-    owner = np.repeat(np.arange(len(lost)), np.diff(some.views.start))
+    some, rotations, lenses = taken(ties, lost), np.asarray(cameras.rotations), cameras.lenses or ()
+    owner, camera = np.repeat(np.arange(len(lost)), np.diff(some.views.start)), some.views.camera
     ray = np.full((len(owner), 3), np.nan)
-    for c in np.unique(some.views.camera):
-        entries = some.views.camera == c
-        ray[entries] = unproject(cameras.lenses[c], some.image_xy[entries]) @ cameras.rotations[c]
+    for c in np.unique(camera):
+        ray[camera == c] = unproject(lenses[c], some.image_xy[camera == c]) @ rotations[c]
     across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
     middle = cameras.centres.mean(axis=0)
-    centre = cameras.centres[some.views.camera] - middle
     normal, right = np.zeros((len(lost), 3, 3)), np.zeros((len(lost), 3))
     np.add.at(normal, owner, across)
-    np.add.at(right, owner, np.einsum("oij,oj->oi", across, centre))
-    finite = np.flatnonzero(np.isfinite(normal).all(axis=(1, 2)))
-    known = finite[np.linalg.det(normal[finite]) > LEAST_DETERMINANT]
+    np.add.at(right, owner, np.einsum("oij,oj->oi", across, cameras.centres[camera] - middle))
+    known = np.linalg.det(normal) > LEAST_DETERMINANT  # NaN is not
     xyz = ties.xyz.copy()
-    meet = np.linalg.solve(normal[known], right[known][:, :, None])[:, :, 0]
-    xyz[lost[known]] = meet + middle
+    xyz[lost[known]] = np.linalg.solve(normal[known], right[known][:, :, None])[:, :, 0] + middle
     return replace(ties, xyz=xyz)
 
 

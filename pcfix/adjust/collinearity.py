@@ -101,7 +101,6 @@ class Workspace(NamedTuple):
     plane: FloatArray  # (4,), at which it is refracted
     ahead: FloatArray  # (3,), the direction that the lens images, camera frame
     behind_port: FloatArray  # (3, 8), that direction behind a port, with its derivatives
-    origin: FloatArray  # (3,), the block's origin, seen from the water level
     moved: FloatArray  # (7,), other values of the first seven of `WATER_NAMES`
     own: FloatArray  # (2, WIDTH), derivatives of an image
     right: FloatArray  # (most, 2, 9 + g), the weighted rows of a point
@@ -115,7 +114,7 @@ class Workspace(NamedTuple):
 def workspace(given: Given) -> Workspace:
     """Return a new workspace."""
     most = int(np.diff(given.start).max(initial=0)) + 1  # one more for a `condition`
-    scratch = [np.zeros(shape) for shape in ((3, 14), 4, 3, (3, 8), 3, 7, (2, WIDTH))]
+    scratch = [np.zeros(shape) for shape in ((3, 14), 4, 3, (3, 8), 7, (2, WIDTH))]
     right = np.zeros((most, 2, SHARED + given.shared))
     left = np.zeros_like(right) if len(given.tests) else right
     r, row, v, rhs = np.zeros((most, 2)), np.zeros(most, np.int64), np.zeros((3, 3)), np.zeros(3)
@@ -133,8 +132,7 @@ STEPS, CLOSE_M = 30, 1e-12
 def surface_at(water: FloatArray, given: Given, x: float, y: float) -> Vector:
     """Return height, dz/dx and dz/dy of the water at x, y; NaN where there is none."""
     if given.field is not None or given.tin is not None:
-        z, b, c = plane_at(given.tin, given.field, x, y, given.origin)
-        return z + water[0], b, c
+        return plane_at(given.tin, given.field, x, y, given.origin)
     d, e, f = water[SHAPE], water[SHAPE + 1], water[SHAPE + 2]
     z = water[0] + (water[1] + d * x + e * y) * x + (water[2] + f * y) * y
     return z, water[1] + 2.0 * d * x + e * y, water[2] + e * x + 2.0 * f * y
@@ -143,16 +141,13 @@ def surface_at(water: FloatArray, given: Given, x: float, y: float) -> Vector:
 @device
 def _set_plane(work: Workspace, water: FloatArray, given: Given, q: Vector, centre: Vector) -> bool:
     """Set the refracting plane (N, h) for light from Q to C; return if Q is below the water."""
-    plane, origin = work.plane, work.origin
+    plane = work.plane
     z, b, c = surface_at(water, given, q[0], q[1])
     if not z > q[2]:
         return False
     lay(plane, q[0], q[1], z, b, c)
     if given.field is not None or given.tin is not None:
-        # a level added to a mesh or raster is an origin that lies lower
-        origin[0], origin[1], origin[2] = vector(given.origin)
-        origin[2] -= water[0]
-        settle(plane, given.tin, given.field, origin, q, centre, water[INDEX])
+        settle(plane, given.tin, given.field, given.origin, q, centre, water[INDEX])
     for _ in range(STEPS if given.curved else 0):
         # refract at the tangent plane, then move the plane to where the light pierces it
         normal = vector(plane)

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.adjust.block import plain_block, similarity_gradients, taken, true_start
+from pcfix.adjust.block import plain_block, similarity_gradients, taken, true_start, used_as_dry
 from pcfix.errors import GeometryError
 from pcfix.model import (
     Cameras,
@@ -40,13 +40,11 @@ from pcfix.water.fit import heights_from_cloud
 from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:  # not quick to load
-    from pcfix.adjust.from_cloud import Mended
+    from pcfix.adjust.from_cloud import Undone
     from pcfix.adjust.problem import Intersected
 
 ORDER = ("tie points", "GNSS", "bed", "land", "neighbours")
 """The signs in the order in which they decide."""
-SIZES = ("land", "GNSS", "tie points", "bed")
-"""Signs by how well they know the likely error: measured on land before predicted."""
 
 LEAST_POINTS = 30
 """Tie points under water that are needed."""
@@ -71,11 +69,9 @@ MOST_STATED_M = 0.5
 """A larger standard deviation of the GNSS is a default of the software, as Metashape's 10 m."""
 
 TIE_POINTS, LEAST_TIE_VIEWS = 3000, 3
-CLOUD_POINTS, POINTS_PER_IMAGE, SAMPLE_POINTS = 1500, 10, 50_000
+CLOUD_POINTS, POINTS_PER_IMAGE, SURVEYED_POINTS = 1500, 10, 50_000
 LEAST_COORDINATES = 24
 """Of GNSS positions."""
-NEAREST = 3
-"""Points of a reference that give its height at a point of the cloud."""
 MOST_IMAGES, QUICK_IMAGES = 600, 200
 """For which the pattern of absorbed refraction is computed, and when it must be quick; the cost
 grows with their cube, and is a second for the latter."""
@@ -92,8 +88,7 @@ class Sign:
     speaks: bool | None  # whether it says that refraction was absorbed; None if it says nothing
     words: str  # what was found, or why it says nothing
     figures: dict[str, float] = field(default_factory=dict)
-    size_m: float | None = None  # likely error
-    basis: str = ""  # which error that is
+    error_m: float | None = None  # likely error of the heights, if it was absorbed
 
 
 @dataclass(frozen=True)
@@ -113,11 +108,12 @@ class Diagnosis:
         return None if self.decided_by is None else self.decided_by.speaks
 
     @property
-    def size(self) -> tuple[float, str] | None:
-        """The likely error in metres, and which error that is; None if nothing was absorbed."""
-        known = {sign.name: sign for sign in self.signs if sign.size_m is not None and sign.speaks}
-        best = next((known[name] for name in SIZES if name in known), None)
-        return None if best is None or not self.absorbed else (float(best.size_m or 0), best.basis)
+    def likely_error_m(self) -> float | None:
+        """The error that land shows, else that of the sign that decides; None if none is likely."""
+        if self.decided_by is None or not self.absorbed:
+            return None
+        land = [sign for sign in self.signs if sign.name == "land" and sign.speaks]
+        return (land or [self.decided_by])[-1].error_m
 
     def sentence(self, command: str, because: str = "") -> str:
         """Return a warning with the command that helps; empty if the poses seem right.
@@ -126,8 +122,8 @@ class Diagnosis:
         """
         if not self.absorbed or self.decided_by is None:
             return ""
-        size = self.size
-        error = "" if size is None else f" The likely error is {size[0]:.2g} m ({size[1]})."
+        likely = self.likely_error_m
+        error = "" if likely is None else f" The likely error of heights is {likely:.2g} m."
         have = "seem to have" if self.decided_by.name == "neighbours" else "have"
         return (
             f"The poses {have} absorbed the refraction: {self.decided_by.words}.{error} Correcting"
@@ -138,7 +134,7 @@ class Diagnosis:
         """Return plain values, ready for JSON."""
         return {
             "absorbed": self.absorbed,
-            "likely_error_m": None if self.size is None else self.size[0],
+            "likely_error_m": self.likely_error_m,
             "signs": [
                 {"name": s.name, "absorbed": s.speaks, "words": s.words, **s.figures}
                 for s in self.signs
@@ -209,24 +205,14 @@ def tie_point_sign(straight: Intersected, refracted: Intersected, depth_m: Float
     return Sign(name, speaks, words, figures)
 
 
-def sized(sign: Sign, mended: Mended) -> Sign:
-    """Return a sign with the likely error, if refraction was absorbed."""
-    if not sign.speaks:
-        return sign
-    size, basis = float(np.sqrt(np.mean(mended.bed_m**2))), "bed after its correction"
-    if len(mended.land_m):
-        basis = f"land; of the {basis} {size:.2g} m"
-        size = float(np.sqrt(np.mean(mended.land_m**2)))
-    return replace(sign, size_m=size, basis=f"RMS, heights of the {basis}")
-
-
 # GNSS
 
 
-def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, mended: Mended) -> Sign:
+def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, undone: Undone) -> Sign:
     """Look for the pattern in which this water bends the block in adjusted minus GNSS positions.
 
-    The pattern is the centres minus those that an adjustment with water finds without the GNSS.
+    The pattern is the centres minus those that an adjustment with water finds without the GNSS
+    (`pcfix.adjust.from_cloud.undo_absorption`).
 
     Parameters
     ----------
@@ -239,14 +225,14 @@ def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, mende
     off = b pattern + shift, turn and scale of the block + noise, by least squares. The noise is
     that of the residuals, or that stated of the GNSS if it is larger.
     """
-    centres, off_m = centres[mended.row], off_m[mended.row]
+    centres, off_m = centres[undone.row], off_m[undone.row]
     rows = np.isfinite(off_m)
     y, base = off_m[rows], similarity_gradients(centres - centres.mean(axis=0))[rows]
-    clear = _rest((centres - mended.cameras.centres)[rows], base)
+    clear = _rest((centres - undone.cameras.centres)[rows], base)
     share = float(clear @ y) / max(float(clear @ clear), 1e-300)
     left = _rest(y, np.column_stack([base, clear]))
     noise = float(np.linalg.norm(left) / np.sqrt(max(len(y) - 8, 1)))
-    stated = sigma_m[mended.row][rows]
+    stated = sigma_m[undone.row][rows]
     if np.isfinite(stated).any() and np.nanmedian(stated) < MOST_STATED_M:
         noise = max(noise, float(np.nanmedian(stated)))
     sigma = noise / max(float(np.linalg.norm(clear)), 1e-150)
@@ -258,7 +244,7 @@ def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, mende
     is_useful = share <= MOST_SHARE and sigma <= MOST_SIGMA
     speaks = _exceeds(share, sigma, SHARE) if is_useful else None
     figures = {"share": share, "sigma_share": sigma, "rms_m": rms}
-    return sized(Sign("GNSS", speaks, words, figures), mended)
+    return Sign("GNSS", speaks, words, figures, undone.error_m)
 
 
 def _rest(y: FloatArray, columns: FloatArray) -> FloatArray:
@@ -286,7 +272,7 @@ def land_sign(higher_m: FloatArray, gsd_m: float, against: str) -> Sign:
     return Sign(
         "land", True if abs(bias) > limit else None, words,
         {"bias_m": bias, "spread_m": spread, "limit_m": limit, "places": float(len(found))},
-        abs(bias), f"height of the land against {against}",
+        abs(bias),
     )  # fmt: skip
 
 
@@ -313,7 +299,7 @@ def bed_sign(apparent_m: FloatArray, true_m: FloatArray, refractive_index: float
     return Sign(
         "bed", _exceeds(share, sigma, limit), words,
         {"share": share, "sigma_share": sigma, "limit": limit},
-        float(np.sqrt(np.mean(after**2))), "RMS, corrected depths against measured ones",
+        float(np.sqrt(np.mean(after**2))),
     )  # fmt: skip
 
 
@@ -336,71 +322,88 @@ def neighbours_sign(share: float, sigma: float, *, is_fused: bool) -> Sign:
     return Sign("neighbours", speaks, words, {"share": share, "sigma_share": sigma})
 
 
-# Evidence
+# All signs
 
 
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """What the signs are looked for in."""
+def diagnosed(
+    cameras: Cameras,
+    water: WaterSurface,
+    n: float,
+    *,
+    ties: TiePoints | None = None,
+    gnss: GnssPositions | None = None,
+    view: Any = None,
+    control: GroundControl | None = None,
+    reference: Any = None,
+    neighbours: Sign | None = None,
+    in_passing: bool = False,
+) -> Diagnosis:
+    """Look for every sign that the evidence allows.
 
-    cameras: Cameras  # in the cloud's CRS, with the GNSS positions to compare with
-    name: str  # of their file, for messages
-    water: WaterSurface
-    refractive_index: float
-    ties: TiePoints | None = None
-    view: Any = None  # a `pcfix.flow.surfaces.CloudView`, for heights and in place of tie points
-    control: GroundControl | None = None
-    reference: Any = None  # a survey of land and bed, with `xyz` and `sparse`
-    gnss: GnssPositions | None = None  # in the frame of the cameras, NaN if unknown
-    neighbours: Sign | None = None  # of `neighbours_sign`
-    in_passing: bool = False  # whether it must be quick
-
-
-def diagnosed(evidence: Evidence) -> Diagnosis:
-    """Look for every sign that the evidence allows."""
-    signs = [] if evidence.neighbours is None else [evidence.neighbours]
-    cameras, lenses = evidence.cameras, evidence.cameras.lenses
-    if not isinstance(evidence.water, WaterDimension):  # which has heights at points of the cloud
-        if cameras.rotations is not None and lenses and all(one.unit == "px" for one in lenses):
-            signs += _signs_of_rays(evidence)
-        if evidence.view is not None:
-            signs += _signs_of_surveys(evidence)
+    Parameters
+    ----------
+    cameras : Cameras
+        In the cloud's CRS.
+    n : float
+        Refractive index.
+    gnss : GnssPositions, optional
+        In the frame of the cameras, NaN if unknown.
+    view : pcfix.flow.surfaces.CloudView, optional
+        The cloud, for its heights and in place of tie points.
+    reference : pcfix.compare.match.Reference, optional
+        A survey of land and bed.
+    neighbours : Sign, optional
+        Of `neighbours_sign`.
+    in_passing : bool
+        Whether it must be quick: GNSS positions are used only if nothing else decides.
+    """
+    signs = [] if neighbours is None else [neighbours]
+    if isinstance(water, WaterDimension):  # which has heights at points of the cloud only
+        return Diagnosis(tuple(signs))
+    lenses = cameras.lenses
+    if cameras.rotations is not None and lenses and all(one.unit == "px" for one in lenses):
+        signs += _signs_of_rays(cameras, water, n, ties, gnss, view, in_passing=in_passing)
+    if view is not None:
+        signs += _signs_of_surveys(cameras, water, n, view, control, reference)
     return Diagnosis(tuple(sorted(signs, key=lambda sign: ORDER.index(sign.name))))
 
 
-def _signs_of_rays(evidence: Evidence) -> list[Sign]:
-    """Look at tie points; and at the GNSS, which in passing must decide only if they do not."""
-    cameras, gnss = evidence.cameras, evidence.gnss
-    signs, apparent = _signs_of_ties(evidence)
+def _signs_of_rays(
+    cameras: Cameras, water: WaterSurface, n: float, ties: TiePoints | None,
+    gnss: GnssPositions | None, view: Any, *, in_passing: bool,
+) -> list[Sign]:  # fmt: skip
+    """Look at tie points and at the GNSS, and predict the error if they say that it is there."""
+    signs, apparent = _sign_of_ties(cameras, water, n, ties)
     off = np.full((len(cameras), 3), np.nan) if gnss is None else cameras.centres - gnss.xyz
     is_known = int(np.isfinite(off).sum()) >= LEAST_COORDINATES
-    is_open = not evidence.in_passing or all(sign.speaks is None for sign in signs)
+    is_open = not in_passing or all(sign.speaks is None for sign in signs)
     if not any(sign.speaks for sign in signs) and not (is_known and is_open):
         return signs
-    from pcfix.adjust.from_cloud import mended  # not quick to load
+    from pcfix.adjust.from_cloud import undo_absorption  # not quick to load
 
-    count, most = len(cameras), QUICK_IMAGES if evidence.in_passing else MOST_IMAGES
+    count, most = len(cameras), QUICK_IMAGES if in_passing else MOST_IMAGES
     wanted = max(CLOUD_POINTS, POINTS_PER_IMAGE * count)
     try:
-        if count > most or (apparent is None and evidence.view is None):
+        if count > most or (apparent is None and view is None):
             why = f"{count} images (limit {most})" if count > most else "no cloud"
             raise GeometryError("adjust.no_pattern", why)
-        if apparent is None:
-            apparent = _sample_of(evidence.view, wanted)
-        some = apparent[:: max(1, len(apparent) // wanted)]
-        true = mended(some, cameras, evidence.water, evidence.refractive_index)
+        if apparent is None:  # points of the cloud, evenly spread over it
+            every = max(1, view.points // wanted)
+            apparent = np.vstack([np.zeros((0, 3)), *(one.xyz[::every] for one in view.chunks())])
+        true = undo_absorption(apparent[:: max(1, len(apparent) // wanted)], cameras, water, n)
     except GeometryError as error:
         words = f"the pattern of absorbed refraction is unknown ({error})"
         return signs + [Sign("GNSS", None, words)] * is_known
-    signs = [sized(sign, true) for sign in signs]
+    signs = [replace(sign, error_m=true.error_m) for sign in signs]
     if gnss is not None and is_known:
         signs.append(gnss_sign(cameras.centres, off, gnss.sigma_m, true))
     return signs
 
 
-def _signs_of_ties(evidence: Evidence) -> tuple[list[Sign], FloatArray | None]:
+def _sign_of_ties(
+    cameras: Cameras, water: WaterSurface, n: float, ties: TiePoints | None
+) -> tuple[list[Sign], FloatArray | None]:
     """Intersect some tie points with straight and refracted rays; return the straight ones too."""
-    ties, n = evidence.ties, evidence.refractive_index
     if ties is None:
         return [], None
     counts = np.diff(ties.views.start)
@@ -409,72 +412,48 @@ def _signs_of_ties(evidence: Evidence) -> tuple[list[Sign], FloatArray | None]:
         return [], None
     from pcfix.adjust.problem import intersect_fixed  # not quick to load
 
-    some = taken(ties, rows[:: max(1, len(rows) // TIE_POINTS)])
-    block = plain_block(evidence.cameras, some, None, n)
+    block = plain_block(cameras, taken(ties, rows[:: max(1, len(rows) // TIE_POINTS)]), None, n)
     straight = intersect_fixed(block)
-    above = surface_above(evidence.water, straight.xyz)
+    above = surface_above(water, straight.xyz)
     wet = is_submerged(straight.xyz[:, 2], above)
-    begin = true_start(straight.xyz, evidence.water, n, wet)
-    refracted = intersect_fixed(replace(block, xyz=begin, wet=wet, water=evidence.water))
+    begin = true_start(straight.xyz, water, n, wet)
+    refracted = intersect_fixed(replace(block, xyz=begin, wet=wet, water=water))
     sign = tie_point_sign(straight, refracted, above.height_m - straight.xyz[:, 2])
     return [sign], straight.xyz[np.isfinite(straight.squares)]
 
 
-def _sample_of(view: Any, wanted: int) -> FloatArray:
-    """Return about so many points of a cloud, evenly spread over it, shape (m, 3)."""
-    every = max(1, view.points // wanted)
-    return np.vstack([np.zeros((0, 3)), *(seen.xyz[::every] for seen in view.chunks())])
-
-
-def _signs_of_surveys(evidence: Evidence) -> list[Sign]:
+def _signs_of_surveys(
+    cameras: Cameras, water: WaterSurface, n: float, view: Any, control: GroundControl | None,
+    reference: Any,
+) -> list[Sign]:  # fmt: skip
     """Compare the cloud with control points on land, and with a survey of land and bed."""
-    view, control, centres = evidence.view, evidence.control, evidence.cameras.centres
     # about the size of a pixel at the water
-    level = surface_above(evidence.water, centres).height_m
-    above = centres[:, 2] - np.where(np.isfinite(level), level, np.nanmean(level))
-    focal = [one.focal if one.unit == "px" else np.inf for one in evidence.cameras.lenses or ()]
+    level = surface_above(water, cameras.centres).height_m
+    above = cameras.centres[:, 2] - np.where(np.isfinite(level), level, np.nanmean(level))
+    focal = [one.focal if one.unit == "px" else np.inf for one in cameras.lenses or ()]
     gsd, signs = float(np.mean(above / focal)) if focal else 0.0, list[Sign]()
+    radius = float(np.clip(10.0 * gsd, 0.2, 2.0))
+
+    def cloud_z(xyz: FloatArray) -> FloatArray:
+        """Return the heights of the cloud at places, NaN where it has none."""
+        xy = np.ascontiguousarray(xyz[:, :2])
+        return heights_from_cloud(xy, (seen.xyz for seen in view.chunks()), radius)
+
     if control is not None:
-        level = surface_above(evidence.water, control.xyz).height_m
+        level = surface_above(water, control.xyz).height_m
         dry = control.xyz[~control.under_water & ~(control.xyz[:, 2] < level)]
-        higher = _cloud_heights(view, dry, gsd) - dry[:, 2]
-        signs.append(land_sign(higher, gsd, "the control points"))
-    surveyed = np.zeros((0, 3)) if evidence.reference is None else evidence.reference.xyz
-    if evidence.reference is None or evidence.reference.sparse:
-        cloud_z = _cloud_heights(view, surveyed, gsd)
-    else:
-        cloud, surveyed = _at_points_of_cloud(view, surveyed)
-        cloud_z = cloud[:, 2]
-    level = surface_above(evidence.water, surveyed).height_m
+        signs.append(land_sign(cloud_z(dry) - dry[:, 2], gsd, "the control points"))
+        deep = used_as_dry(control, water)
+        if deep:
+            words = f"control points {', '.join(deep)} lie below the water: mark them under_water"
+            signs.append(Sign("land", None, words))
+    if reference is None:
+        return signs
+    surveyed = reference.xyz[:: 1 + len(reference.xyz) // SURVEYED_POINTS]
+    level, found = surface_above(water, surveyed).height_m, cloud_z(surveyed)
     land, bed = surveyed[:, 2] > level + LAND_M, surveyed[:, 2] < level
     if land.any():
-        signs.append(land_sign(cloud_z[land] - surveyed[land, 2], gsd, "the reference"))
+        signs.append(land_sign((found - surveyed[:, 2])[land], gsd, "the reference"))
     if bed.any():
-        apparent, true = level - cloud_z, level - surveyed[:, 2]
-        signs.append(bed_sign(apparent[bed], true[bed], evidence.refractive_index))
+        signs.append(bed_sign((level - found)[bed], (level - surveyed[:, 2])[bed], n))
     return signs
-
-
-def _cloud_heights(view: Any, xyz: FloatArray, gsd_m: float) -> FloatArray:
-    """Return the heights of a cloud at single places, shape (p,); NaN where it has none."""
-    radius = float(np.clip(10.0 * gsd_m, 0.2, 2.0))
-    xy = np.ascontiguousarray(xyz[:, :2])
-    if not len(xy):
-        return np.zeros(0)
-    return heights_from_cloud(xy, (seen.xyz for seen in view.chunks()), radius)
-
-
-def _at_points_of_cloud(view: Any, reference: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points of a cloud, and the reference at their places."""
-    from scipy.spatial import cKDTree
-
-    cloud = _sample_of(view, SAMPLE_POINTS)
-    if len(reference) < NEAREST or not len(cloud):
-        return cloud[:0], reference[:0]
-    size = np.ptp(reference[:, :2], axis=0)
-    spacing = float(np.sqrt(max(size.prod(), 1e-9) / len(reference)))
-    found = cKDTree(reference[:, :2]).query(cloud[:, :2], k=NEAREST)
-    distance, row = np.asarray(found[0]), np.asarray(found[1])
-    near = distance[:, -1] < 3.0 * spacing
-    z = reference[row[near], 2].mean(axis=1)
-    return cloud[near], np.column_stack([cloud[near, :2], z])

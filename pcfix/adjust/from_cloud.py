@@ -33,10 +33,8 @@ from scipy.special import chdtri
 
 from pcfix.adjust.block import (
     Block,
-    LogRow,
     Progress,
     Unknowns,
-    check_datum,
     plain_block,
     some_cameras,
     ties_of_cloud,
@@ -48,10 +46,9 @@ from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import (
     Problem,
     Solution,
-    counts_of,
     intersect_fixed,
+    log_row,
     prepare,
-    priors_at,
     solved_cameras,
     survey_cost,
 )
@@ -137,41 +134,29 @@ def adjust_cloud(
         gain = (chosen.misfit - more.misfit) / max(chosen.misfit / chosen.redundancy, 1.0)
         if gain > chdtri(extra * len(chosen.problem.groups), SURE):
             chosen = more
-    notes = _notes(chosen, lens_sets)
-    # only GNSS and control points have noise
+    # only GNSS and control points have noise; the precision is about that with tie points of the
+    # standard deviation of the cloud
     sigma0 = float(np.sqrt(chosen.misfit / chosen.redundancy))
-    try:  # about as precise as with tie points of this standard deviation
-        known = precision_of(chosen.problem, chosen.found, max(sigma0, 1.0))
-    except GeometryError as error:
-        known = None
-        words = f"The precision of the poses is unknown, and SigmaZ will not include it: {error}"
-        notes.append(PcfixWarning("adjust.no_precision", words, reason=error.code))
+    known = precision_of(chosen.problem, chosen.found, max(sigma0, 1.0))
+    notes = _notes(chosen, lens_sets)
     found = adjusted_of(chosen.problem, chosen.found, known, notes, "cloud")
     return replace(found, sigma0=sigma0, redundancy=chosen.redundancy)
 
 
 def _check(block: Block, unknowns: Unknowns) -> None:
     """Refuse what needs measured tie points."""
-    check_datum(block, unknowns)
     has_gnss = bool((block.gnss_weights > 0.0).any())
     if (unknowns.free_network and not has_gnss) or unknowns.poses != "free":
-        words = (
-            "Without tie points the poses must be free, and need GNSS positions or control points."
-            " Give --gnss or --gcps, or a model with tie points."
-        )
-        raise GeometryError("adjust.cloud_needs_datum", words)
-    if any(unknowns.water_sigma):
-        words = (
-            "Level, tilt and refractive index can be free with measured tie points only. Give a"
-            " model with tie points, or fix the water."
-        )
-        raise GeometryError("adjust.cloud_needs_water", words)
-    if len(block.conditions.on):
-        words = (
-            "Points on the water or on a plane need measured tie points. Give a model with tie"
-            " points, or remove the roles waterline and on:NAME from --gcps."
-        )
-        raise GeometryError("adjust.cloud_has_conditions", words)
+        code, words = "needs_datum", "the poses must be free, with GNSS positions or control points"
+    elif any(unknowns.water_sigma):
+        code, words = "needs_water", "level, tilt and refractive index must be fixed"
+    elif len(block.conditions.on):
+        code = "has_conditions"
+        words = "no point of --gcps can lie on the water or on a plane (waterline, on:NAME)"
+    else:
+        return
+    words = f"Without tie points {words}. Change that, or give a model with tie points."
+    raise GeometryError(f"adjust.cloud_{code}", words)
 
 
 def _notes(chosen: Trial, lens_sets: list[tuple[str, ...]]) -> list[PcfixWarning]:
@@ -180,18 +165,17 @@ def _notes(chosen: Trial, lens_sets: list[tuple[str, ...]]) -> list[PcfixWarning
     fixed = dict.fromkeys(name for names in lens_sets for name in names if name not in free)
     words = (
         f"No tie points: {count:,} images of points of the cloud were used with a standard"
-        f" deviation of {chosen.sigma_px:g} px. Lens parameters free: {', '.join(free) or 'none'}"
-        + (f" (undetermined and fixed: {', '.join(fixed)})." if fixed else ".")
+        f" deviation of {chosen.sigma_px:g} px. Lens parameters free: {', '.join(free) or 'none'}."
     )
-    sigma = {"sigma_px": chosen.sigma_px}
-    notes = [PcfixWarning("adjust.by_cloud", words, free=list(free), fixed=list(fixed), **sigma)]
+    values = {"free": list(free), "fixed": list(fixed), "sigma_px": chosen.sigma_px}
+    notes = [PcfixWarning("adjust.by_cloud", words, **values)]
     if chosen.sigma_px >= POOR_PX:
         words = (
             f"Points of the cloud fit GNSS and control points only with {chosen.sigma_px:g} px, so"
             " bed and focal length may be wrong by more than all figures say. Give tie points,"
             " control points or a calibrated lens."
         )
-        notes.append(PcfixWarning("adjust.poor_cloud", words, **sigma))
+        notes.append(PcfixWarning("adjust.poor_cloud", words, sigma_px=chosen.sigma_px))
     return notes
 
 
@@ -201,8 +185,14 @@ def _trial(
     m, owner = given.block.tie_points, given.block.owner
     block = replace(given.block, sigma_px=np.where(owner < m, sigma_px, given.block.sigma_px))
     problem, start = prepare(block, unknowns)
+    # the Jacobians of the straight collinearity at the original solution
     before, at_rest = prepare(replace(block, cameras=given.original), unknowns)
-    tests = straight_columns(before, at_rest, given.apparent_xyz - before.origin)
+    o, nowhere = len(owner), np.zeros(len(block.xyz), np.bool_)
+    dry = before.given._replace(wet=nowhere, weight=np.ones(o))
+    apparent = np.ascontiguousarray(given.apparent_xyz - before.origin)
+    rows = linearised(at_rest.state._replace(xyz=apparent), dry, UNDAMPED, 0, len(apparent))
+    tests = np.zeros((o, 2, SHARED + dry.shared))
+    tests[rows.observation[rows.is_image]] = rows.columns[rows.is_image]
     found = solve_unaware(problem, start, tests[: block.start[m]], progress)
     marks, weight = problem.used & (owner >= m), problem.given.weight
     r = residuals(found.state, problem.given)[marks]
@@ -216,28 +206,6 @@ def _trial(
 # The equations
 
 
-def straight_columns(problem: Problem, start: Solution, apparent_xyz: FloatArray) -> FloatArray:
-    """Return the Jacobians of the straight collinearity at the original solution.
-
-    Parameters
-    ----------
-    apparent_xyz : array, shape (m, 3)
-        The points of the original adjustment, block frame.
-
-    Returns
-    -------
-    array, shape (o, 2, 9 + g)
-        By pose, point and shared unknowns; the residuals are orthogonal to these columns.
-    """
-    o = len(problem.given.camera)
-    dry = problem.given._replace(wet=np.zeros(len(problem.given.wet), np.bool_), weight=np.ones(o))
-    state = start.state._replace(xyz=np.ascontiguousarray(apparent_xyz))
-    rows = linearised(state, dry, UNDAMPED, 0, len(apparent_xyz))
-    tests = np.zeros((o, 2, SHARED + problem.given.shared))
-    tests[rows.observation[rows.is_image]] = rows.columns[rows.is_image]
-    return tests
-
-
 def solve_unaware(
     problem: Problem, start: Solution, tests: FloatArray, progress: Progress | None = None
 ) -> Solution:
@@ -249,8 +217,9 @@ def solve_unaware(
         Of `pcfix.adjust.problem.prepare`; points of the cloud were observed where the original
         cameras image them.
     tests : array, shape (t, 2, 9 + g)
-        Of `straight_columns`, for the points of the cloud. The others, control points, are adjusted
-        by least squares.
+        Jacobians of the straight collinearity at the original solution, by pose, point and shared
+        unknowns, for the points of the cloud. The others, control points, are adjusted by least
+        squares.
     """
     given = problem.given._replace(tests=tests)
     tested = replace(problem, given=given)
@@ -269,13 +238,12 @@ def solve_unaware(
         if moved is None or not size < LARGE_STEP_M:
             break
         now = moved
-        cost = survey_cost(problem, now) + priors_at(problem, now)[0]
-        row = LogRow(1, number, *counts_of(problem, now))
+        row = log_row(problem, now.state, 1, number)
         log.append(row)
         if progress is not None:
             progress(row)
         if size < CLOSE_M:
-            return replace(now, cost=cost, log=log)
+            return replace(now, cost=survey_cost(problem, now), log=log)
     raise _unsolved(f"the steps do not converge (last step {size:.2g} m)")
 
 
@@ -297,18 +265,17 @@ OWN_SIGMA_M = 1.0
 LEAST_IMAGES_OF_POINT, LEAST_POINTS, LEAST_IMAGES = 3, 10, 5
 
 
-class Mended(NamedTuple):
-    """The poses if they had absorbed the refraction, and the errors that this implies."""
+class Undone(NamedTuple):
+    """The poses if they had absorbed the refraction, and the error that this implies."""
 
     cameras: Cameras  # those with enough points
     row: IntArray  # (k,), their rows among all cameras
-    land_m: FloatArray  # (m,), by how much land is too low now
-    bed_m: FloatArray  # (w,), the same of the bed after its correction with the present poses
+    error_m: float  # RMS, heights of the land now, or if there is none of the corrected bed
 
 
-def mended(
+def undo_absorption(
     xyz: FloatArray, cameras: Cameras, water: WaterSurface, refractive_index: float
-) -> Mended:
+) -> Undone:
     """Return the poses that an adjustment with water would have found; the block stays in place.
 
     Parameters
@@ -335,5 +302,6 @@ def mended(
     trial = _trial(CloudBlock(block, cameras, ties.xyz), Unknowns(lens=("f",)), SIGMA_PX, None)
     problem, found = trial.problem, trial.found
     higher = found.state.xyz[:, 2] + problem.origin[2] - intersect_fixed(block).xyz[:, 2]
-    known = np.isfinite(higher)
-    return Mended(solved_cameras(problem, found), row, higher[~wet & known], higher[wet & known])
+    is_land = ~wet if (~wet & np.isfinite(higher)).any() else wet
+    error_m = float(np.sqrt(np.nanmean(higher[is_land] ** 2)))
+    return Undone(solved_cameras(problem, found), row, error_m)

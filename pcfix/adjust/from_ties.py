@@ -38,7 +38,6 @@ LEAST_SHARE = 0.5
 
 MAD_TO_SIGMA = 1.4826
 OUTLIER_ROUNDS = 3
-LAST_ROUND = 2 + OUTLIER_ROUNDS
 MANY_OUT = 0.05
 """Share of outliers that is worth a warning."""
 
@@ -71,27 +70,24 @@ def adjust_ties(
         "tie point observations are in front of their cameras at the start. Check that poses and"
         " tie points belong to one model, and the camera axes.",
     )  # fmt: skip
-    clean, now = _cleaned(problem, now, sigma_px, outliers, progress)
     estimate, notes = sigma_px is None, list[PcfixWarning]()
-    problem, now, precision = _settled(clean, now, LAST_ROUND, estimate, progress)
+    clean, now = _cleaned(problem, now, estimate, outliers, progress)
+    problem, now, precision = _settled(clean, now, estimate, progress)
     if choose_lens:
         weak = weak_lens_parameters(problem, now, precision)
         kept = [name for name in unknowns.lens if name not in weak]
         more = missing_lens_parameters(problem, now, sigma0_of(problem, now))
-        tests = f" ({', '.join(more)} found by tests of the residuals)" if more else ""
-        words = f"Lens parameters free: {', '.join([*kept, *more])}{tests}."
-        notes = [PcfixWarning("adjust.lens", words, free=[*kept, *more], found=more)]
+        if more:
+            words = f"Tests of the residuals freed {', '.join(more)} of the lens."
+            notes.append(PcfixWarning("adjust.lens", words, found=more))
         if weak:
             words = f"The block does not determine {', '.join(weak)} of the lens; they were fixed."
             notes.append(PcfixWarning("adjust.weak_lens", words, fixed=weak))
         if weak or more:
             clean, now = _with_lens(clean, now, (*kept, *more), outliers, progress)
-            problem, now, precision = _settled(clean, now, LAST_ROUND + 2, estimate, progress)
-    factor, shared = disagreement_of(problem, now, precision)
-    factor = factor * common_errors(problem, precision)
+            problem, now, precision = _settled(clean, now, estimate, progress)
+    factor = disagreement_of(problem, now, precision) * common_errors(problem, precision)
     precision = precision_of(problem, now, precision.sigma0, factor)
-    quality = weighed(clean, now)[1] if estimate else []
-    notes += [*quality, *shared]
     counted = np.isfinite(block.sigma_px) & problem.of_ties
     share = 1.0 - float(problem.used[counted].mean())
     if share >= MANY_OUT:
@@ -106,20 +102,18 @@ def adjust_ties(
 
 
 def _cleaned(
-    problem: Problem, now: Solution, sigma_px: float | None, outliers: bool,
-    progress: Progress | None,
-) -> tuple[Problem, Solution]:  # fmt: skip
+    problem: Problem, now: Solution, estimate: bool, outliers: bool, progress: Progress | None
+) -> tuple[Problem, Solution]:
     """Return the problem with the noise of its tie points estimated and outliers excluded."""
-    estimate = sigma_px is None
     if outliers or estimate:
-        now = solve(problem, now, HUBER, number=1, progress=progress, close=ROUGHLY)
+        now = solve(problem, now, HUBER, progress, close=ROUGHLY)
     if estimate:
-        problem = with_sigma(problem, noise_px(problem, now))
+        problem = with_noise(problem, now)
     if not outliers:
         return problem, now
     for number in range(OUTLIER_ROUNDS):
         loss = CAUCHY if number == 0 else SQUARES
-        now = solve(problem, now, loss, number=2 + number, progress=progress, close=ROUGHLY)
+        now = solve(problem, now, loss, progress, close=ROUGHLY)
         before = problem.used
         problem = without_outliers(problem, now)
         _check_most(
@@ -128,7 +122,7 @@ def _cleaned(
             " poses belong to one model, and the water level; or align the images again.",
         )  # fmt: skip
         if estimate:
-            problem = with_sigma(problem, noise_px(problem, now))
+            problem = with_noise(problem, now)
         if number and (problem.used == before).all():
             break
     return problem, now
@@ -143,22 +137,21 @@ def _check_most(problem: Problem, good: BoolArray, code: str, what: str) -> None
 
 
 def _settled(
-    problem: Problem, now: Solution, number: int, estimate: bool, progress: Progress | None
+    problem: Problem, now: Solution, estimate: bool, progress: Progress | None
 ) -> tuple[Problem, Solution, Precision]:
     """Return the least squares solution without outliers, and its precision.
 
     The noise is now estimated from all residuals, long tails included, so that GNSS and control
-    points, whose standard deviations are given, get the right weight beside the images.
+    points, whose standard deviations are given, get the right weight relative to the images.
     """
     if estimate:
-        problem = with_sigma(problem, noise_px(problem, now, robust=False))
-        problem = weighed(problem, now)[0]
-    now = solve(problem, now, number=number, progress=progress)
-    return problem, now, precision_of(problem, now, sigma0_of(problem, now))
+        problem = weighed(with_noise(problem, now, robust=False), now)
+    now = solve(problem, now, progress=progress)
+    return problem, now, precision_of(problem, now, sigma0_of(problem, now), only_poses=True)
 
 
-def noise_px(problem: Problem, now: Solution, *, robust: bool = True) -> float:
-    """Return the standard deviation of the tie points' image coordinates, from their residuals.
+def with_noise(problem: Problem, now: Solution, *, robust: bool = True) -> Problem:
+    """Return the problem with the noise of its tie points as their residuals show it.
 
     Robust is by the median, which outliers do not move, else by the mean square. The share of the
     redundancy corrects for what the points absorb.
@@ -169,12 +162,7 @@ def noise_px(problem: Problem, now: Solution, *, robust: bool = True) -> float:
     points = len(np.unique(problem.block.owner[rows]))
     share = max(1.0 - 3.0 * points / max(2.0 * len(r), 1.0), 0.05)
     typical = MAD_TO_SIGMA * np.median(np.abs(r)) if robust else np.sqrt(np.mean(r * r))
-    return float(max(typical / np.sqrt(share), 1e-6))
-
-
-def with_sigma(problem: Problem, sigma_px: float) -> Problem:
-    """Return the problem with another standard deviation of the tie points."""
-    rows = problem.of_ties & problem.used
+    sigma_px = max(typical / np.sqrt(share), 1e-6)
     return problem.weighted(np.where(rows, 1.0 / sigma_px, problem.given.weight))
 
 
@@ -200,7 +188,7 @@ def _with_lens(
     wide, start = prepare(problem.block, replace(problem.unknowns, lens=lens))
     wide = wide.weighted(problem.given.weight)
     start = replace(start, state=start.state._replace(xyz=now.state.xyz), log=now.log)
-    start = solve(wide, start, number=LAST_ROUND + 1, progress=progress, close=ROUGHLY)
+    start = solve(wide, start, progress=progress, close=ROUGHLY)
     if not outliers:
         return wide, start
     used = problem.given.weight[problem.of_ties].max(initial=0.0)

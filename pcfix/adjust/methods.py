@@ -55,21 +55,6 @@ _REMEDY = (
 )
 
 
-def unknowns_of(rules: AdjustRules, lens: tuple[str, ...]) -> Unknowns:
-    """Return what is free, with these lens parameters."""
-    tilt = None if rules.sigma_tilt is None else float(np.tan(np.radians(rules.sigma_tilt)))
-    stated = {"level": rules.sigma_level, "tilt": tilt, "index": rules.sigma_index}
-    surface: dict[str, float] = dict.fromkeys(rules.free, np.inf)
-    surface |= {name: sigma for name, sigma in stated.items() if sigma is not None}
-    return Unknowns(
-        poses=rules.poses,
-        fixed_images=rules.fixed_images,
-        lens=lens,
-        surface=surface,
-        free_network=rules.datum == "free",
-    )
-
-
 def adjust_block(
     material: Material,
     rules: AdjustRules,
@@ -99,12 +84,25 @@ def adjust_block(
             " --cloud'."
         )
         raise GeometryError("cameras.no_overlap", words, path=material.name)
-    block = block_of(material, ties, rules.sigma_image or FIRST_SIGMA_PX)
-    unknowns = unknowns_of(rules, lens)
+    tilt = None if rules.sigma_tilt is None else float(np.tan(np.radians(rules.sigma_tilt)))
+    stated = {"level": rules.sigma_level, "tilt": tilt, "index": rules.sigma_index}
+    surface: dict[str, float] = dict.fromkeys(rules.free, np.inf)
+    surface |= {name: sigma for name, sigma in stated.items() if sigma is not None}
+    is_free = rules.datum == "free"
+    unknowns = Unknowns(rules.poses, rules.fixed_images, lens, surface, free_network=is_free)
+    sigma_px, level_sigma_m = rules.sigma_image or FIRST_SIGMA_PX, surface.get("level", 0.0)
+    block = block_of(material, ties, sigma_px, level_sigma_m)
     check_datum(block, unknowns, material.no_gnss)
-    _check_wet(material.water, block.xyz[: len(ties.xyz)])
-    kept, notes = _well_seen(material.name, block)
-    block = restricted(block, kept)
+    xyz, water = block.xyz[: len(ties.xyz)], material.water
+    wet = len(xyz) if water is None else int((surface_above(water, xyz).height_m > xyz[:, 2]).sum())
+    if wet < SMALL_WATER:
+        words = (
+            f"Only {wet} of {len(xyz):,} points lie below the water, so there is no refraction to"
+            " adjust. Check the water level, or use an ordinary bundle adjustment."
+        )
+        raise GeometryError("water.below_points", words, wet=wet, points=len(xyz))
+    rows, notes = _well_seen(material.name, block)
+    block = restricted(block, rows)
     if cloud_xyz is None:
         found = adjust_ties(
             block, unknowns, progress, sigma_px=rules.sigma_image, outliers=rules.outliers,
@@ -116,55 +114,41 @@ def adjust_block(
         sets = [lens]
         if chooses_lens:
             sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), lens]))
-        given = CloudBlock(block, some_cameras(original, kept), apparent)
+        given = CloudBlock(block, some_cameras(original, rows), apparent)
         found = adjust_cloud(given, unknowns, sets, progress)
-    notes += [*_check_dry(material.water, found), *found.notes]
-    if found.precision is not None:
-        notes += [*undetermined(found.precision), *correlated(found.precision)]
-        if found.precision.members is None:
-            words = (
-                f"The block is too large ({len(block.cameras):,} images) for covariances of its"
-                " points, and the correction cannot use the errors of the poses."
-            )
-            notes.append(PcfixWarning("adjust.too_large", words, images=len(block.cameras)))
-        wet = found.is_wet & np.isfinite(found.xyz).all(axis=1)
-        notes += shape_notes(found.precision, (found.xyz - found.problem.origin)[wet, :2])
+    notes += [*_check_dry(water, found), *found.notes]
+    notes += [*undetermined(found.precision), *correlated(found.precision)]
+    if found.precision.members is None:
+        words = (
+            f"The block is too large ({len(block.cameras):,} images) for covariances of its points,"
+            " and the correction cannot use the errors of the poses."
+        )
+        notes.append(PcfixWarning("adjust.too_large", words, images=len(block.cameras)))
+    on_bed = found.is_wet & np.isfinite(found.xyz).all(axis=1)
+    notes += shape_notes(found.precision, (found.xyz - found.problem.origin)[on_bed, :2])
     return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])
 
 
 # Checks of what goes in
 
 
-def _check_wet(water: WaterSurface | None, xyz: FloatArray) -> None:
-    """Check that some points lie below the water."""
-    if water is None:
-        return
-    below = int((surface_above(water, xyz).height_m > xyz[:, 2]).sum())
-    if below < SMALL_WATER:
-        words = (
-            f"Only {below} of {len(xyz):,} points lie below the water, so there is no refraction to"
-            " adjust. Check the water level, or use an ordinary bundle adjustment."
-        )
-        raise GeometryError("water.below_points", words, wet=below, points=len(xyz))
-
-
 def _well_seen(name: str, block: Block) -> tuple[IntArray, list[PcfixWarning]]:
     """Return the rows of the images that can be adjusted, and a warning about others."""
-    kept, count = well_seen(block), len(block.cameras)
-    if len(kept) < 2:
+    rows, count = well_seen(block), len(block.cameras)
+    if len(rows) < 2:
         words = (
-            f"{name}: only {len(kept)} of {count} images have enough observations for a pose. Give"
+            f"{name}: only {len(rows)} of {count} images have enough observations for a pose. Give"
             " a model with more tie points."
         )
-        raise GeometryError("ties.few_images", words, path=name, images=len(kept))
-    lost = np.setdiff1d(np.arange(count), kept)
+        raise GeometryError("ties.few_images", words, path=name, images=len(rows))
+    lost = np.setdiff1d(np.arange(count), rows)
     if not len(lost):
-        return kept, []
+        return rows, []
     words = (
         f"{len(lost)} of {count} images (first {block.cameras.labels[lost[0]]}) have too few"
         " observations for a pose and were excluded."
     )
-    return kept, [PcfixWarning("ties.few_in_image", words, images=len(lost))]
+    return rows, [PcfixWarning("ties.few_in_image", words, images=len(lost))]
 
 
 def check_images(
@@ -282,12 +266,10 @@ def check_control(found: Adjusted, name: str) -> None:
     if not gross.any():
         return
     worst = int(np.argmax(np.where(gross, px, 0.0)))
-    others = len(np.unique(point[gross])) - 1
     name_of_worst = block.control_names[point[worst] - block.tie_points]
     words = (
         f"{name}: control point {name_of_worst} does not fit: its error is {px[worst]:.0f} px or"
-        f" {sigmas[worst]:.0f} standard deviations{f' ({others} more do not)' if others else ''}."
-        f" {_REMEDY}"
+        f" {sigmas[worst]:.0f} standard deviations. {_REMEDY}"
     )
     values = {"point": name_of_worst, "off_px": float(px[worst])}
     raise GeometryError("gcps.gross_error", words, path=name, **values)
@@ -303,12 +285,8 @@ SIGMAS, OF_GNSS = 3.0, 2.0
 """An offset is reported if it exceeds so many of its standard errors, and so many standard
 deviations of a position: smaller ones come from fixed lens parameters, and move the bed by less."""
 
-WEAK, FEW = 3.0, 6
-"""A datum is weak if the standard error of a centre exceeds so many of a position, or (adjusted by
-the cloud) if there are fewer positions and control points."""
-
-IN_LINE = 0.1
-"""Spread of positions across a line, over that along it, below which they lie on it."""
+FEW = 6
+"""GNSS positions and control points; fewer hardly determine the weight of a cloud."""
 
 BED_GSD = 1.5
 """Standard error of the heights of the bed, in ground pixels, that is worth a warning."""
@@ -345,92 +323,57 @@ def offset_of(found: Adjusted) -> tuple[FloatArray, FloatArray] | None:
 
 
 def datum_notes(found: Adjusted) -> list[PcfixWarning]:
-    """Return warnings if GNSS positions are a weak datum, or have a significant offset."""
+    """Return warnings if GNSS positions are few for a cloud, or have a significant offset."""
     known = np.isfinite(found.gnss_residual_m)
     if not known.any() or found.unknowns.poses != "free" or found.unknowns.free_network:
         return []
-    stated_m = float(np.median(found.block.gnss_sigma_m[known]))
-    places, line = _line(found)
-    control = sum(row.role == "control" for row in found.control)
-    notes, values = [], {"gnss": len(places), "control": control}
-    what = f"{len(places)} GNSS positions{', on a line,' if line is not None else ''} and {control}"
-    remedy = "Give positions of more images, spread over the block, or control points."
-    if found.source == "cloud" and len(places) + control < FEW:
-        words = f"Only {what} control points determine the weight of the cloud. {remedy}"
-        notes.append(PcfixWarning("gnss.few", words, **values))
-    if found.precision is None or found.source == "cloud":
-        return notes
-    sigma = found.precision.centre_sigma_m.max(axis=1)
-    if sigma.max() > WEAK * stated_m:
-        image = found.cameras.labels[int(sigma.argmax())]
-        words = (
-            f"{what} control points are a weak datum: the largest standard error of a projection"
-            f" centre is {sigma.max():.2f} m ({image}), that of a position {stated_m:.2f} m."
-            f" {remedy}"
+    if found.source == "cloud":
+        count, control = (
+            int(known.all(axis=1).sum()),
+            sum(r.role == "control" for r in found.control),
         )
-        more = {"sigma_m": float(sigma.max()), "image": image, "in_line": line is not None}
-        notes.append(PcfixWarning("gnss.weak", words, **values, **more))
+        if count + control >= FEW:
+            return []
+        words = (
+            f"Only {count} GNSS positions and {control} control points determine the weight of the"
+            " cloud. Give positions of more images, spread over the block, or control points."
+        )
+        return [PcfixWarning("gnss.few", words, gnss=count, control=control)]
+    stated_m = float(np.median(found.block.gnss_sigma_m[known]))
     offset_m, sigma_m = offset_of(found) or (np.zeros(3), np.zeros(3))
     is_off = np.abs(offset_m) > np.maximum(SIGMAS * sigma_m, OF_GNSS * stated_m)
-    if is_off.any():
-        parts = [
-            f"{abs(m):.2f} m {side[int(m < 0.0)]} the projection centres (standard error"
-            f" {sigma:.2f} m)"
-            for m, sigma, side, off in zip(offset_m, sigma_m, SIDES, is_off, strict=True)
-            if off
-        ]
-        level = ""
-        if is_off[2] and found.water is not None:
-            level = f", or a water level that is too {'low' if offset_m[2] > 0.0 else 'high'}"
-        words = (
-            f"The GNSS positions lie {' and '.join(parts)}: an antenna lever arm, another"
-            f" datum{level}. The block followed them. Correct them, or omit them if there are"
-            " control points."
-        )
-        more = {"offset_m": offset_m.tolist(), "sigma_m": sigma_m.tolist()}
-        notes.append(PcfixWarning("gnss.offset_found", words, **more))
-    return notes
-
-
-def _line(found: Adjusted) -> tuple[FloatArray, FloatArray | None]:
-    """Return the GNSS positions that were used, and the direction of the line they lie on."""
-    places = found.block.gnss_xyz[np.isfinite(found.gnss_residual_m[:, :2]).all(axis=1)]
-    if len(places) < 2:
-        return places, None
-    off = places[:, :2] - places[:, :2].mean(axis=0)
-    _, spread, axes = np.linalg.svd(off, full_matrices=False)
-    return places, np.append(axes[0], 0.0) if spread[1] < IN_LINE * spread[0] else None
+    if not is_off.any():
+        return []
+    parts = [
+        f"{abs(m):.2f} m {side[int(m < 0.0)]} the projection centres (standard error {sigma:.2f} m)"
+        for m, sigma, side, off in zip(offset_m, sigma_m, SIDES, is_off, strict=True)
+        if off
+    ]
+    level = ""
+    if is_off[2] and found.water is not None:
+        level = f", or a water level that is too {'low' if offset_m[2] > 0.0 else 'high'}"
+    words = (
+        f"The GNSS positions lie {' and '.join(parts)}: an antenna lever arm, another datum{level}."
+        " The block followed them. Correct them, or omit them if there are control points."
+    )
+    more = {"offset_m": offset_m.tolist(), "sigma_m": sigma_m.tolist()}
+    return [PcfixWarning("gnss.offset_found", words, **more)]
 
 
 def bed_notes(found: Adjusted) -> list[PcfixWarning]:
-    """Return a warning if the heights of the bed are imprecise, with the cause."""
-    precision, bed = found.precision, found.is_wet & found.is_observed
-    if precision is None or precision.point_sigma_m is None or not bed.any():
+    """Return a warning if the heights of the bed are imprecise."""
+    sigma, bed = found.precision.point_sigma_m, found.is_wet & found.is_observed
+    if sigma is None or not bed.any():
         return []
-    sigma_m = float(np.nanmedian(precision.point_sigma_m[bed, 2]))
+    sigma_m = float(np.nanmedian(sigma[bed, 2]))
     focal = float(np.median([lens.focal for lens in found.cameras.lenses or ()]))
     away_m = float(np.median(found.cameras.centres[:, 2]) - np.median(found.xyz[bed, 2]))
     gsd = sigma_m / (away_m / focal)
     if gsd < BED_GSD:
         return []
-    why, (places, line), values = "", _line(found), {"sigma_m": sigma_m, "gsd": gsd}
-    of_focal = precision.sigma_of("f")
-    if line is not None and not any(row.role == "control" for row in found.control):
-        about = np.asarray(found.cameras.rotations) @ line
-        turn = np.einsum("ki,kij,kj->k", about, precision.pose_covariance[:, :3, :3], about)
-        values["tilt_deg"] = float(np.degrees(np.sqrt(np.median(turn))))
-        why = (
-            f" The {len(places)} GNSS positions lie on a line, so the tilt across it has a standard"
-            f" error of {values['tilt_deg']:.2f} deg. Give control points beside it, or fly another"
-            " strip."
-        )
-    elif of_focal is not None and of_focal / focal * away_m > 0.5 * sigma_m:
-        why = (
-            f" Most of it comes from the focal length (standard error {of_focal:.2g}). Give a"
-            " calibrated lens or control points."
-        )
     words = (
         f"The heights of the bed have a standard error of {sigma_m:.2f} m ({gsd:.1f} ground"
-        f" pixels).{why}"
+        " pixels). Give control points, GNSS positions of more images that do not lie on one line,"
+        " or a calibrated lens."
     )
-    return [PcfixWarning("adjust.imprecise_bed", words, **values)]
+    return [PcfixWarning("adjust.imprecise_bed", words, sigma_m=sigma_m, gsd=gsd)]

@@ -37,7 +37,7 @@ from pcfix.adjust.collinearity import (
     workspace,
 )
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import beyond, dot, inverted, row_of, times, transposed_times, vector
+from pcfix.lens.algebra import dot, inverted, row_of, times, transposed_times, vector
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 PARTS, PARTS_BYTES = 8, 100_000_000
@@ -252,8 +252,24 @@ def _sum_up(
                         line[camera + j] += by * row[j]
                     for j in range(g):
                         line[poses + j] += by * row[SHARED + j]
+        # W = J'B of the unknowns: six of each camera, then the shared ones; left and right are
+        # exchanged in `w_right`
+        used = 6 * count + g
+        for i in range(used):
+            is_pose = i < 6 * count
+            column = i % 6 if is_pose else SHARED + i - 6 * count
+            unknown[i] = poses + i - 6 * count
+            if is_pose:
+                unknown[i] = 6 * given.camera[work.row[i // 6]] + column
+            for j in range(3):
+                w[i, j], w_right[i, j] = 0.0, 0.0
+                # a pose is in one row, a shared unknown in all of them
+                for a in range(i // 6 if is_pose else 0, i // 6 + 1 if is_pose else count):
+                    left, right = work.left[a], work.right[a]
+                    for axis in range(2):
+                        w[i, j] += left[axis, column] * right[axis, POINT + j]
+                        w_right[i, j] += right[axis, column] * left[axis, POINT + j]
         # minus W V^-1 W' and W V^-1 B'r
-        used = _couple(given, poses, work, count, w, w_right, unknown)
         for i in range(used):
             y, line = transposed_times(work.v, vector(w[i])), sums.matrix[unknown[i]]
             sums.right[unknown[i]] -= dot(y, vector(work.rhs))
@@ -265,34 +281,6 @@ def _sum_up(
                 if first <= unknown[i] or is_tested:
                     for j in range(width):
                         line[first + j] -= dot(y, row_of(w_right, at + j))
-
-
-@device
-def _couple(
-    given: Given, poses: int, work: Workspace, count: int, w: FloatArray, w_right: FloatArray,
-    unknown: IntArray,
-) -> int:  # fmt: skip
-    """Fill in W = J'B of the unknowns of a point, six of each row's camera and then the shared.
-
-    `w_right` has left and right exchanged; `unknown` are the numbers of the unknowns. Returns how
-    many there are.
-    """
-    used = 6 * count + given.shared
-    for i in range(used):
-        is_pose = i < 6 * count
-        column = i % 6 if is_pose else SHARED + i - 6 * count
-        unknown[i] = poses + i - 6 * count
-        if is_pose:
-            unknown[i] = 6 * given.camera[work.row[i // 6]] + column
-        for j in range(3):
-            w[i, j], w_right[i, j] = 0.0, 0.0
-            # a pose is in one row, a shared unknown in all of them
-            for a in range(i // 6 if is_pose else 0, i // 6 + 1 if is_pose else count):
-                left, right = work.left[a], work.right[a]
-                for axis in range(2):
-                    w[i, j] += left[axis, column] * right[axis, POINT + j]
-                    w_right[i, j] += right[axis, column] * left[axis, POINT + j]
-    return used
 
 
 def point_steps(state: State, given: Given, rule: Rule, moved: FloatArray) -> FloatArray:
@@ -325,7 +313,7 @@ def _point_steps(
             steps[p, 0], steps[p, 1], steps[p, 2] = times(v, vector(rhs))
 
 
-# The equations of single observations, and covariances
+# The equations of single observations
 
 
 class LinearisedRows(NamedTuple):
@@ -426,39 +414,3 @@ def _sparse_equations(state: State, given: Given, rule: Rule) -> Equations:
         right += part.others.T @ part.left_over()
         diagonal += part.others.power(2).sum(axis=0)
     return Equations(matrix, right, diagonal)
-
-
-def point_covariances(state: State, given: Given, inverse: FloatArray) -> FloatArray:
-    """Return the covariances of the points: V^-1 + V^-1 W' S^-1 W V^-1, shape (m, 6).
-
-    They are xx, xy, xz, yy, yz, zz in square metres for observations of unit weight, NaN for points
-    that are not fixed. The inverse S^-1 has the shape (6 k + g, 6 k + g), zero where poses are
-    fixed.
-    """
-    out = np.full((len(state.xyz), 6), np.nan)
-    in_parts(_point_covariances, state, given, inverse, out)
-    return out
-
-
-@kernel(allocates=True)
-def _point_covariances(
-    span: Span, state: State, given: Given, inverse: FloatArray, out: FloatArray, work: Workspace
-) -> None:
-    most, poses = 6 * len(work.row) + given.shared, 6 * len(state.centres)
-    w, y, unknown = np.empty((most, 3)), np.empty((most, 3)), np.empty(most, np.int64)
-    for p in range(*span):
-        count, _ = linearise_point(state, given, UNDAMPED, p, work)
-        if count == 0:
-            continue
-        used = _couple(given, poses, work, count, w, y, unknown)
-        for i in range(used):  # y: rows of W V^-1
-            y[i, 0], y[i, 1], y[i, 2] = transposed_times(work.v, vector(w[i]))
-        total = work.v
-        for i in range(used):
-            s = (0.0, 0.0, 0.0)
-            for j in range(used):
-                s = beyond(s, inverse[unknown[i], unknown[j]], row_of(y, j))
-            for j in range(3):
-                for k in range(3):
-                    total[j, k] += y[i, j] * s[k]
-        out[p, :3], out[p, 3:5], out[p, 5] = total[0], total[1, 1:], total[2, 2]

@@ -18,17 +18,19 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
 
 from pcfix.adjust.block import CODES, INDEX, PORT, SHAPE, lens_parameter, moved_lens, words_of
-from pcfix.adjust.normal import point_covariances
+from pcfix.adjust.normal import UNDAMPED, sparse_rows_of
 from pcfix.adjust.problem import Problem, Solution, polynomial
-from pcfix.adjust.solve import BED, moved_by, reduced_at, singular, solver
+from pcfix.adjust.solve import moved_by, reduced_at, singular, solver
 from pcfix.errors import PcfixWarning
 from pcfix.model import Cameras, FloatArray, WaterPlane, WaterRaster, WaterSurface
 
 DENSE_UP_TO = 12_000
 """Unknowns up to which the whole inverse is computed (1.2 GB)."""
+
+MOST_POINTS, POINTS_AT_ONCE = 50_000, 500
+"""Points whose standard errors are computed, and how many at a time, which limits the memory."""
 
 SINGULAR = 1e-12
 """Share of the variance of an unknown, if all others were known, below which none is meaningful."""
@@ -54,8 +56,9 @@ class Precision:
     pose_covariance: FloatArray
     shared: tuple[SharedUnknown, ...]
     correlation: FloatArray  # (g, g), of the shared unknowns
-    # (m, 6), xx, xy, xz, yy, yz, zz; NaN if not determined, None for very large blocks
-    point_covariance_m2: FloatArray | None
+    # (m, 3), standard errors of the points along x, y, z in metres; NaN if not determined, or not
+    # among the `MOST_POINTS` of a large block, None for very large ones
+    point_sigma_m: FloatArray | None
     members: Members | None = None  # drawn from the joint covariance; None for very large blocks
 
     @property
@@ -68,20 +71,15 @@ class Precision:
         """Standard errors of rotations about the axes of the cameras, shape (k, 3)."""
         return np.asarray(np.degrees(np.sqrt(np.einsum("kii->ki", self.pose_covariance)[:, :3])))
 
-    @property
-    def point_sigma_m(self) -> FloatArray | None:
-        """Standard errors of the points along x, y, z, shape (m, 3), metres."""
-        covariance = self.point_covariance_m2
-        return None if covariance is None else np.sqrt(covariance[:, [0, 3, 5]])
-
     def sigma_of(self, name: str) -> float | None:
         """Return the standard error of a shared unknown; None if it is fixed."""
         return next((row.sigma for row in self.shared if row.name == name), None)
 
 
 def precision_of(
-    problem: Problem, solution: Solution, sigma0: float = 1.0, factor: FloatArray | None = None
-) -> Precision:
+    problem: Problem, solution: Solution, sigma0: float = 1.0, factor: FloatArray | None = None, *,
+    only_poses: bool = False,
+) -> Precision:  # fmt: skip
     """Return covariances and correlations at a solution.
 
     Parameters
@@ -94,8 +92,10 @@ def precision_of(
     factor : array, shape (6 + g,), optional
         Further factors of standard errors: of angles and centres of all poses, and of the shared
         unknowns; see `pcfix.adjust.shared_errors`.
+    only_poses : bool
+        Whether standard errors of the points and an ensemble are not wanted.
     """
-    matrix, state, given = reduced_at(problem, solution)[0], solution.state, problem.given
+    matrix, state = reduced_at(problem, solution)[0], solution.state
     k, g, free = len(problem.moves), len(problem.names), np.flatnonzero(problem.moves)
     times = np.ones(6 + g) if factor is None else factor
     variance, u = sigma0 * sigma0, len(matrix.diagonal())
@@ -103,7 +103,8 @@ def precision_of(
     if solve_for is None:
         raise singular(problem, solution)
     # columns of the inverse, some at a time: those of 32 poses, then those of the shared unknowns
-    poses, inverse = np.zeros((k, 6, 6)), np.empty((u, u)) if u <= DENSE_UP_TO else None
+    is_wanted = u <= DENSE_UP_TO and not only_poses
+    poses, inverse = np.zeros((k, 6, 6)), np.empty((u, u)) if is_wanted else None
     first, last = np.arange(0, u - g, 6), np.arange(u - g, u)
     for part in (*np.array_split(first, -(-len(first) // 32) or 1), None):
         rows = last if part is None else (part[:, None] + np.arange(6)).ravel()
@@ -131,7 +132,7 @@ def precision_of(
         inverse *= each
         inverse *= each[:, None]
         spread = problem.spread(state)
-        points = variance * point_covariances(state, given, spread @ inverse @ spread.T)
+        points = sigma0 * _point_sigma(problem, solution, spread @ inverse @ spread.T)
         members = members_of(problem, solution, sigma0 * drawn(inverse))
     sigma = np.sqrt(np.diag(of_shared))
     correlation = of_shared / sigma / sigma[:, None]
@@ -140,6 +141,28 @@ def precision_of(
         sigma0, variance * poses, tuple(SharedUnknown(*row) for row in rows_of), correlation,
         points, members,
     )  # fmt: skip
+
+
+def _point_sigma(problem: Problem, found: Solution, inverse: FloatArray) -> FloatArray:
+    """Return standard errors of the points for observations of unit weight, shape (m, 3).
+
+    Their variances are those of V^-1 + V^-1 W' S^-1 W V^-1. The inverse S^-1 has the shape
+    (6 k + g, 6 k + g), zero where poses are fixed.
+    """
+    sigma, first = np.full_like(found.state.xyz, np.nan), 0
+    step = 1 + len(sigma) // MOST_POINTS
+    for part in sparse_rows_of(found.state, problem.given, UNDAMPED):
+        last = first + len(part.rows.rhs)
+        own = part.inverse.diagonal().reshape(-1, 3)
+        for some in range(0, last - first, step * POINTS_AT_ONCE):
+            rows = np.arange(some, min(some + step * POINTS_AT_ONCE, last - first), step)
+            coupling = part.coupling[(3 * rows[:, None] + np.arange(3)).ravel()]
+            by_others = coupling.multiply(coupling @ inverse).sum(axis=1)
+            # points that their rays do not fix have no variance
+            square = np.where(own[rows] > 0.0, own[rows] + by_others.reshape(-1, 3), np.nan)
+            sigma[first + rows] = np.sqrt(square)
+        first = last
+    return sigma
 
 
 # What is known poorly
@@ -157,9 +180,6 @@ LIMITS = {
 LEAST_BEND_M = 0.02
 """Standard error of the curvature of the water from which it is undetermined, as the level's."""
 
-SURE = 0.01
-"""Probability that flat water appears to be curved by chance."""
-
 
 def correlated(precision: Precision) -> list[PcfixWarning]:
     """Return a warning for each two unknowns that are hardly separated, the strongest first.
@@ -172,10 +192,11 @@ def correlated(precision: Precision) -> list[PcfixWarning]:
         r, pair = float(precision.correlation[i, j]), [names[j], names[i]]
         if pair[0][0] == pair[1][0] == "k":
             continue
-        is_bed = [name in BED for name in pair]
-        remedy = ", or give control points at several heights" if sum(is_bed) == 1 else ""
         one, other = (f"the {words_of(name)[0]}" for name in pair)
-        words = f"{one} and {other} are strongly correlated (r = {r:.3f}). Fix one of them{remedy}."
+        words = (
+            f"{one} and {other} are strongly correlated (r = {r:.3f}). Fix one of them, or give"
+            " control points at several heights."
+        )
         notes.append(PcfixWarning("adjust.correlated", words, unknowns=[one, other], correlation=r))
     return sorted(notes, key=lambda note: -abs(note.values["correlation"]))
 
@@ -196,7 +217,7 @@ def undetermined(precision: Precision) -> list[PcfixWarning]:
 
 
 def shape_notes(precision: Precision, wet_xy: FloatArray) -> list[PcfixWarning]:
-    """Return a warning if a free shape of the water is undetermined, or a plane.
+    """Return a warning if a free shape of the water is undetermined.
 
     Parameters
     ----------
@@ -210,22 +231,16 @@ def shape_notes(precision: Precision, wet_xy: FloatArray) -> list[PcfixWarning]:
     x, y = wet_xy.T
     terms, plane = np.column_stack([x * x, x * y, y * y]), np.column_stack([np.ones(len(x)), x, y])
     terms = terms - plane @ np.linalg.lstsq(plane, terms, rcond=None)[0]
-    by, sigma = np.array([[precision.shared[i].added, precision.shared[i].sigma] for i in rows]).T
+    sigma = np.array([precision.shared[i].sigma for i in rows])
     covariance = precision.correlation[np.ix_(rows, rows)] * sigma * sigma[:, None]
-    chi2 = float(by @ np.linalg.solve(covariance, by))
-    bend = float(np.sqrt(np.mean((terms @ by) ** 2)))
     error = float(np.sqrt(np.mean(np.einsum("mi,ij,mj->m", terms, covariance, terms))))
-    figures = (
-        f"curvature {1000.0 * bend:.2g} mm (RMS over the bed), standard error"
-        f" {1000.0 * error:.2g} mm. Remove shape from --free"
-    )
-    code, words = "adjust.flat", f"the water is not curved: {figures}."
-    if error > LEAST_BEND_M:
-        code = "adjust.shape_undetermined"
-        words = f"the shape of the water is undetermined: {figures}, or mark waterline points."
-    elif chi2 > chdtri(len(rows), SURE):
+    if error <= LEAST_BEND_M:
         return []
-    return [PcfixWarning(code, words, bend_m=bend, sigma_m=error)]
+    words = (
+        "the shape of the water is undetermined: the curvature over the bed has a standard error of"
+        f" {1000.0 * error:.2g} mm. Remove shape from --free, or mark waterline points."
+    )
+    return [PcfixWarning("adjust.shape_undetermined", words, sigma_m=error)]
 
 
 # The ensemble

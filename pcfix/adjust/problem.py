@@ -15,7 +15,6 @@ from pcfix.adjust.block import (
     INDEX,
     MOTIONS,
     NAMES,
-    NO_CONDITIONS,
     PLANES,
     PORT,
     SHAPE,
@@ -30,8 +29,8 @@ from pcfix.adjust.block import (
     similarity_gradients,
     usable_codes,
 )
-from pcfix.adjust.collinearity import SHARED, Given, State
-from pcfix.adjust.normal import UNDAMPED, Rule, cost_of, point_steps, residuals
+from pcfix.adjust.collinearity import POINT, SHARED, Given, State
+from pcfix.adjust.normal import UNDAMPED, Rule, cost_of, linearised, point_steps, residuals
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import lens_table
 from pcfix.model import (
@@ -47,7 +46,7 @@ from pcfix.model import (
 )
 from pcfix.port.light import coefficients as port_coefficients
 from pcfix.port.shapes import DomePort, FlatPort, Port
-from pcfix.water.surface import build_field, build_tin, surface_above
+from pcfix.water.surface import build_field, build_tin
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -141,29 +140,18 @@ def prepare(
     block: Block, unknowns: Unknowns, origin: FloatArray | None = None
 ) -> tuple[Problem, Solution]:
     """Return a problem and its start; the origin is the rounded mean of the cameras by default."""
-    cameras, water = block.cameras, block.water
-    if cameras.rotations is None or cameras.lenses is None:
-        raise GeometryError(
-            "cameras.no_angles", "An adjustment needs the angles and a lens of every image."
-        )
+    cameras, water, lenses = block.cameras, block.water, block.cameras.lenses or ()
     origin = np.round(cameras.centres.mean(axis=0)) if origin is None else origin
-    group, groups = sensor_groups(cameras.lenses)
-    codes = [usable_codes(cameras.lenses[images[0]], unknowns.lens) for images in groups]
-    for what in ("tilt", "shape"):
-        if unknowns.surface.get(what) and isinstance(water, WaterMesh | WaterRaster):
-            words = (
-                f"The {what} of the water can be free for a level or plane only, not for a mesh or"
-                " raster."
-            )
-            raise GeometryError("adjust.fixed_surface", words, unknown=what)
+    group, groups = sensor_groups(lenses)
+    codes = [usable_codes(lenses[images[0]], unknowns.lens) for images in groups]
     numbers = surface_numbers(block, origin)
     planes, plane_names, axis, alike = _planes(block, origin, numbers)
     # columns of the shared unknowns: lenses, then surface and planes
     first_lens = np.concatenate([[0], np.cumsum([len(one) for one in codes])]).astype(np.int64)
-    free = [sigma != 0.0 for sigma in unknowns.water_sigma]
-    free += [len(WATER_NAMES) + i not in alike for i in range(len(planes))]
-    column = np.full(len(free), -1, np.int64)
-    column[free] = first_lens[-1] + np.arange(sum(free))
+    is_free = [sigma != 0.0 for sigma in unknowns.water_sigma]
+    is_free += [len(WATER_NAMES) + i not in alike for i in range(len(planes))]
+    column = np.full(len(is_free), -1, np.int64)
+    column[is_free] = first_lens[-1] + np.arange(sum(is_free))
     for number, other in alike.items():
         column[number] = column[other]
     names = [
@@ -171,12 +159,10 @@ def prepare(
         for i, of_sensor in enumerate(codes, start=1)
         for code in of_sensor
     ]
-    names += [
-        name for name, is_free in zip((*WATER_NAMES, *plane_names), free, strict=True) if is_free
-    ]
+    names += [name for name, one in zip((*WATER_NAMES, *plane_names), is_free, strict=True) if one]
     shared = len(names)
     names += MOTIONS if unknowns.poses == "similarity" else ()
-    row, table = lens_table(cameras.lenses)
+    row, table = lens_table(lenses)
     centres = cameras.centres - origin
     weight = inverse_variances(block.surveyed_xyz, block.surveyed_sigma_m)
     conditions = block.conditions
@@ -206,14 +192,13 @@ def prepare(
     poses = [
         unknowns.poses == "free" and label not in unknowns.fixed_images for label in cameras.labels
     ]
-    problem = Problem(
-        block, unknowns, origin, given, groups, codes, np.array(poses, np.bool_), names
-    )
+    moves = np.array(poses, np.bool_)
+    problem = Problem(block, unknowns, origin, given, groups, codes, moves, names)
     state = State(
         centres, np.ascontiguousarray(cameras.rotations, np.float64), table, block.xyz - origin,
         np.concatenate([numbers, planes]), port_row(block.port),
     )  # fmt: skip
-    return problem, Solution(state, cameras.lenses, np.zeros(len(names)), np.inf, [])
+    return problem, Solution(state, lenses, np.zeros(len(names)), np.inf, [])
 
 
 def surface_numbers(block: Block, origin: FloatArray) -> FloatArray:
@@ -310,22 +295,12 @@ def port_row(port: Port | None) -> FloatArray:
 def water_of(problem: Problem, state: State) -> WaterSurface | None:
     """Return the water surface of a state, world frame."""
     water, origin = problem.block.water, problem.origin
-    level, b, c = (float(value) for value in state.water[:3])
-    match water:
-        case WaterPlane() if problem.given.curved:
-            return _curved_raster(problem, state)
-        case WaterPlane():
-            return WaterPlane(level + origin[2] - (b * origin[0] + c * origin[1]), b, c)
-        case WaterRaster() if level:
-            return replace(water, height_m=water.height_m + level)
-        case WaterMesh() if level:
-            return replace(water, vertices=water.vertices + np.array([0.0, 0.0, level]))
-        case _:
-            return water
-
-
-def _curved_raster(problem: Problem, state: State) -> WaterRaster:
-    """Return water of the second order as a raster over all images and points."""
+    if not isinstance(water, WaterPlane):
+        return water
+    if not problem.given.curved:
+        level, b, c = (float(value) for value in state.water[:3])
+        return WaterPlane(level + origin[2] - (b * origin[0] + c * origin[1]), b, c)
+    # water of the second order as a raster over all images and points
     known = state.xyz[np.isfinite(state.xyz).all(axis=1)]
     places = np.vstack([state.centres[:, :2], known[:, :2]])
     low, high = places.min(axis=0), places.max(axis=0)
@@ -333,8 +308,8 @@ def _curved_raster(problem: Problem, state: State) -> WaterRaster:
     cell = float((high - low).max()) / CELLS
     columns, rows = np.maximum(np.ceil((high - low) / cell).astype(int), 2)
     x, y = low[0] + cell * (np.arange(columns) + 0.5), high[1] - cell * (np.arange(rows) + 0.5)
-    height = polynomial(state.water, x[None, :], y[:, None]) + problem.origin[2]
-    left, top = float(problem.origin[0] + low[0]), float(problem.origin[1] + high[1])
+    height = polynomial(state.water, x[None, :], y[:, None]) + origin[2]
+    left, top = float(origin[0] + low[0]), float(origin[1] + high[1])
     return WaterRaster(height, left, top, (cell, cell), "water of second order")
 
 
@@ -347,45 +322,42 @@ def polynomial(water: FloatArray, x: FloatArray | float, y: FloatArray | float) 
 # Prior knowledge
 
 
-def priors_at(problem: Problem, found: Solution) -> tuple[float, csc_array, FloatArray]:
-    """Return what prior knowledge of poses, lens and water adds to the equations of a state.
+def prior_rows(problem: Problem, found: Solution) -> tuple[csc_array, FloatArray]:
+    """Return prior knowledge of poses, lens and water as weighted observations of them.
 
     Returns
     -------
-    cost : float
-    matrix : sparse array, shape (u, u)
-    right : array, shape (u,)
+    rows : sparse array, shape (n, 6 k + g)
+        Derivatives by poses and shared unknowns, over the standard deviation.
+    left : array, shape (n,)
+        Observed minus current value, over the standard deviation.
     """
     from scipy import sparse
 
     given, block = problem.given, problem.block
     k, size = len(block.cameras), 6 * len(block.cameras) + given.shared
-    diagonal, right = np.zeros(size), np.zeros(size)
-    weight = block.gnss_weights
-    off = np.where(weight > 0.0, block.gnss_xyz - problem.origin - found.state.centres, 0.0)
-    sigma = np.full(given.shared, np.inf)  # of the shared unknowns about their start
+    # GNSS positions of the centres, and unknowns of the surface about their start
+    root = np.sqrt(block.gnss_weights)
+    camera, axis = np.nonzero(root)
+    sigma = np.array([one for one in problem.unknowns.water_sigma if one])
     free = given.column[: len(WATER_NAMES)]
-    sigma[free[free >= 0]] = [one for one in problem.unknowns.water_sigma if one]
-    added = found.shared[: given.shared]
-    shared = inverse_variances(added, sigma)
-    cost = float((weight * off * off).sum() + (shared * added**2).sum())
-    diagonal[6 * k :], right[6 * k :] = shared, -shared * added
-    diagonal[: 6 * k].reshape(k, 6)[:, 3:] = weight
-    right[: 6 * k].reshape(k, 6)[:, 3:] = weight * off
-    # seven observations hold mean, direction and scale of the centres of a free network
-    rows, left = np.zeros((0, size)), np.zeros(0)
-    if problem.unknowns.free_network and problem.unknowns.poses != "similarity":
-        start = block.cameras.centres - problem.origin
-        d = start - start.mean(axis=0)
-        by = similarity_gradients(d) / np.array([1.0] * 3 + [np.sqrt((d * d).sum() / k)] * 4)
-        by = by[:, :, _undetermined_motions(problem)] / k / NETWORK_SIGMA_M
-        rows = np.zeros((by.shape[2], size))
-        rows[:, : 6 * k].reshape(-1, k, 6)[:, :, 3:] = by.transpose(2, 0, 1)
-        left = -np.einsum("kja,kj->a", by, found.state.centres - start)
-        cost += float((left * left).sum())
-    held = sparse.csc_array(rows)
-    matrix = sparse.diags_array(diagonal) + held.T @ held
-    return cost, matrix.tocsc(), right + rows.T @ left
+    free, sigma = free[free >= 0][np.isfinite(sigma)], sigma[np.isfinite(sigma)]
+    column = np.concatenate([6 * camera + 3 + axis, 6 * k + free])
+    weight = np.concatenate([root[camera, axis], 1.0 / sigma])
+    centres = (block.gnss_xyz - problem.origin - found.state.centres)[camera, axis]
+    left = weight * np.concatenate([centres, -found.shared[free]])
+    rows = sparse.csc_array((weight, (np.arange(len(column)), column)), (len(column), size))
+    if not problem.unknowns.free_network or problem.unknowns.poses == "similarity":
+        return rows, left
+    # mean, direction and scale of the centres of a free network
+    start = block.cameras.centres - problem.origin
+    d = start - start.mean(axis=0)
+    by = similarity_gradients(d) / np.array([1.0] * 3 + [np.sqrt((d * d).sum() / k)] * 4)
+    by = by[:, :, _undetermined_motions(problem)] / k / NETWORK_SIGMA_M
+    held = np.zeros((by.shape[2], size))
+    held[:, : 6 * k].reshape(-1, k, 6)[:, :, 3:] = by.transpose(2, 0, 1)
+    moved = np.einsum("kja,kj->a", by, found.state.centres - start)
+    return sparse.vstack([rows, sparse.csc_array(held)], format="csc"), np.append(left, -moved)
 
 
 def _undetermined_motions(problem: Problem) -> list[int]:
@@ -406,41 +378,34 @@ def cost_at(problem: Problem, found: Solution, rule: Rule) -> float:
     """Return the cost of a solution: images, surveyed points and all prior knowledge."""
     used, weight = problem.used, problem.given.weight
     r = residuals(found.state, problem.given)[used]
-    images = cost_of((r**2).sum(axis=1) * weight[used] ** 2, rule.loss)
-    return images + survey_cost(problem, found) + priors_at(problem, found)[0]
+    return cost_of((r**2).sum(axis=1) * weight[used] ** 2, rule.loss) + survey_cost(problem, found)
 
 
 def survey_cost(problem: Problem, found: Solution) -> float:
-    """Return the weighted squared residuals of surveyed points and of points on surfaces."""
-    given = problem.given
+    """Return the weighted squares of all observations that are no images."""
+    given, left = problem.given, prior_rows(problem, found)[1]
     off = given.surveyed_weight * (given.surveyed_xyz - found.state.xyz) ** 2
-    cost = float(off.sum())
-    if not len(given.on):
-        return cost
-    return cost + float(np.nansum((given.on_weight * surface_distances(problem, found)) ** 2))
+    on_surfaces = off_surfaces(problem, found.state)[1]
+    return float(off.sum() + left @ left + on_surfaces @ on_surfaces)
 
 
-def surface_distances(problem: Problem, found: Solution) -> FloatArray:
-    """Return surface minus point, shape (m,), metres along its axis; NaN for points on none."""
-    given, state, off = problem.given, found.state, np.full(len(found.state.xyz), np.nan)
-    for number in np.unique(given.on[given.on >= 0]):
-        rows, up = np.flatnonzero(given.on == number), int(given.axis[number])
-        q, z = state.xyz[rows], np.full(len(rows), np.nan)
-        if number > 0:
-            a, b, c = state.water[PLANES + 3 * number - 3 :][:3]
-            z = a + b * q[:, (up + 1) % 3] + c * q[:, (up + 2) % 3]
-        elif isinstance(problem.block.water, WaterPlane):
-            z = polynomial(state.water, q[:, 0], q[:, 1])
-        elif (surface := water_of(problem, state)) is not None:
-            z = surface_above(surface, q + problem.origin).height_m - problem.origin[2]
-        off[rows] = z - q[:, up]
-    return off
+def off_surfaces(problem: Problem, state: State) -> tuple[IntArray, FloatArray]:
+    """Return points that lie on surfaces, and surface minus point in standard deviations.
+
+    Both have the shape (n,); points that their rays and surface do not fix are missing.
+    """
+    if not len(problem.given.on):
+        return np.zeros(0, np.int64), np.zeros(0)
+    rows = linearised(state, problem.given, UNDAMPED, problem.block.tie_points, len(state.xyz))
+    is_condition = ~rows.is_image & rows.columns[:, 0, POINT:SHARED].any(axis=1)
+    return problem.block.owner[rows.observation[is_condition]], rows.r[is_condition, 0]
 
 
-def counts_of(problem: Problem, found: Solution) -> tuple[int, float]:
-    """Return the number of observations that count, and the RMS of their residuals."""
-    r = residuals(found.state, problem.given)[problem.used]
-    return len(r), float(np.sqrt(np.nansum(r * r) / max(2 * len(r), 1)))
+def log_row(problem: Problem, state: State, number: int, steps: int) -> LogRow:
+    """Return the number of observations that count and the RMS of their residuals, for the log."""
+    r = residuals(state, problem.given)[problem.used]
+    rms = float(np.sqrt(np.nansum(r * r) / max(2 * len(r), 1)))
+    return LogRow(number, steps, len(r), rms)
 
 
 # Intersection with fixed poses
@@ -478,17 +443,22 @@ def intersect_fixed(block: Block) -> Intersected:
 
     It fails for a point that needs more than `STEPS` Gauss-Newton steps.
     """
-    problem, now = prepare(
-        replace(block, conditions=NO_CONDITIONS), Unknowns(poses="fixed", lens=())
-    )
-    nothing = np.zeros(6 * len(problem.moves))
-    state, step = now.state, np.full((len(block.xyz), 3), np.inf)
+    problem, start = prepare(block, Unknowns(poses="fixed", lens=()))
+    state, step = intersected(problem, start.state)
+    r = residuals(state, problem.given)
+    settled = np.asarray((np.abs(step) < CLOSE_M).all(axis=1))
+    r[~settled[block.owner]] = np.nan
+    return Intersected(state.xyz + problem.origin, r, np.asarray(block.start))
+
+
+def intersected(problem: Problem, state: State) -> tuple[State, FloatArray]:
+    """Return a state with its points intersected, and the last step of each, shape (m, 3)."""
+    # surfaces have no weight here: the points shall show how well they fit
+    given = problem.given._replace(on=np.zeros(0, np.int64))
+    fixed, step = np.zeros(6 * len(state.centres) + given.shared), np.zeros_like(state.xyz)
     for _ in range(STEPS):
-        step = point_steps(state, problem.given, UNDAMPED, nothing)
+        step = point_steps(state, given, UNDAMPED, fixed)
         state = state._replace(xyz=state.xyz + step)
         if np.nanmax(np.abs(step), initial=0.0) < CLOSE_M:
             break
-    r = residuals(state, problem.given)
-    settled = (np.abs(step) < CLOSE_M).all(axis=1)
-    r[~settled[block.owner]] = np.nan
-    return Intersected(state.xyz + problem.origin, r, np.asarray(block.start))
+    return state, step

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -13,7 +13,6 @@ from pcfix.adjust.block import (
     INDEX,
     LEAST_VIEWS,
     NAMES,
-    NO_CONDITIONS,
     PORT,
     SHAPE,
     WATER,
@@ -22,8 +21,6 @@ from pcfix.adjust.block import (
     LogRow,
     Unknowns,
     lens_parameter,
-    sensor_groups,
-    usable_codes,
 )
 from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import Precision
@@ -32,9 +29,10 @@ from pcfix.adjust.problem import (
     Problem,
     Solution,
     intersect_fixed,
+    intersected,
+    off_surfaces,
     port_of,
     solved_cameras,
-    surface_distances,
     surface_numbers,
     water_of,
 )
@@ -77,14 +75,13 @@ class Adjusted:
     redundancy: int  # observations, with those of the unknowns, minus unknowns
     rounds: list[LogRow]
     source: Source  # what was observed: tie points, or images of the apparent cloud
-    precision: Precision | None
+    precision: Precision
     gnss_residual_m: FloatArray  # (k, 3), adjusted centres minus GNSS positions; NaN if unknown
     control: list[ControlRow]
     notes: list[PcfixWarning]
     problem: Problem  # with the weights of the last round
     solution: Solution
     port: Port | None = None  # adjusted
-    on_surfaces: list[Plain] = field(default_factory=list)  # of points on the water or on planes
 
     @property
     def is_observed(self) -> BoolArray:
@@ -111,13 +108,16 @@ def redundancy_of(problem: Problem) -> int:
 
 
 def adjusted_of(
-    problem: Problem, now: Solution, precision: Precision | None, notes: list[PcfixWarning],
+    problem: Problem, now: Solution, precision: Precision, notes: list[PcfixWarning],
     source: Source,
 ) -> Adjusted:  # fmt: skip
     """Return a solution as a result, with check points intersected."""
-    block, state = problem.block, now.state
-    xyz = _with_check_points(problem, now)
-    r = residuals(state._replace(xyz=xyz - problem.origin), problem.given)
+    block, owner, state = problem.block, problem.block.owner, now.state
+    # check points have no weight yet
+    is_check = np.isin(owner, block.tie_points + np.flatnonzero(block.is_check))
+    is_check &= np.diff(block.start)[owner] >= LEAST_VIEWS
+    with_checks, _ = intersected(problem.weighted(np.where(is_check, 1.0, 0.0)), state)
+    xyz, r = with_checks.xyz + problem.origin, residuals(with_checks, problem.given)
     water = water_of(problem, state)
     none = -np.inf if block.port is None else np.inf  # behind a port everything is under water
     level = np.full(len(xyz), none) if water is None else surface_above(water, xyz).height_m
@@ -142,27 +142,9 @@ def adjusted_of(
         control=_control_rows(block, xyz, r),
         notes=notes,
         port=port_of(block, state.water),
-        on_surfaces=_on_surfaces(problem, now),
         problem=problem,
         solution=now,
     )
-
-
-def _with_check_points(problem: Problem, now: Solution) -> FloatArray:
-    """Return the points, world frame, with check points intersected from the adjusted cameras."""
-    block, xyz = problem.block, now.state.xyz + problem.origin
-    rows = block.tie_points + np.flatnonzero(block.is_check)
-    rows = rows[np.diff(block.start)[rows] >= LEAST_VIEWS]
-    if len(rows) == 0:
-        return xyz
-    whole = replace(
-        block, cameras=solved_cameras(problem, now), xyz=xyz, water=water_of(problem, now.state),
-        conditions=NO_CONDITIONS, port=port_of(block, now.state.water),
-        refractive_index=float(now.state.water[INDEX]),
-        sigma_px=np.where(np.isin(block.owner, rows), 1.0, np.inf),
-    )  # fmt: skip
-    xyz[rows] = intersect_fixed(whole).xyz[rows]
-    return xyz
 
 
 def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlRow]:
@@ -181,23 +163,19 @@ def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlR
 
 def _on_surfaces(problem: Problem, now: Solution) -> list[Plain]:
     """Return the stated and found distances of marked points from each surface, metres."""
-    given, block, found = problem.block.conditions, problem.block, list[Plain]()
-    if not len(given.on):
-        return []
-    off = np.where(np.diff(block.start) > 0, surface_distances(problem, now), np.nan)
-    for number, name in enumerate((WATER, *given.names)):
-        rows = np.flatnonzero((given.on == number) & np.isfinite(off))
-        if len(rows):
-            worst = rows[np.argmax(np.abs(off[rows]))]
-            found.append({
-                "surface": name,
-                "points": len(rows),
-                "sigma_m": rms(given.sigma_m[rows]),
-                "rms_m": rms(off[rows]),
-                "largest_m": abs(off[worst]),
-                "largest_point": block.control_names[worst - block.tie_points],
-            })  # fmt: skip
-    return found
+    given, (points, left) = problem.block.conditions, off_surfaces(problem, now.state)
+    sigma_m = given.sigma_m[points]
+    rows = [(name, given.on[points] == i) for i, name in enumerate((WATER, *given.names))]
+    return [
+        {
+            "surface": name,
+            "points": is_on.sum(),
+            "sigma_m": rms(sigma_m[is_on]),
+            "rms_m": rms((left * sigma_m)[is_on]),
+        }
+        for name, is_on in rows
+        if is_on.any()
+    ]
 
 
 # Plain values
@@ -229,7 +207,7 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
     """
     a, block, u = adjusted, adjusted.block, adjusted.unknowns
     kept = len(block.cameras) if u.poses == "fixed" else 0
-    known, lenses = a.precision, block.cameras.lenses or ()
+    lenses = block.cameras.lenses or ()
     found = {
         "source": a.source,
         "image_unit": lenses[0].unit,
@@ -253,9 +231,9 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
         "lens": _lens(a),
         "water": _water(a),
         "port_found": _port(a),
-        "on_surfaces": a.on_surfaces,
+        "on_surfaces": _on_surfaces(a.problem, a.solution),
         "poses": _poses(a),
-        "precision": None if known is None else _precision(known),
+        "precision": _precision(a.precision),
         "gnss": _gnss(a),
         "control": _surveyed([row for row in a.control if row.role == "control"]),
         "check": _surveyed([row for row in a.control if row.role == "check"]),
@@ -281,10 +259,9 @@ def rms(values: FloatArray) -> FloatArray:
 
 def _counts(a: Adjusted) -> Plain:
     """Return the numbers of points and of observations."""
-    roles, observed = [row.role for row in a.control], a.is_observed
-    ties = len(a.xyz) - len(a.block.is_check)  # check points are among the last ones
-    is_check = np.concatenate([np.zeros(ties, np.bool_), a.block.is_check])
-    of_check = is_check[a.block.owner]
+    roles, observed, block = [row.role for row in a.control], a.is_observed, a.block
+    is_check = np.zeros(len(a.xyz), np.bool_)
+    is_check[len(a.xyz) - len(block.is_check) :] = block.is_check
     return {
         "points": {
             "all": observed.sum(),
@@ -296,9 +273,7 @@ def _counts(a: Adjusted) -> Plain:
         },
         "observations": {
             "used": a.used.sum(),
-            "left_out": (~a.used & ~of_check).sum(),
-            "of_check_points": of_check.sum(),
-            "out_of_sight": (np.isnan(a.residual_px).any(axis=1) & a.used).sum(),
+            "left_out": (~a.used & ~is_check[block.owner]).sum(),
         },
     }
 
@@ -306,38 +281,39 @@ def _counts(a: Adjusted) -> Plain:
 def _residuals(a: Adjusted, before: Intersected, points: BoolArray) -> Plain:
     points = points & a.is_observed
     rows = a.used & points[a.block.owner]
-    sigma = None if a.precision is None else a.precision.point_sigma_m
-    block, camera = a.block, a.block.camera[rows]
+    sigma = a.precision.point_sigma_m
+    camera, r = a.block.camera[rows], a.residual_px[rows]
     # on the ground: by distance over focal length
-    away = np.linalg.norm(a.xyz[block.owner[rows]] - a.cameras.centres[camera], axis=1)
+    away = np.linalg.norm(a.xyz[a.block.owner[rows]] - a.cameras.centres[camera], axis=1)
     focal = np.array([lens.focal for lens in a.cameras.lenses or ()])[camera]
     return {
         "points": points.sum(),
         "observations": rows.sum(),
         "rms_before_px": rms(before.residual_px[rows].ravel()),
-        "rms_px": rms(a.residual_px[rows].ravel()),
-        "rms_xy_px": rms(a.residual_px[rows]),
-        "rms_m": rms((a.residual_px[rows] * (away / focal)[:, None]).ravel()),
+        "rms_px": rms(r.ravel()),
+        "rms_xy_px": rms(r),
+        "rms_m": rms((r * (away / focal)[:, None]).ravel()),
         "sigma_xyz_m": None if sigma is None else rms(sigma[points]),
     }
 
 
 def _lens(a: Adjusted) -> list[Plain]:
-    original, adjusted = a.block.cameras.lenses or (), a.cameras.lenses or ()
-    _, groups = sensor_groups(original)
+    original, adjusted, groups = (
+        a.block.cameras.lenses or (),
+        a.cameras.lenses or (),
+        a.problem.groups,
+    )
     rows = []
-    for place, images in enumerate(groups, start=1):
+    for i, (images, codes) in enumerate(zip(groups, a.problem.codes, strict=True), start=1):
         first, after = original[images[0]], adjusted[images[0]]
-        for code in usable_codes(first, a.unknowns.lens):
-            unknown = NAMES[code] if len(groups) == 1 else f"{NAMES[code]} of sensor {place}"
+        for code in codes:
+            unknown = NAMES[code] if len(groups) == 1 else f"{NAMES[code]} of sensor {i}"
             rows.append({
-                "sensor": first.sensor or f"sensor {place}",
-                "images": len(images),
-                "lenses": len({original[i] for i in images}),
+                "sensor": first.sensor or f"sensor {i}",
                 "name": NAMES[code],
                 "before": lens_parameter(first, code),
                 "after": lens_parameter(after, code),
-                "sigma": None if a.precision is None else a.precision.sigma_of(unknown),
+                "sigma": a.precision.sigma_of(unknown),
             })  # fmt: skip
     return rows
 
@@ -346,16 +322,12 @@ def _water(a: Adjusted) -> Plain | None:
     original, adjusted = a.block.water, a.water
     if original is None or adjusted is None:
         return None
-    if isinstance(original, WaterPlane):
-        names, height_m = ["level", "tilt_x", "tilt_y", "index"], float(a.problem.origin[2])
-    else:  # the number is what is added to a mesh or raster
-        heights = surface_above(original, a.xyz).height_m
-        names, height_m = ["level", "index"], float(mean(heights))
-        names = names if np.isfinite(heights).any() else ["index"]
+    is_plane = isinstance(original, WaterPlane)
+    names = ["level", "tilt_x", "tilt_y", "index"] if is_plane else ["index"]
     names += WATER_NAMES[SHAPE:PORT] if a.unknowns.surface.get("shape") else []
     found: Plain = {"surface": str(adjusted), **_numbers(a, names)}
-    for key in ("before", "after") if "level" in found else ():
-        found["level"][key] += height_m
+    for key in ("before", "after") if is_plane else ():
+        found["level"][key] += float(a.problem.origin[2])
     return found
 
 
@@ -375,7 +347,7 @@ def _numbers(a: Adjusted, names: Sequence[str]) -> dict[str, Plain]:
         name: {
             "before": start[i],
             "after": a.solution.state.water[i],
-            "sigma": None if a.precision is None else a.precision.sigma_of(name),
+            "sigma": a.precision.sigma_of(name),
             "free": bool(a.unknowns.water_sigma[i]),
         }
         for name in names
@@ -399,13 +371,12 @@ def _poses(a: Adjusted) -> Plain:
 
 
 def _precision(p: Precision) -> Plain:
-    centre, angle = p.centre_sigma_m, p.angle_sigma_deg
-    moves = (centre > 0.0).any(axis=1) | (angle > 0.0).any(axis=1)
+    moves = p.pose_covariance.any(axis=(1, 2))
     found: Plain = {"images": moves.sum()}
-    for name, values in (("centre_{}_m", centre[moves]), ("angle_{}_deg", angle[moves])):
-        known = bool(moves.any())
-        found[name.format("mean")] = values.mean(axis=0) if known else None
-        found[name.format("largest")] = values.max(axis=0) if known else None
+    for name, values in (("centre", p.centre_sigma_m), ("angle", p.angle_sigma_deg)):
+        unit, known = "m" if name == "centre" else "deg", values[moves]
+        found[f"{name}_mean_{unit}"] = known.mean(axis=0) if len(known) else None
+        found[f"{name}_largest_{unit}"] = known.max(axis=0) if len(known) else None
     found["shared"] = [row._asdict() for row in p.shared]
     found["correlation"] = p.correlation
     return found
@@ -432,9 +403,11 @@ def _surveyed(rows: Sequence[ControlRow]) -> Plain | None:
         return None
     off = np.array([[row.dx_m, row.dy_m, row.dz_m] for row in rows], np.float64)
     points = [row._asdict() for row in rows]
+    for point in points:
+        del point["role"]
     return {
         "rms_m": rms(off),
         "mean_m": mean(off),
         "rms_px": rms(np.array([row.rms_px for row in rows], np.float64)),
-        "points": [{name: row[name] for name in row if name != "role"} for row in points],
+        "points": points,
     }

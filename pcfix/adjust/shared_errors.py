@@ -28,7 +28,6 @@ from pcfix.adjust.normal import UNDAMPED, residuals, sparse_matrix, sparse_rows_
 from pcfix.adjust.precision import Precision
 from pcfix.adjust.problem import Problem, Solution, water_of
 from pcfix.adjust.solve import reduced_at, solver
-from pcfix.errors import PcfixWarning
 from pcfix.model import FloatArray, IntArray
 from pcfix.water.surface import surface_above
 
@@ -39,10 +38,6 @@ SURE = 0.99
 
 
 MOST_TILES, POINTS_PER_TILE, FRAME_TILES = 400, 25, 48
-ALONE, FRAME = "observations of different quality", "places in the frame"
-NOTED = 0.44
-"""Variance by the frame, over the formal one, that is worth a note: standard errors 1.2 times."""
-
 LEAST_GROUPS = 10
 """Fewer groups do not give a variance."""
 
@@ -52,64 +47,45 @@ shifts features with their slope, and outliers of the original adjustment are mi
 Focal length and principal point absorb it, so that poses and bed are right, and residuals do not
 show it. Rendered blocks, whose lens is known, had up to 1.5 times this."""
 
-POSE = ("angle about x", "angle about y", "angle about z", "centre x", "centre y", "centre z")
 
+def disagreement_of(problem: Problem, found: Solution, formal: Precision) -> FloatArray:
+    """Return by which factors standard errors must grow for shared errors, shape (6 + g,).
 
-def disagreement_of(
-    problem: Problem, found: Solution, formal: Precision
-) -> tuple[FloatArray, list[PcfixWarning]]:
-    """Return by which factors standard errors must grow for shared errors, and a warning.
-
-    Parameters
-    ----------
-    formal : Precision
-        From the normal matrix.
-
-    Returns
-    -------
-    factor : array, shape (6 + g,)
-        For the parameters of `POSE` and the shared unknowns.
-    notes : list of PcfixWarning
+    They are those of the angles and centres of all poses, and of the shared unknowns; `formal` is
+    the precision by the normal matrix.
     """
-    groups, added = _groups_by_sharing(problem, found), np.zeros(6 + len(problem.names))
-    counts = {words: len(np.unique(group)) for words, group in groups.items()}
+    given, block, added = problem.given, problem.block, np.zeros(6 + len(problem.names))
+    # random groups of points, neighbouring points, points of an image, and places in the frame
+    tiles = min(MOST_TILES, len(block.xyz) // POINTS_PER_TILE)
+    randomly = np.random.default_rng(0).integers(0, max(tiles, 1), len(block.xyz))[block.owner]
+    near = _tiles(found.state.xyz[:, :2], tiles)[block.owner]
+    size = np.array([(lens.width, lens.height) for lens in block.cameras.lenses or ()])
+    place = _tiles(given.image_xy / size[given.camera], FRAME_TILES)
+    place += given.group[given.camera] * (place.max(initial=0) + 1)
+    frame = np.unique(place, return_inverse=True)[1]
     matrix, right = reduced_at(problem, found)
     solve_for, spread = solver(matrix), problem.spread(found.state)
-    if counts[ALONE] < LEAST_GROUPS or solve_for is None:
-        return 1.0 + added, []
-    drawn = np.random.default_rng(1).normal(0.0, formal.sigma0, problem.given.image_xy.shape)
-    *pulls, field, rest = _pulls_of(problem, found, groups, drawn)
-    # the first group is that of drawn residuals, whose variances are by chance
+    least = len(np.unique(randomly))
+    if least < LEAST_GROUPS or solve_for is None:
+        return 1.0 + added
+    # the first group has drawn residuals: the variances that random groups have by chance
+    drawn = np.random.default_rng(1).normal(0.0, formal.sigma0, given.image_xy.shape)
+    groups = [randomly, randomly, near, given.camera]
+    *pulls, field, rest = _pulls_of(problem, found, groups, frame, drawn)
     by_chance, *shares = (_share_of(problem, formal, solve_for(spread.T @ p.T)) for p in pulls)
-    shared = list[str]()
-    for words, share in zip(groups, shares, strict=False):
-        is_more = share > fdtri(counts[words] - 1, counts[ALONE] - 1, SURE) * by_chance
-        if counts[words] < LEAST_GROUPS or not is_more.any():
-            continue
-        more = np.where(is_more, share - by_chance, 0.0)
-        added, shared = added + more, [*shared, words]
-        if words == ALONE:
+    for group, share in zip(groups[1:], shares, strict=True):
+        count = len(np.unique(group))
+        is_more = share > fdtri(count - 1, least - 1, SURE) * by_chance
+        more = np.where(is_more & (count >= LEAST_GROUPS), share - by_chance, 0.0)
+        added = added + more
+        if group is randomly:
             by_chance = by_chance + more
-    if counts[FRAME] >= LEAST_GROUPS:
+    if frame.max() + 1 >= LEAST_GROUPS:
         field = field @ spread
         rest -= field @ solve_for(np.column_stack([field.T, right]))
-        likely = _likely_field(problem, groups[FRAME], formal.sigma0, rest) @ field
-        more = _share_of(problem, formal, solve_for(likely.T))
-        added = added + more
-        shared += [FRAME] if (more > NOTED).any() else []
-    factor = np.sqrt(1.0 + added)
-    if not shared:
-        return factor, []
-    worst = (*POSE, *problem.names)[int(np.argmax(factor))]
-    note = PcfixWarning(
-        "adjust.shared_errors",
-        f"Errors are shared by {', '.join(shared)}. Standard errors include them; they grow up to"
-        f" {factor.max():.1f} times ({worst}).",
-        groups=shared,
-        factor=float(factor.max()),
-        worst=worst,
-    )
-    return factor, [note]
+        likely = _likely_field(problem, frame, formal.sigma0, rest) @ field
+        added = added + _share_of(problem, formal, solve_for(likely.T))
+    return np.sqrt(1.0 + added)
 
 
 def common_errors(problem: Problem, formal: Precision) -> FloatArray:
@@ -120,23 +96,6 @@ def common_errors(problem: Problem, formal: Precision) -> FloatArray:
     sigma = np.array([formal.shared[i].sigma for i in rows])
     factor[6 + rows] = np.hypot(1.0, COMMON_SHARE * noise_px / problem.lens_effects[rows] / sigma)
     return factor
-
-
-def _groups_by_sharing(problem: Problem, found: Solution) -> dict[str, IntArray]:
-    """Return the groups of the observations by what they share; `ALONE` are random groups."""
-    given, block = problem.given, problem.block
-    m = len(block.xyz)
-    tiles = min(MOST_TILES, m // POINTS_PER_TILE)
-    size = np.array([(lens.width, lens.height) for lens in block.cameras.lenses or ()])
-    alone = np.random.default_rng(0).integers(0, max(tiles, 1), m)
-    place = _tiles(given.image_xy / size[given.camera], FRAME_TILES)
-    place += given.group[given.camera] * (place.max(initial=0) + 1)
-    return {
-        ALONE: alone[block.owner],
-        "neighbouring points": _tiles(found.state.xyz[:, :2], tiles)[block.owner],
-        "points of an image": given.camera,
-        FRAME: np.unique(place, return_inverse=True)[1],
-    }
 
 
 def _tiles(xy: FloatArray, count: int) -> IntArray:
@@ -162,28 +121,26 @@ def _share_of(problem: Problem, formal: Precision, moved: FloatArray) -> FloatAr
 
 
 def _pulls_of(
-    problem: Problem, found: Solution, groups: dict[str, IntArray], drawn: FloatArray
+    problem: Problem, found: Solution, groups: list[IntArray], frame: IntArray, drawn: FloatArray
 ) -> list[FloatArray]:
     """Return the right side of the reduced equations by groups, each of shape (groups, 6 k + g).
 
-    The first is that of `ALONE` with the weighted residuals `drawn`, shape (o, 2), instead of those
-    found; the others of all groups but the frame. Then, for shifts along u and v of the t tiles of
-    the frame: B', shape (2 t, 6 k + g), and C beside their right sides, shape (2 t, 2 t + 1).
+    The first is that with the weighted residuals `drawn`, shape (o, 2), instead of those found.
+    Then, for shifts along u and v of the t tiles of the frame: B', shape (2 t, 6 k + g), and C
+    beside their right sides, shape (2 t, 2 t + 1).
     """
-    tile, size = groups[FRAME], 6 * len(problem.moves) + problem.given.shared
-    each = [groups[ALONE], *(group for words, group in groups.items() if words != FRAME)]
-    pulls = [np.zeros((int(group.max(initial=0)) + 1, size)) for group in each]
-    count = 2 * (int(tile.max(initial=0)) + 1)
+    size, count = 6 * len(problem.moves) + problem.given.shared, 2 * (int(frame.max(initial=0)) + 1)
+    pulls = [np.zeros((int(group.max(initial=0)) + 1, size)) for group in groups]
     field, rest = np.zeros((count, size)), np.zeros((count, count + 1))
     for part in sparse_rows_of(found.state, problem.given, UNDAMPED):
         at, is_image = part.rows.observation, part.rows.is_image
         r = np.where(is_image[:, None], drawn[at], part.rows.r)
-        for group, total in zip(each, pulls, strict=True):
+        for group, total in zip(groups, pulls, strict=True):
             grouped = sparse_matrix(r, np.repeat(group[at], 2)[:, None], len(total))
             total += part.product(grouped).toarray()
             r = part.rows.r
         weight = np.repeat(np.where(is_image, problem.given.weight[at], 0.0), 2)
-        column = (2 * tile[at][:, None] + np.arange(2)).reshape(-1, 1)
+        column = (2 * frame[at][:, None] + np.arange(2)).reshape(-1, 1)
         shifts = sparse_matrix(weight, column, count)
         field += part.product(shifts).toarray()
         by_points = shifts.T @ part.points
@@ -246,47 +203,29 @@ LEAST_RATIO = 1.2
 """Of standard deviations; below it other weights would gain a fiftieth of a standard error."""
 
 
-def weighed(problem: Problem, now: Solution) -> tuple[Problem, list[PcfixWarning]]:
-    """Weight tie points by the noise of their group, and return a warning if groups differ.
+def weighed(problem: Problem, now: Solution) -> Problem:
+    """Weight tie points on land and under water by the noise of their group, if it differs.
 
-    Each side of the water and each sensor has its own variance of unit weight: weighted squares
-    over its share of the redundancy, of which each point takes three. Groups whose variances differ
-    (F-test), and by enough to matter, are weighted by their own (Foerstner 1979, one step).
+    Each group has its own variance of unit weight: weighted squares over its share of the
+    redundancy, of which each point takes three. Groups whose variances differ (F-test), and by
+    enough to matter, are weighted by their own (Foerstner 1979, one step).
     """
-    given, block, noise = problem.given, problem.block, dict[str, float]()
-    weight, owner, water = given.weight, block.owner, water_of(problem, now.state)
-    sensors = [f"of sensor {i}" for i in range(1, int(given.group.max()) + 2)]
-    groupings = [(sensors, given.group[given.camera])]
-    if water is not None:
-        xyz = now.state.xyz + problem.origin
-        wet = block.wet & (surface_above(water, xyz).height_m > xyz[:, 2])
-        groupings.insert(0, (["on land", "under water"], wet[owner].astype(np.int64)))
+    given, block, water = problem.given, problem.block, water_of(problem, now.state)
+    if water is None:
+        return problem
+    weight, owner, xyz = given.weight, block.owner, now.state.xyz + problem.origin
+    wet = (block.wet & (surface_above(water, xyz).height_m > xyz[:, 2]))[owner]
     r = residuals(now.state, given)
     used = problem.of_ties & problem.used & np.isfinite(r).all(axis=1)
-    square = (np.where(used[:, None], r, 0.0) ** 2).sum(axis=1)
+    rows = [used & ~wet, used & wet]
+    points = np.array([len(np.unique(owner[row])) for row in rows])
+    if points.min() < LEAST_POINTS:
+        return problem
+    square = (np.where(used[:, None], r, 0.0) ** 2).sum(axis=1) * weight**2
     redundancy = 2.0 - 3.0 / np.maximum(np.bincount(owner, used)[owner], 2.0)
-    for names, group in groupings:
-        rows = [used & (group == i) for i in range(len(names))]
-        points = np.array([len(np.unique(owner[row])) for row in rows])
-        if len(names) < 2 or points.min() < LEAST_POINTS:
-            continue
-        free = np.array([redundancy[row].sum() for row in rows])
-        each = [(square[row] * weight[row] ** 2).sum() for row in rows] / free
-        worst, best = int(np.argmax(each)), int(np.argmin(each))
-        ratio = each[worst] / each[best]
-        if ratio < max(fdtri(points[worst], points[best], SURE), LEAST_RATIO**2):
-            continue
-        weight = weight.copy()
-        for row, variance in zip(rows, each, strict=True):
-            weight[row] /= np.sqrt(variance)
-        px = np.sqrt([square[row].sum() for row in rows] / free).tolist()
-        noise |= dict(zip(names, px, strict=True))
-    if not noise:
-        return problem, []
-    words = ", ".join(f"{px:.2f} px {name}" for name, px in noise.items())
-    note = PcfixWarning(
-        "adjust.noise_differs",
-        f"The noise of tie points differs: {words}. Each group is weighted by its own.",
-        noise_px=noise,
-    )
-    return problem.weighted(weight), [note]
+    each = np.array([square[row].sum() / redundancy[row].sum() for row in rows])
+    worst, best = int(np.argmax(each)), int(np.argmin(each))
+    limit = max(fdtri(points[worst], points[best], SURE), LEAST_RATIO**2)
+    if each[worst] < limit * each[best]:
+        return problem
+    return problem.weighted(weight / np.where(used, np.sqrt(each)[wet.astype(np.int64)], 1.0))

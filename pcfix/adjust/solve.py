@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import INDEX, LogRow, Progress, moved_lens, words_of
+from pcfix.adjust.block import INDEX, Progress, moved_lens, words_of
 from pcfix.adjust.collinearity import State
 from pcfix.adjust.normal import SQUARES, UNDAMPED, Rule, normal_equations, point_steps
-from pcfix.adjust.problem import Problem, Solution, cost_at, counts_of, port_of, port_row, priors_at
+from pcfix.adjust.problem import Problem, Solution, cost_at, log_row, port_of, port_row, prior_rows
 from pcfix.errors import GeometryError, PcfixError
 from pcfix.lens.imaging import lens_table
 from pcfix.model import FloatArray
@@ -42,7 +42,6 @@ def solve(
     problem: Problem,
     start: Solution,
     loss: int = SQUARES,
-    number: int = 1,
     progress: Progress | None = None,
     close: float = CLOSE,
 ) -> Solution:
@@ -52,8 +51,6 @@ def solve(
     ----------
     loss : int
         `SQUARES`, `HUBER` or `CAUCHY` of `pcfix.adjust.normal`.
-    number : int
-        Of the round, for the log.
     close : float
         Two steps in a row that lower the cost by less than this share end the round.
     """
@@ -65,7 +62,7 @@ def solve(
         )
     damping, up, calm = FIRST_DAMPING, 2.0, 0
     least_cost = EXACT * max(int(problem.used.sum()), 1)
-    log = list(start.log)
+    log, number = list(start.log), 1 + max((row.round for row in start.log), default=0)
     for step in range(MOST_STEPS):
         # raise the damping until a step lowers the cost
         while (
@@ -82,7 +79,7 @@ def solve(
         gain = (now.cost - trial.cost) / max(now.cost, least_cost)
         now, up = trial, 2.0
         damping = max(damping / 10.0, LEAST_DAMPING)
-        row = LogRow(number, step + 1, *counts_of(problem, now))
+        row = log_row(problem, now.state, number, step + 1)
         log.append(row)
         if progress is not None:
             progress(row)
@@ -131,18 +128,16 @@ def moved_by(
         port = port_of(problem.block, water)
     except PcfixError:  # a distance below zero, or a dome that does not contain the camera
         return None
-    lenses, table = list(now.lenses), state.lenses
-    if given.first_lens[-1]:
-        parts = np.split(shared, given.first_lens[1:])
-        for rows, codes, by in zip(problem.groups, problem.codes, parts, strict=False):
-            new = {lens: moved_lens(lens, codes, by) for lens in {lenses[i] for i in rows}}
-            for i in rows:
-                lenses[i] = new[lenses[i]]
-        if not all(lens.focal > 0.0 for lens in lenses):
-            return None
-        table = lens_table(tuple(lenses))[1]
-        if table.shape[0] != state.lenses.shape[0]:
-            return None
+    lenses = list(now.lenses)
+    parts = np.split(shared, given.first_lens[1:])
+    for rows, codes, by in zip(problem.groups, problem.codes, parts, strict=False):
+        # images with one lens keep one
+        new = {lens: moved_lens(lens, codes, by) for lens in {lenses[i] for i in rows}}
+        for i in rows:
+            lenses[i] = new[lenses[i]]
+    if not all(lens.focal > 0.0 for lens in lenses):
+        return None
+    table = lens_table(tuple(lenses))[1]
     return replace(
         now,
         state=State(
@@ -165,11 +160,12 @@ def reduced_at(problem: Problem, found: Solution, rule: Rule = UNDAMPED) -> tupl
     from scipy.sparse import diags_array
 
     total, right, diagonal = normal_equations(found.state, problem.given, rule)
-    _, extra, extra_right = priors_at(problem, found)
+    rows, left = prior_rows(problem, found)
+    extra = rows.T @ rows
     # the damping is a factor on the diagonal before the points were eliminated
     extra = extra + diags_array(rule.damping * (diagonal + extra.diagonal()))
     spread = problem.spread(found.state)
-    return spread.T @ (total + extra) @ spread, spread.T @ (right + extra_right)
+    return spread.T @ (total + extra) @ spread, spread.T @ (right + rows.T @ left)
 
 
 def solver(matrix: Any) -> Callable[[FloatArray], FloatArray] | None:
@@ -213,12 +209,19 @@ def singular(problem: Problem, solution: Solution) -> GeometryError:
     These have no observation at all, or a component in an eigenvector of an eigenvalue of zero of
     the reduced matrix with unit diagonal: 1e-4 makes a variance a thousand times larger.
     """
+    from scipy.sparse import csc_array, diags_array
+    from scipy.sparse.linalg import eigsh
+
     matrix, poses = reduced_at(problem, solution)[0], np.flatnonzero(problem.moves)
     diagonal = matrix.diagonal()
     weak, why = ~(diagonal > 0.0), "no observation depends on them"
     if not weak.any():
-        values, vectors = _smallest(matrix, 1.0 / np.sqrt(diagonal))
-        vectors = vectors[:, values < max(WEAK, 10.0 * float(values[0]))]
+        scale = diags_array(1.0 / np.sqrt(diagonal))
+        start = np.random.default_rng(0).normal(size=len(diagonal))
+        few = min(8, len(diagonal) - 1)
+        scaled = csc_array(scale @ matrix @ scale)
+        values, vectors = eigsh(scaled, k=few, sigma=-1e-9, which="LM", v0=start)
+        vectors = vectors[:, values < max(WEAK, 10.0 * float(values.min()))]
         weak = np.linalg.norm(vectors, axis=1) > 1e-4
         why = "the observations do not separate them"
     of_poses, of_names = np.split(weak, [6 * len(poses)])
@@ -240,17 +243,3 @@ def singular(problem: Problem, solution: Solution) -> GeometryError:
         unknowns=names,
         images=labels,
     )
-
-
-def _smallest(matrix: Any, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the smallest eigenvalues of the scaled matrix, and their vectors."""
-    if isinstance(matrix, np.ndarray):
-        return np.linalg.eigh(matrix * scale * scale[:, None])
-    from scipy import sparse
-    from scipy.sparse.linalg import eigsh
-
-    scaled = sparse.diags_array(scale) @ matrix @ sparse.diags_array(scale)
-    start = np.random.default_rng(0).normal(size=len(scale))
-    values, vectors = eigsh(scaled.tocsc(), k=8, sigma=-1e-9, which="LM", v0=start)
-    order = np.argsort(values)
-    return values[order], vectors[:, order]

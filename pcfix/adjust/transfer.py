@@ -29,7 +29,6 @@ from pcfix.model import (
     Correction,
     FloatArray,
     IntArray,
-    Lens,
     Outcome,
     TiePoints,
     Views,
@@ -44,9 +43,8 @@ CLOSE_M = 1e-6
 LEAST_CONDITION = 1e-6
 """Determinant of the normal matrix over the product of its diagonal."""
 
-SAME_SHAPE = 0.002
-"""Relative difference of the aspect ratios of one image. Undistorted images differ by more from
-their originals, unless they have the same size; sides in millimetres are rounded by less."""
+SAME_SIDES = 0.002
+"""Relative difference of the sides of one image; those in millimetres are rounded by less."""
 
 POINTS_AT_ONCE = 100_000
 """Points whose cameras are listed at a time, which limits the memory."""
@@ -148,25 +146,17 @@ def transfer_of(original: Cameras, adjusted: Cameras, place: IntArray) -> CloudT
     row[place] = np.arange(len(adjusted))
     left_out = tuple(label for label, at in zip(original.labels, row, strict=True) if at < 0)
     original = some_cameras(original, place)
-    lenses = map(_in_unit_of, adjusted.lenses or (), original.lenses or (), original.labels)
-    return CloudTransfer(replace(original, lenses=tuple(lenses)), adjusted, row, left_out)
-
-
-def _in_unit_of(adjusted: Lens, original: Lens, label: str) -> Lens:
-    """Return an original lens in the unit of the adjusted one."""
-    factor = adjusted.width / original.width
-    if not abs(factor * original.height / adjusted.height - 1.0) <= SAME_SHAPE:
-        words = (
-            f"--adjusted-from: image {label} has {original.width:g} x {original.height:g}"
-            f" {original.unit}, but {adjusted.width:g} x {adjusted.height:g} {adjusted.unit} in the"
-            " cameras (undistorted?). Give the model from which the cameras were adjusted."
-        )
-        raise GeometryError("adjusted_from.shape", words, image=label)
-    if factor == 1.0:
-        return original
-    lengths = ("focal", "width", "height", "principal_x", "principal_y", "b1", "b2", "b3")
-    changed = {name: factor * getattr(original, name) for name in lengths}
-    return replace(original, unit=adjusted.unit, **changed)
+    pairs = zip(original.labels, original.lenses or (), adjusted.lenses or (), strict=True)
+    for label, before, after in pairs:
+        sides = np.array([[after.width, after.height], [before.width, before.height]])
+        if before.unit != after.unit or np.abs(sides[0] / sides[1] - 1.0).max() > SAME_SIDES:
+            words = (
+                f"--adjusted-from: image {label} has {before.width:g} x {before.height:g}"
+                f" {before.unit}, but {after.width:g} x {after.height:g} {after.unit} in the"
+                " cameras. Give the model from which the cameras were adjusted."
+            )
+            raise GeometryError("adjusted_from.shape", words, image=label)
+    return CloudTransfer(original, adjusted, row, left_out)
 
 
 def renumbered(views: Views, row: IntArray) -> tuple[Views, IntArray]:
@@ -197,7 +187,7 @@ class Transferred(NamedTuple):
 
         Points that were not transferred or not corrected stay at their original place.
         """
-        outcome = np.where(self.moved, correction.outcome, np.uint8(Outcome.NOT_CARRIED))
+        outcome = np.where(self.moved, correction.outcome, np.uint8(Outcome.NOT_TRANSFERRED))
         found = replace(correction, outcome=outcome)
         shift = self.xyz - self.original_xyz + correction.shift_m
         shift = np.where(found.uncorrected[:, None], 0.0, shift)
@@ -303,8 +293,8 @@ class CloudTransfer:
         return {
             "points": counts.points,
             "land": counts.land,
-            "not_carried": counts.not_moved,
-            "not_carried_reason": REASON,
+            "not_transferred": counts.not_moved,
+            "not_transferred_reason": REASON,
             "shift_m": {name: round(float(value), 4) for name, value in shift.items()},
             "cameras_left_out": list(self.left_out),
         }

@@ -21,14 +21,7 @@ from pcfix.adjust.block import (
     with_places,
 )
 from pcfix.adjust.block import taken as taken_ties
-from pcfix.adjust.methods import (
-    LEAST_TIES,
-    adjust_block,
-    check_control,
-    check_images,
-    check_marks,
-    unknowns_of,
-)
+from pcfix.adjust.methods import LEAST_TIES, adjust_block, check_control, check_images, check_marks
 from pcfix.adjust.result import Adjusted, adjustment_dict, before_of
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.diagnosis import flags_of, water_word
@@ -53,6 +46,7 @@ from pcfix.model import (
     TiePoints,
     Views,
     WaterDimension,
+    WaterMesh,
     WaterPlane,
     WaterRaster,
     WaterSurface,
@@ -128,7 +122,6 @@ def adjust_into(
 ) -> Adjusted:  # fmt: skip
     """Adjust the cameras of some inputs; of the options all others count. See `adjust_cameras`."""
     # 1. The block, its water, and what was surveyed
-    water_unknowns = unknowns_of(given, ())
     if folder is not None:
         known = [*paths_in(inputs), *paths_in(given)]
         check_folder(folder, known, mark=SUMMARY, overwrite=given.overwrite)
@@ -153,7 +146,7 @@ def adjust_into(
         )
         raise SettingError("water.dimension", words, value=str(water))
     check_images(name, original, water, given.fixed_images)
-    _check_free(given, inputs.port)
+    _check_free(given, water, inputs.port)
     gnss, reason, notes = _gnss(original, name, given)
     control = given.gcps
     gcps = "gcps" if isinstance(control, GroundControl) else str(control)
@@ -166,8 +159,7 @@ def adjust_into(
     material = Material(
         name, original, water, index_of(given.index, given.index_formula)[0], gnss, control,
         inputs.port, None if given.lens is None else _calibration(given.lens, original),
-        None if mask is None else mask.inside, water_unknowns.surface.get("level", 0.0), reason,
-        given.parallel,
+        None if mask is None else mask.inside, reason, given.parallel,
     )  # fmt: skip
 
     # 2. Tie points as they were measured, or points of the cloud
@@ -199,9 +191,11 @@ def adjust_into(
     return found
 
 
-def _check_free(given: AdjustOptions, port: Port | None) -> None:
+def _check_free(given: AdjustOptions, water: WaterSurface | None, port: Port | None) -> None:
     """Refuse unknowns that water or port do not have."""
     what, known = "the water", [*WATER_UNKNOWNS[:4]]
+    if isinstance(water, WaterMesh | WaterRaster):
+        what, known = "a mesh or raster of water", ["index"]
     if port is not None:
         is_flat = isinstance(port, FlatPort)
         what = "a flat port" if is_flat else "a dome"
@@ -211,7 +205,7 @@ def _check_free(given: AdjustOptions, port: Port | None) -> None:
         if name not in known:
             raise SettingError(
                 "option.choice",
-                f"--free {name}: {what} has no {name}. Use {', '.join(known)}.",
+                f"--free {name}: {what} has no free {name}. Use {', '.join(known)}.",
                 option="free",
                 value=name,
             )
@@ -279,11 +273,9 @@ def _write(folder: Path, found: Adjusted, model: str) -> None:
     before = before_of(found)
     with temporary_output(folder, is_folder=True) as draft:
         _write_models(draft, found)
-        sigma = found.unknowns.surface
-        moved = sigma.get("level") or sigma.get("shape")
-        if moved and isinstance(found.water, WaterRaster):
+        if found.unknowns.surface.get("shape") and isinstance(found.water, WaterRaster):
             write_water_raster(draft / WATER_FILE, found.water, found.cameras.crs)
-        if found.precision is not None and found.precision.members is not None:
+        if found.precision.members is not None:
             write_members(draft, found.precision.members)
         summary = {"model": model, **adjustment_dict(found, before)}
         text = json.dumps(summary, indent=2, allow_nan=False) + "\n"

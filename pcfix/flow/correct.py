@@ -170,7 +170,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     if options.unsure != "withhold":
         counts["unsure"] = None
     unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
-    not_moved = sum(counts["uncorrected"].values()) + int(figures.outcomes[Outcome.NOT_CARRIED])
+    not_moved = sum(counts["uncorrected"].values()) + int(figures.outcomes[Outcome.NOT_TRANSFERRED])
     made, detected = plan.made, [*plan.notes]
     if tally.beyond is not None and line is not None:
         least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
@@ -202,7 +202,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         water=water,
         water_fit=plan.found.as_dict(),
         uncertainty=uncertainty,
-        carried=transfer.as_dict(tally.transfer) if transfer and tally.transfer else None,
+        transfer=transfer.as_dict(tally.transfer) if transfer and tally.transfer else None,
         made=made,  # the reconstruction type, and why
         # other notes on the cloud, also in `warnings`
         told=[one for one in map(str, detected) if made is None or one not in made["because"]],

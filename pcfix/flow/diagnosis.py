@@ -4,21 +4,13 @@ from __future__ import annotations
 
 import shlex
 import warnings
-from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.adjust.diagnosis import (
-    EXPORT,
-    MOST_STATED_M,
-    Diagnosis,
-    Evidence,
-    diagnosed,
-    neighbours_sign,
-)
+from pcfix.adjust.diagnosis import EXPORT, MOST_STATED_M, Diagnosis, diagnosed, neighbours_sign
 from pcfix.errors import InputError, PcfixError, PcfixWarning
 from pcfix.flow.inputs import Inputs, ties_of
 from pcfix.flow.surfaces import CloudView
@@ -46,22 +38,16 @@ QUICK_BYTES = 25_000_000
 """Size of a model that is read within a second or two, even if nobody asked."""
 
 
-def diagnose(evidence: Evidence) -> Diagnosis:
-    """Look for every sign that the evidence allows, with the GNSS positions of the cameras."""
-    return diagnosed(replace(evidence, gnss=_gnss_of(evidence.cameras, evidence.name)))
-
-
 def diagnose_inputs(
     inputs: Inputs, cameras: Cameras, view: CloudView, water: WaterSurface, index: float, *,
     gcps: Any = None, reference: Any = None, in_passing: bool = False,
 ) -> Diagnosis:  # fmt: skip
     """Look for signs in a cloud, its cameras with their tie points, and surveys, if given."""
-    evidence = Evidence(
-        cameras, str(inputs.cameras), water, index, view=view, reference=reference,
-        control=None if gcps is None else read_ground_control(gcps, cameras).surveyed,
-        ties=ties_of(inputs, view.crs), in_passing=in_passing,
+    control = None if gcps is None else read_ground_control(gcps, cameras).surveyed
+    return diagnosed(
+        cameras, water, index, ties=ties_of(inputs, view.crs), view=view, control=control,
+        gnss=_gnss_of(cameras, str(inputs.cameras)), reference=reference, in_passing=in_passing,
     )  # fmt: skip
-    return diagnose(evidence)
 
 
 def _gnss_of(cameras: Cameras, name: str) -> GnssPositions | None:
@@ -87,38 +73,32 @@ def diagnose_in_passing(
     if inputs.adjusted_from is not None:
         words = "adjusted with refraction (--adjusted-from)"
         return found | {"absorbed": False, "words": words}, None
-    path = None if isinstance(inputs.cameras, Cameras) else inputs.cameras
     seen = [(one.straight, one.is_fused) for one in plan.verdicts if one.straight is not None]
+    name = "cameras" if isinstance(inputs.cameras, Cameras) else str(inputs.cameras)
     n = plan.options.refractive_index
-    evidence = Evidence(
-        cameras, "cameras" if path is None else str(path), plan.found.surface, n, ties=ties,
-        view=plan.view, in_passing=True,
-        neighbours=neighbours_sign(*seen[-1][0], is_fused=seen[-1][1]) if seen else None,
-    )  # fmt: skip
+    neighbours = neighbours_sign(*seen[-1][0], is_fused=seen[-1][1]) if seen else None
     try:
-        is_large = path is not None and _size_of(Path(path)) > QUICK_BYTES
-        diagnosis = diagnose(evidence)
+        diagnosis = diagnosed(
+            cameras, plan.found.surface, n, ties=ties, gnss=_gnss_of(cameras, name),
+            view=plan.view, neighbours=neighbours, in_passing=True,
+        )  # fmt: skip
     except (PcfixError, OSError) as error:  # this check stops no correction
         return found | {"words": f"not checked for absorbed refraction: {error}"}, None
     command, because = adjust_words(
-        inputs, plan.view.name, has_datum=has_datum(evidence.cameras, evidence.name),
+        inputs, plan.view.name, has_datum=has_datum(cameras, name),
         index=None if n == DEFAULT_REFRACTIVE_INDEX else n,
     )  # fmt: skip
     sentence, decided, warning = diagnosis.sentence(command, because), diagnosis.decided_by, None
     if sentence:
-        values = {} if diagnosis.size is None else {"likely_error_m": diagnosis.size[0]}
+        likely = diagnosis.likely_error_m
+        values = {} if likely is None else {"likely_error_m": likely}
         warning = PcfixWarning("poses.absorbed", sentence, command=command, **values)
         warnings.warn(warning, stacklevel=3)
     if decided is not None:
         did = "absorbed" if diagnosis.absorbed else "did not absorb"
         words = f"{did} the refraction, by {decided.name}{'; see the warning' * bool(sentence)}"
     else:
-        why = f"no tie points and no GNSS positions; {EXPORT}"
-        silent = [one.name for one in diagnosis.signs if one.name in ("tie points", "GNSS")]
-        if is_large:
-            why = f"the file is larger than {QUICK_BYTES / 1e6:g} MB; use 'pcfix cameras'"
-        elif silent:
-            why = f"{' and '.join(silent)} of the file tell too little (see 'pcfix cameras')"
+        why = f"no tie points or GNSS positions of the file show it quickly; {EXPORT}"
         words = f"not checked for absorbed refraction: {why}"
     signs = diagnosis.as_dict()["signs"]
     return {"absorbed": diagnosis.absorbed, "words": words, "signs": signs}, warning

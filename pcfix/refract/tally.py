@@ -171,7 +171,7 @@ class Tally(Sums):
     @property
     def submerged(self) -> int:
         """Points below the surface so far."""
-        neither = self.outcomes[Outcome.LAND] + self.outcomes[Outcome.NOT_CARRIED]
+        neither = self.outcomes[Outcome.LAND] + self.outcomes[Outcome.NOT_TRANSFERRED]
         return int(self.outcomes.sum() - neither)
 
     @property

@@ -5,50 +5,42 @@ All words are made of the plain values of `adjustment_dict`, so that a resumed r
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from pcfix.adjust.block import sensor_groups, words_of
+from pcfix.adjust.block import words_of
 from pcfix.adjust.problem import Intersected
-from pcfix.adjust.result import Adjusted, Plain, adjustment_dict, rms
-from pcfix.grid.colours import DEPTH, DIFFERENCE, RAYS, UNCERTAINTY
+from pcfix.adjust.result import Adjusted, Plain, adjustment_dict
+from pcfix.grid.colours import DIFFERENCE, UNCERTAINTY
 from pcfix.grid.maps import Maps, MapsBuilder
-from pcfix.model import BoolArray, FloatArray
+from pcfix.model import FloatArray
 from pcfix.report.map_data import Layer
-from pcfix.report.page import AFTER, BEFORE, Picture, Report, Table, label_plan, new_figure, render
+from pcfix.report.page import Picture, Report, Table, label_plan, new_figure, render
 from pcfix.report.text import Rows, RowTable, filled, share
 from pcfix.sums import nice_step
-from pcfix.water.surface import surface_above
 
 MOST_POINTS = 6000
-COLUMNS = 14
-"""Cells over the width of an image, for mean residual vectors."""
-LEAST_IN_CELL = 4
 ARROW = 0.07
 """Length of a large arrow, as a share of the longer side of the block."""
-ARROW_LOOK: Plain = {"angles": "xy", "scale_units": "xy", "zorder": 3}
 
 WHERE = (("land", "on land"), ("water", "under water"))
 MOST_LISTED = 12
 """Surveyed points in the text; the page has all of them."""
 _FACTS: RowTable = (
     ("images", "{images:,}, {poses_words}", "images"),
-    ("points", "{points[all]:,}: {points[land]:,} on land, {points[water]:,} under water{counted}",
+    ("points", "{points[all]:,}: {points[land]:,} on land, {points[water]:,} under water",
      "points"),
-    ("observations", "{o[used]:,} {kind} used, {o[left_out]:,} left out ({o_share}){outside}", "o"),
-    ("sigma0", "{sigma0:.3f}, redundancy {redundancy:,}, {rounds} rounds, {steps} steps{undone}",
-     "images"),
+    ("observations", "{o[used]:,} {kind} used, {o[left_out]:,} left out ({o_share})", "o"),
+    ("sigma0", "{sigma0:.3f}, redundancy {redundancy:,}, {rounds} rounds, {steps} steps", "images"),
     ("water", "{water[surface]}", "has_shape"),
     ("lens", "fixed", "lens_is_fixed"),
     ("{label}", "{before:.6g} -> {after:.6g}{unit} ({added:+.3g}, standard error {sigma:.2g})",
      "*unknowns"),
     ("{label}", "{added:+.3g}{unit} (standard error {sigma:.2g})", "*motions"),
-    ("water", "none{refracts}", "no_water"),
-    ("port", "--port {port_found[port]}", "has_port_unknowns"),
+    ("water", "none", "no_water"),
+    ("port", "--port {port_found[port]}", "port"),
     ("{label}", "{after:.6g}{unit}, fixed", "*held"),
-    ("on {surface}", "{points:,} marked points, distance RMS {rms_m:z.4f} m (given {sigma_m:g} m),"
-     " largest {largest_m:z.4f} m ({largest_point}){parallel_to}", "*on_surfaces"),
+    ("on {surface}", "{points:,} marked points, distance RMS {rms_m:z.4f} m (given {sigma_m:g} m)",
+     "*on_surfaces"),
     ("poses", "RMS movement of the centres {poses[moved_rms_m]:.3f} m", "moved"),
     ("", "mean east, north, up {poses[moved_mean_m]:+z.3f} m, largest"
      " {poses[moved_largest_m]:.3f} m ({poses[moved_largest_image]}); RMS rotation"
@@ -102,7 +94,7 @@ def adjustment_page(adjusted: Adjusted, before: Intersected) -> str:
     `before` are residuals and points before, of `before_of`.
     """
     d = adjustment_dict(adjusted, before)
-    maps, layers = _map(adjusted, before)
+    (maps, layers), picture = _map(adjusted, before), block_picture(d, adjusted)
     how = "without refraction" if d["water"] is None else "with refraction at the water"
     lead = (
         f"{d['images']:,} images and {d['points']['all']:,} points were adjusted"
@@ -118,7 +110,7 @@ def adjustment_page(adjusted: Adjusted, before: Intersected) -> str:
         warnings=all_notes(d),
         maps=maps,
         layers=layers,
-        pictures=pictures_of(d, adjusted, before),
+        pictures=[] if picture is None else [picture],
         tables=[table for table in tables if table.rows],
     )
     return render(report)
@@ -140,12 +132,10 @@ def adjustment_tables(d: Plain, page: str) -> list[Table]:
 
 def _facts(d: Plain) -> Rows:
     """Return labels and values of the summary."""
-    n, o, water, port = d["points"], d["observations"], d["water"], d["port_found"] or {}
-    counts = [(n[key], key.replace("_", " ")) for key in ("left_out", "control", "check")]
+    o, water, is_free = d["observations"], d["water"], d["poses_are"] != "fixed"
     kinds = {"tie points": "measured tie points", "cloud": "points of the cloud in original images"}
-    outside = f", {o['out_of_sight']:,} outside their image" if o["out_of_sight"] else ""
     unknowns, held = [_lens_row(d, row) for row in d["lens"]], []
-    for name, row in (water or port).items():
+    for name, row in (water or d["port_found"] or {}).items():
         if isinstance(row, dict):
             named = _named(name) | row | {"added": row["after"] - row["before"]}
             # a level surface has no tilt to show
@@ -154,26 +144,16 @@ def _facts(d: Plain) -> Rows:
             elif not (name.startswith("tilt") and row["after"] == 0.0):
                 held.append(named)
     motions = []
-    if d["poses_are"] == "similarity" and d["precision"] is not None:
+    if d["poses_are"] == "similarity":
         motions = [_named(row["name"]) | row for row in d["precision"]["shared"][-7:]]
-    parallel, is_free = d["unknowns"]["parallel"], d["poses_are"] != "fixed"
-    surfaces = []
-    for one in d["on_surfaces"]:
-        others = ", ".join(name for name in parallel if name != one["surface"])
-        is_parallel = one["surface"] in parallel
-        surfaces.append(one | {"parallel_to": f"; parallel to {others}" if is_parallel else ""})
     return filled(_FACTS, d | {
-        "poses_words": _poses_words(d), "o": o, "kind": kinds[d["source"]], "outside": outside,
-        "counted": "".join(f", {count:,} {key}" for count, key in counts if count),
+        "poses_words": _poses_words(d), "o": o, "kind": kinds[d["source"]],
         "o_share": share(o["left_out"], o["used"] + o["left_out"]),
-        "undone": "; adjustment without water undone" if d["source"] == "cloud" else "",
         "has_shape": water is not None and not water["surface"].startswith("level"),
         "lens_is_fixed": not d["lens"], "unknowns": unknowns, "motions": motions, "held": held,
-        "no_water": water is None, "has_port_unknowns": len(port) > 1,
-        "refracts": ", a housing port refracts" if d["port"] else "",
-        "on_surfaces": surfaces,
+        "no_water": water is None,
         "moved": is_free and d["poses"]["moved_rms_m"],
-        "is_precise": is_free and d["precision"] is not None and d["precision"]["images"],
+        "is_precise": is_free and d["precision"]["images"],
         "surveyed": [
             {"role": role, "count": len(d[role]["points"]), **d[role]}
             for role in ("control", "check") if d[role] is not None
@@ -199,10 +179,8 @@ def _lens_row(d: Plain, row: Plain) -> Plain:
     """Return a free parameter of a lens with its label and unit."""
     label, _ = words_of(row["name"])
     if len({one["sensor"] for one in d["lens"]}) > 1:
-        label += f", {row['sensor']}, {row['images']:,} images"
-    label += f", first of {row['lenses']} lenses" if row["lenses"] > 1 else ""
-    is_in_pixels = row["name"] in ("f", "cx", "cy", "b1", "b2")
-    unit = f" {d['image_unit']}" if is_in_pixels else ""
+        label += f", {row['sensor']}"
+    unit = f" {d['image_unit']}" if row["name"] in ("f", "cx", "cy", "b1", "b2") else ""
     return row | {"label": label, "unit": unit, "added": row["after"] - row["before"]}
 
 
@@ -211,45 +189,38 @@ def _fact_table(d: Plain) -> Table:
     return Table("In short", [], rows)
 
 
-# Maps
+# Map
 
 
 def _map(a: Adjusted, before: Intersected) -> tuple[Maps, list[Layer]]:
-    """Return maps of the points, averaged in cells."""
-    unit = (a.block.cameras.lenses or ())[0].unit
-    heights = _means(a, a.xyz[:, 2])
-    layers = [Layer("Height", "m", heights.height_m)]
-    if a.water is not None and a.is_wet.any():
-        depth = surface_above(a.water, a.xyz).height_m - a.xyz[:, 2]
-        under = np.where(a.is_wet, depth, np.nan)
-        layers.append(Layer("Depth", "m", _means(a, under).height_m, DEPTH))
-    higher = _means(a, a.xyz[:, 2] - before.xyz[:, 2]).height_m
-    layers.append(Layer("Change in height", "m", higher, DIFFERENCE, is_centred=True))
-    # mean squared residual of a coordinate of each point
-    rows = a.used & np.isfinite(a.residual_px).all(axis=1)
-    owner, m = a.block.owner[rows], len(a.xyz)
-    count = np.bincount(owner, minlength=m)
-    total = np.bincount(owner, (a.residual_px[rows] ** 2).mean(axis=1), m)
-    squares: FloatArray = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    layers.append(Layer("Residual", unit, np.sqrt(_means(a, squares).height_m), UNCERTAINTY))
-    images = np.bincount(a.block.owner[a.used], minlength=m).astype(np.float64)
-    return heights, [*layers, Layer("Images", "", _means(a, images).height_m, RAYS)]
-
-
-def _means(a: Adjusted, values: FloatArray) -> Maps:
-    """Return maps whose heights are means of some values of the points."""
+    """Return the heights of the points and what changed, averaged in cells."""
     plan = a.xyz[a.is_observed, :2]
-    builder = MapsBuilder(plan.min(axis=0), plan.max(axis=0), len(plan))
-    known = np.isfinite(values) & a.is_observed
-    builder.add(np.column_stack([a.xyz[known, :2], values[known]]))
-    return builder.maps()
+
+    def means(values: FloatArray) -> Maps:
+        """Return maps whose heights are means of some values of the points."""
+        builder = MapsBuilder(plan.min(axis=0), plan.max(axis=0), len(plan))
+        known = np.isfinite(values) & a.is_observed
+        builder.add(np.column_stack([a.xyz[known, :2], values[known]]))
+        return builder.maps()
+
+    # mean squared residual of a coordinate of each point
+    rows, heights = a.used & np.isfinite(a.residual_px).all(axis=1), means(a.xyz[:, 2])
+    owner, square = a.block.owner[rows], (a.residual_px[rows] ** 2).mean(axis=1)
+    count, total = (np.bincount(owner, w, len(a.xyz)) for w in (None, square))
+    squares = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    unit, higher = (a.block.cameras.lenses or ())[0].unit, a.xyz[:, 2] - before.xyz[:, 2]
+    return heights, [
+        Layer("Height", "m", heights.height_m),
+        Layer("Change in height", "m", means(higher).height_m, DIFFERENCE, is_centred=True),
+        Layer("Residual", unit, np.sqrt(means(squares).height_m), UNCERTAINTY),
+    ]
 
 
 # Tables
 
 
 def _correlation_table(d: Plain) -> Table:
-    p = d["precision"] or {"shared": [], "correlation": []}
+    p = d["precision"]
     names = [row["name"].replace("_", " ") for row in p["shared"]]
     rows = [
         [name, *(fixed(value, 3, "+") for value in row)]
@@ -292,42 +263,35 @@ def _residual_table(d: Plain) -> Table:
     return Table("Residuals and precision on land and under water", header, rows)
 
 
-# Pictures
+# Picture
 
 
-def pictures_of(d: Plain, adjusted: Adjusted, before: Intersected) -> list[Picture]:
-    """Return the pictures of an adjustment."""
-    drawn = _block(d, adjusted), _vectors(adjusted, before)
-    return [picture for picture in drawn if picture is not None]
-
-
-def _block(d: Plain, a: Adjusted) -> Picture | None:
+def block_picture(d: Plain, a: Adjusted) -> Picture | None:
     """Draw how far the projection centres moved, and their differences from GNSS, as arrows."""
-    moved = a.cameras.centres - a.block.cameras.centres
-    known = np.asarray(np.isfinite(a.gnss_residual_m).any(axis=1))
-    shown: list[tuple[str, FloatArray, BoolArray]] = []
+    moved, off = a.cameras.centres - a.block.cameras.centres, a.gnss_residual_m
+    shown: list[tuple[str, FloatArray]] = []
     if d["poses_are"] != "fixed":
-        shown.append(("Movement of the projection centres", moved, np.ones(len(moved), bool)))
-    if known.any():
-        shown.append(("Adjusted minus GNSS", a.gnss_residual_m, known))
+        shown.append(("Movement of the projection centres", moved))
+    if np.isfinite(off).any():
+        shown.append(("Adjusted minus GNSS", off))
     if not shown:
         return None
-    size = np.ptp(a.block.cameras.centres[:, :2], axis=0)
+    size, n = np.ptp(a.block.cameras.centres[:, :2], axis=0), len(shown)
     share = float(np.clip(size[1] / max(size[0], 1e-9), 0.25, 1.2))
-    n = len(shown)
     figure, panels = new_figure(8.0, n * (5.2 * share + 1.4), nrows=n, squeeze=False)
     xyz = a.xyz[a.is_observed]
     xyz = xyz[:: max(1, len(xyz) // MOST_POINTS)]
     side = float(max(np.ptp(a.cameras.centres[:, :2], axis=0).max(), 1e-3))
-    for axes, (title, vectors, rows) in zip(panels.ravel(), shown, strict=True):
+    for axes, (title, vectors) in zip(panels.ravel(), shown, strict=True):
         # in plan as arrows, in height as colour
         axes.plot(*xyz[:, :2].T, ".", color="0.85", markersize=1.5, zorder=1)
+        rows = np.isfinite(vectors).any(axis=1)
         (x, y, _), (dx, dy, up) = a.cameras.centres[rows].T, np.nan_to_num(vectors[rows]).T
         key = nice_step(max(float(np.percentile(np.hypot(dx, dy), 95.0)), 1e-6) / 2.0)
         longer, reach = ARROW * side / key, max(float(np.abs(up).max()), 1e-6)
         arrows = axes.quiver(
             x, y, dx, dy, up, cmap=DIFFERENCE, scale=1.0 / longer, clim=(-reach, reach),
-            edgecolor="0.3", linewidth=0.5, width=0.007, **ARROW_LOOK,
+            edgecolor="0.3", linewidth=0.5, width=0.007, angles="xy", scale_units="xy", zorder=3,
         )  # fmt: skip
         axes.plot(x, y, "o", color="0.2", markersize=1.5, zorder=2)
         figure.colorbar(arrows, ax=axes, label="Up (m)", shrink=0.8)
@@ -340,58 +304,5 @@ def _block(d: Plain, a: Adjusted) -> Picture | None:
     alt = (
         "The block in plan. Enlarged arrows show how far each projection centre moved, and its"
         " difference from the GNSS position; their colour shows the vertical part."
-        f" The centres moved by {d['poses']['moved_rms_m']:.3f} m (rms)."
     )
     return Picture("block", "Projection centres", alt, figure)
-
-
-def _vectors(a: Adjusted, before: Intersected) -> Picture | None:
-    """Draw mean residual vectors over the image, of the sensor with most observations."""
-    lenses = a.block.cameras.lenses or ()
-    group, _ = sensor_groups(lenses)
-    of_group = group[a.block.camera]
-    main = int(np.bincount(of_group[a.used], minlength=1).argmax())
-    lens = lenses[int(np.flatnonzero(group == main)[0])]
-    rows = a.used & (of_group == main)
-    sets = [("before", before.residual_px, BEFORE), ("after", a.residual_px, AFTER)]
-    cells = [(name, _cell_means(a, r, rows, lens.width, lens.height), c) for name, r, c in sets]
-    largest = max((float(np.hypot(*m[2:]).max(initial=0.0)) for _, m, _ in cells), default=0.0)
-    if not largest > 0.0:
-        return None
-    key, scale = nice_step(largest / 2.0), largest * COLUMNS / (1.6 * lens.width)
-    height_in = 8.0 / len(cells) * lens.height / lens.width + 0.7
-    figure, panels = new_figure(8.0, height_in, ncols=len(cells), squeeze=False, sharey=True)
-    for axes, (name, means, colour) in zip(panels.ravel(), cells, strict=True):
-        arrows = axes.quiver(*means, color=colour, scale=scale, width=0.004, **ARROW_LOOK)
-        axes.quiverkey(arrows, 0.85, 1.04, key, f"{key:g} {lens.unit}", labelpos="E")
-        axes.set(title=name, xlim=(0.0, lens.width), ylim=(lens.height, 0.0), aspect="equal")
-        axes.locator_params(nbins=5)
-        axes.set_xlabel(f"u ({lens.unit})")
-    panels[0, 0].set_ylabel(f"v ({lens.unit})")
-    rest = {name: float(rms(np.concatenate(m[2:]))) for name, m, _ in cells if len(m[2])}
-    alt = (
-        f"Mean residuals (measured minus computed) by place in the image, enlarged alike; sensor"
-        f" {lens.sensor or main + 1}. Lens and poses did not absorb these: "
-        + ", ".join(
-            f"{name} {value:.3f} {lens.unit} rms" for name, value in rest.items() if value > 0.0
-        )
-        + "."
-    )
-    return Picture("residual_vectors", "Residuals over the image", alt, figure)
-
-
-def _cell_means(
-    a: Adjusted, residual: FloatArray, rows: BoolArray, width: float, height: float
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return centres of cells of the image and mean residuals there."""
-    from scipy.stats import binned_statistic_2d
-
-    rows = rows & np.asarray(np.isfinite(residual).all(axis=1))
-    bins = [COLUMNS, max(1, round(height * COLUMNS / width))]
-    (u, v), limits = a.block.image_xy[rows].T, [[0.0, width], [0.0, height]]
-    found: Any = binned_statistic_2d
-    count = found(u, v, u, "count", bins, limits).statistic
-    du, dv = found(u, v, residual[rows].T, "mean", bins, limits).statistic
-    column, row = np.nonzero(count >= LEAST_IN_CELL)
-    u, v = (column + 0.5) * width / bins[0], (row + 0.5) * height / bins[1]
-    return u, v, du[column, row], dv[column, row]

@@ -82,10 +82,10 @@ def run_report(run: RunResults, inputs: Table, files: Sequence[Pair]) -> Report:
         f" are under water and were moved, {abs(mean):.2f} m"
         f" {'higher' if mean > 0.0 else 'deeper'} on average."
     )
-    if s.carried is not None:
+    if s.transfer is not None:
         lead += (
             " Before that, the whole cloud was transferred to the adjusted poses, which moved it by"
-            f" {s.carried['shift_m']['rms']:.2f} m (rms)."
+            f" {s.transfer['shift_m']['rms']:.2f} m (rms)."
         )
     rows = summary_rows(s)
     beside = [

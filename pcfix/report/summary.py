@@ -31,7 +31,7 @@ class Summary(Figures):
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON; optional parts only if there are any."""
-        optional = ("labelling", "carried", "unsure", "poses", "shoreline", "fit", "part")
+        optional = ("labelling", "transfer", "unsure", "poses", "shoreline", "fit", "part")
         values = {
             name: value for name, value in vars(self).items()
             if name != "told" and not (name in optional and value is None)

@@ -50,10 +50,10 @@ _LABELLING: RowTable = (
 )  # fmt: skip
 _CORRECTED: RowTable = (
     _PART,
-    ("Transferred", "{carried[points]:,} points ({carried[land]:,} on land) to the adjusted poses:"
-     " {carried[shift_m][rms]:.3f} m rms, at most {carried[shift_m][max]:.3f} m, mean Z"
-     " {carried[shift_m][mean_z]:+.3f} m", "carried"),
-    ("", "{carried_not:,} not: {carried[not_carried_reason]} ({fate})", "carried_not"),
+    ("Transferred", "{transfer[points]:,} points ({transfer[land]:,} on land) to the adjusted"
+     " poses: {transfer[shift_m][rms]:.3f} m rms, at most {transfer[shift_m][max]:.3f} m, mean Z"
+     " {transfer[shift_m][mean_z]:+.3f} m", "transfer"),
+    ("", "{not_transferred:,} not: {transfer[not_transferred_reason]} ({fate})", "not_transferred"),
     ("Submerged", "{submerged:,} points ({submerged_share}), {corrected_words}", "points"),
     ("", "{count:,} not corrected: {reason} ({fate})", "*not_corrected"),
     _NO_SURFACE,
@@ -198,7 +198,7 @@ def summary_rows(s: Summary) -> Rows:
     values = vars(s) | {
         "part_words": _part_words(s.part),
         "fate": _FATE[s.settings["uncorrected"]],
-        "carried_not": (s.carried or {}).get("not_carried"),
+        "not_transferred": (s.transfer or {}).get("not_transferred"),
         "submerged_share": share(s.submerged, s.points),
         "corrected_words": "all corrected" if s.corrected == s.submerged
         else f"{s.corrected:,} corrected ({share(s.corrected, s.submerged)})",

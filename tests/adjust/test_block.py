@@ -7,6 +7,7 @@ import numpy as np
 
 from pcfix.adjust.block import Material, block_of, restricted, usable_ties, well_seen
 from pcfix.model import TiePoints, Views
+from tests.utils.codes import refused
 from tests.utils.tie_points import simulate_tie_points
 
 
@@ -59,3 +60,13 @@ def test_poor_image():
               if c != 3}  # fmt: skip
     assert back == all_of
     np.testing.assert_array_equal(less.gnss_xyz, made.cameras.gnss.xyz[rows])
+
+
+def test_control_under_water():
+    control = scene().control
+    assert control.under_water.any()
+    silent = replace(control, under_water=np.zeros(len(control.names), bool))
+    names = [control.names[i] for i in np.flatnonzero(control.under_water)]
+    with refused("gcps.under_water", points=names):
+        gathered(control=silent)
+    assert gathered(control=silent, water=None).control_names == control.names

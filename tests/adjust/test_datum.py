@@ -54,15 +54,6 @@ def test_offset(files, adjust):
     assert offset_of(adjust(UP_M))[1][2] > 2.0 * sigma_m[2]
 
 
-@pytest.mark.nightly
-def test_weak_datum(adjust):
-    note = note_of(adjust(rows=slice(0, 3)), "gnss.weak")
-    assert (note.values["gnss"], note.values["control"], note.values["in_line"]) == (3, 0, True)
-    assert note.values["sigma_m"] == pytest.approx(0.18, abs=0.005)
-    assert note_of(adjust(), "gnss.weak") is None
-    assert note_of(adjust(rows=[0, 4, 10, 14]), "gnss.weak") is None
-
-
 def test_few_positions_and_the_cloud(files, adjust):
     cloud = files.folder / "cloud.las"
     note = note_of(adjust(rows=[0, 4, 14], model="bare", cloud=cloud), "gnss.few")
@@ -93,4 +84,4 @@ def test_strip(strip):
     assert note_of(found, "adjust.weak_lens") is None
     assert note_of(found, "gnss.offset_found") is None
     # the positions lie on a line, so the tilt across it is unknown
-    assert note_of(found, "adjust.imprecise_bed").values["tilt_deg"] > 0.0
+    assert note_of(found, "adjust.imprecise_bed").values["gsd"] > 1.5

@@ -99,7 +99,6 @@ def test_noise():
         (Unknowns(free_network=True), "adjust.cloud_needs_datum"),
         (Unknowns(poses="similarity"), "adjust.cloud_needs_datum"),
         (Unknowns(surface={"level": np.inf}), "adjust.cloud_needs_water"),
-        (Unknowns(), "adjust.no_datum"),
     ],
 )
 def test_refused(unknowns, code):

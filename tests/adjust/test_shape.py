@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-import pytest
 
 from pcfix.adjust.block import Unknowns
 from pcfix.adjust.precision import members_of, precision_of, shape_notes
@@ -60,14 +59,10 @@ def test_comes_home():
     np.testing.assert_allclose(surface_above(water, made.truth).height_m, wanted, atol=2e-5)
 
 
-@pytest.mark.parametrize(
-    ("points", "bend", "sigma_px", "code"),
-    [(600, (0.0, 0.0, 0.0), None, "adjust.flat"), (60, BEND, 8.0, "adjust.shape_undetermined")],
-)
-def test_notes(points, bend, sigma_px, code):
-    made = scene(points, tuple(bend))
-    _, found, precision = adjusted(block_of(made, control=True, sigma_px=sigma_px))
-    assert notes_of(made, found, precision) == [code]
+def test_undetermined_shape():
+    made = scene(60)
+    _, found, precision = adjusted(block_of(made, control=True, sigma_px=8.0))
+    assert notes_of(made, found, precision) == ["adjust.shape_undetermined"]
 
 
 def test_same_as_scipy():

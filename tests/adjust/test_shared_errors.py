@@ -53,7 +53,7 @@ def draws(kind, count=DRAWS):
     for _ in range(count):
         problem, found = adjusted(with_errors(rng, kind), Unknowns(lens=("f",)))
         formal = precision_of(problem, found, sigma0_of(problem, found))
-        factor, _ = disagreement_of(problem, found, formal)
+        factor = disagreement_of(problem, found, formal)
         off = found.state.centres + problem.origin - made.true_cameras.centres
         turn = found.state.rotations @ made.true_cameras.rotations.transpose(0, 2, 1)
         angles = np.degrees(Rotation.from_matrix(turn).as_rotvec())

@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 from pcfix.adjust.block import Unknowns
 from pcfix.adjust.precision import precision_of, undetermined
 from pcfix.adjust.problem import solved_cameras, water_of
-from pcfix.model import WaterMesh, WaterPlane, WaterRaster
+from pcfix.model import WaterPlane
 from tests.utils.adjust_twin import Twin
-from tests.utils.nightly import mostly_nightly
 from tests.utils.tie_blocks import adjusted, block_of
 from tests.utils.tie_points import simulate_tie_points
 
@@ -165,25 +164,6 @@ def test_similarity():
         block = block_of(made, exact=True, cameras=cameras, start_xyz=disturbed(made), **given)
         problem, found = adjusted(block, Unknowns(poses="similarity", lens=()))
         assert max(misses(made, problem, found)) < HOME_M
-
-
-@pytest.mark.parametrize("kind", mostly_nightly(["raster", "mesh"], "raster"))
-def test_level_surface(kind):
-    made = scene()
-    (x, y, _), level = np.round(made.cameras.centres.mean(axis=0)), made.water.a
-    corners = [[x + i, y + j, level] for i, j in ((-99, -99), (99, -99), (99, 99), (-99, 99))]
-    water = {
-        "raster": WaterRaster(np.full((40, 40), level), x - 100.0, y + 100.0, (5.0, 5.0)),
-        "mesh": WaterMesh(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]])),
-    }[kind]
-    unknowns = Unknowns(lens=("f",), surface={"level": 0.1})
-    _, found = adjusted(block_of(made, water=water), unknowns)
-    problem, wanted = adjusted(block_of(made), unknowns)
-    # m: the last steps of both
-    np.testing.assert_allclose(found.state.centres, wanted.state.centres, atol=1e-6)
-    np.testing.assert_allclose(found.state.xyz, wanted.state.xyz, atol=1e-6)
-    height = level + found.state.water[0]
-    assert abs(height - water_of(problem, wanted.state).a) < 1e-6
 
 
 @pytest.mark.parametrize("tilt", [None, 2.0], ids=["level", "tilted"])

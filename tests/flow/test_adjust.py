@@ -155,7 +155,6 @@ def test_shape_and_waterline(files, tmp_path):
     assert {row["name"] for row in told["control"]["points"]} == {
         row.name for row in found.control if row.role == "control"
     }
-    assert "adjust.flat" in [note.code for note in found.notes]
     for where in ("land", "water"):
         fit = told["residuals"][where]
         assert np.hypot(*fit["rms_xy_px"]) == pytest.approx(np.sqrt(2.0) * fit["rms_px"])
