@@ -90,6 +90,14 @@ def put(runs: FloatArray, at: int, a: Vector) -> None:
 
 
 @device(forceinline=True)
+def add_three(runs: FloatArray, at: int, c: float, a: Vector) -> None:
+    """Add c a to the numbers of a point in three runs that follow each other."""
+    runs[at] += c * a[0]
+    runs[at + TILE] += c * a[1]
+    runs[at + 2 * TILE] += c * a[2]
+
+
+@device(forceinline=True)
 def nine(runs: FloatArray, at: int) -> Nine:
     """Return the numbers of a point from nine runs that follow each other."""
     a, b, c = three(runs, at), three(runs, at + 3 * TILE), three(runs, at + 6 * TILE)

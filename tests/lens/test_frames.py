@@ -126,11 +126,11 @@ def test_may_hold(name):
             if not may_hold(frames, c, centre, low, high):
                 excluded += 1
                 assert not any(holds(frames, c, tuple(row)) for row in centre - inside)
-    assert excluded > 0
+    assert (excluded > 0) == frames.planes.any()
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_pyramid_and_cone(name):
+def test_pyramid(name):
     lens = LENSES[name]
     frames = frames_of(pcfix.Cameras(("a",), np.zeros((1, 3)), np.eye(3)[None], (lens,)))
     directions = np.random.default_rng(2).normal(size=(200_000, 3))
@@ -138,10 +138,9 @@ def test_pyramid_and_cone(name):
     held = directions[(u >= 0) & (u <= lens.width) & (v >= 0) & (v <= lens.height)]
     assert len(held) > 1000
     assert (held @ frames.planes[0].T >= 0).all()
-    angle = np.arccos(held[:, 2] / np.linalg.norm(held, axis=1))
-    assert angle.max() <= frames.cone[0, 3] <= np.pi + 0.1
     if lens.projection == "perspective" and name != "folding":
-        assert frames.cone[0, 3] < 1.02 * angle.max() + 0.01  # and not far around
+        # and not far around
+        assert (np.min(held @ frames.planes[0].T / held[:, 2:], axis=0) < 0.02).all()
 
 
 def test_different_lenses(points):
