@@ -31,11 +31,8 @@ from pcfix.model import Cameras, FloatArray, IntArray, Lens
 def project(lens: Lens, directions: FloatArray) -> FloatArray:
     """Return the image coordinates of directions, shape (n, 3), camera frame, any length.
 
-    Returns
-    -------
-    array, shape (n, 2)
-        u, v in the unit of the lens, also outside the frame; NaN where the lens has no image, as
-        behind a perspective camera or beyond the fold of the distortion.
+    Shape (n, 2), in the unit of the lens, also outside the frame; NaN where the lens has no image,
+    as behind a perspective camera or beyond the fold of the distortion.
     """
     rows = np.ascontiguousarray(directions, np.float64).reshape(-1, 3)
     return _project(coefficients(lens), rows)
@@ -44,29 +41,17 @@ def project(lens: Lens, directions: FloatArray) -> FloatArray:
 def unproject(lens: Lens, image_xy: FloatArray) -> FloatArray:
     """Return the directions of image coordinates, shape (n, 2), in the unit of the lens.
 
-    Returns
-    -------
-    array, shape (n, 3)
-        Unit vectors in the camera frame; NaN outside the image of the lens.
+    Unit vectors in the camera frame, shape (n, 3); NaN outside the image of the lens.
     """
     rows = np.ascontiguousarray(image_xy, np.float64).reshape(-1, 2)
     return _unproject(coefficients(lens), rows)
 
 
 def straight_images(xyz: FloatArray, camera: IntArray, cameras: Cameras) -> FloatArray:
-    """Return the image coordinates of points by straight rays, one camera for each point.
+    """Return the image coordinates of points by straight rays, shape (o, 2); see `project`.
 
-    Parameters
-    ----------
-    xyz : array, shape (o, 3)
-        World frame, metres.
-    camera : array of int, shape (o,)
-        Rows of `cameras`, which have rotations and lenses.
-
-    Returns
-    -------
-    array, shape (o, 2)
-        See `project`.
+    Each point, shape (o, 3), world frame, has one camera: a row of `cameras`, which have rotations
+    and lenses.
     """
     lenses, rotations = cameras.lenses or (), np.asarray(cameras.rotations)
     image_xy = np.full((len(xyz), 2), np.nan)
@@ -107,14 +92,9 @@ def coefficients(lens: Lens) -> FloatArray:
 
 
 def lens_table(lenses: tuple[Lens, ...]) -> tuple[IntArray, FloatArray]:
-    """Return the coefficients of k lenses for kernels, equal lenses once.
+    """Return the row of each of k lenses in a table, and the table for kernels, shape (l, ...).
 
-    Returns
-    -------
-    row : array, shape (k,)
-        Index of the lens of each camera in the table.
-    table : array, shape (l, ...)
-        See `pcfix.lens.formulas`; padded with zeros.
+    It has equal lenses once, as of `pcfix.lens.formulas`, padded with zeros.
     """
     rows: dict[Lens, int] = {}
     row = np.array([rows.setdefault(lens, len(rows)) for lens in lenses])

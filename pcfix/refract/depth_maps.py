@@ -149,16 +149,6 @@ class Tile(NamedTuple):
     row: IntArray  # (k,), of each image in `looks`
 
 
-class Lines(NamedTuple):
-    """The depths of the maps of one point as linear functions of the height of the bed.
-
-    NaN where there is none.
-    """
-
-    t: FloatArray  # (maps,), the depth of a bed; see `DEPTH`
-    slope: FloatArray  # its change with the height, 1/m
-
-
 def invert_depth_maps(batch: Batch) -> Intersection:
     """Return the true points from which fused depth maps would have made the apparent ones.
 
@@ -173,15 +163,13 @@ def invert_depth_maps(batch: Batch) -> Intersection:
         given = np.zeros(0) if rays.weight is None else rays.weight.astype(np.float64)
     else:
         given = np.full(len(batch), np.nan) if bed is None else bed.height_at(batch.xyz[:, :2])
-    result = np.zeros((len(batch), COLUMNS))
-    _invert_all(batch, listed, given, result, np.zeros((0, 0), np.float32))
+    result, none = np.zeros((len(batch), COLUMNS)), np.zeros((0, 0), np.float32)
+    _invert_all(batch, listed, given, result, none)
     few = np.flatnonzero(result[:, OUTCOME] == ONE_CAMERA)
     if batch.survey.settings.matcher in SINGLE and not listed and len(few):
         # no image shows the point with `LEAST_NEAR` others: at the edge of the block
         again = np.zeros((len(few), COLUMNS))
-        _invert_all(
-            batch.take(few), listed, given[few], again, np.zeros((0, 0), np.float32), least=1
-        )
+        _invert_all(batch.take(few), listed, given[few], again, none, least=1)
         result[few] = again
     outcome = result[:, OUTCOME].astype(np.uint8)
     found = batch.result(result[:, :3], outcome=outcome, ray_miss_m=result[:, _DISTANCE])
@@ -446,10 +434,9 @@ def best_pairs(
     """
     room[_SOLE * TILE : ROOM * TILE] = 0.0
     room[_LEAST * TILE : _TOTAL * TILE] = np.inf
-    for p in range(len(partners)):
-        _count_partner(room, partners[p], count)
     at = 0
     for p in range(len(partners)):
+        _count_partner(room, partners[p], count)
         for q in range(p + 1, len(partners)):
             _agree_best(pairs[at], partners[p], partners[q], room, count)
             at += 1
@@ -577,8 +564,8 @@ class Groups(NamedTuple):
     averaged: IntArray  # (k, 9), each map and its partners by their places; -1 after the last
     fused: IntArray  # (k, 13), likewise
     place: IntArray  # (k,), of each image among those of the point, or `ABSENT`
-    t: FloatArray  # (k,), of `Lines`
-    slope: FloatArray  # (k,)
+    t: FloatArray  # (k,), the depth of a bed in each map; see `DEPTH`
+    slope: FloatArray  # (k,), its change with the height of the bed, 1/m; NaN without a depth
     weight: FloatArray  # (k,), of each map, with what is averaged into it
     share: FloatArray  # (k,), the weight of each map by itself
     depth: FloatArray  # (k,), the averaged depth of each map, relative
@@ -605,33 +592,31 @@ def _weigh_groups(
         if not are_same(cameras, before):
             _group(groups, cameras, block.matcher)
         before = cameras
-        depths = _lines_of(groups, cameras, j, tile)
-        for q in range(cameras.size):
+        k = cameras.size
+        _set_lines(groups, cameras, j, tile)
+        for q in range(k):
             # the pixel on the ground grows with the distance
             groups.share[q] = _per_square(cameras[q], j, tile, block)
-        _set_rises(groups, depths)
+        _set_rises(groups, k)
         if len(likely):
-            for seed in range(cameras.size):
-                if depths.slope[seed] == depths.slope[seed]:
+            for seed in range(k):
+                if groups.slope[seed] == groups.slope[seed]:
                     likely[i, seed] = bed + groups.rise[seed]
             continue
         if block.matcher.is_nearest:
-            seed, result[i, AMBIGUITY] = _nearest(cameras, depths, j, tile, block), 0.0
-            rise = groups.rise[seed]
+            seed, result[i, AMBIGUITY] = _nearest(groups, cameras, j, tile, block), 0.0
         else:
             wanted = around[i] - tile.points[2 * TILE + j] - bed
-            seed, rise, result[i, AMBIGUITY] = _best_seed(
-                groups, depths, wanted, block.matcher.width_m
-            )
-        groups.weight[: cameras.size] = 0.0
+            seed, result[i, AMBIGUITY] = _best_seed(groups, k, wanted, block.matcher.width_m)
+        groups.weight[:k] = 0.0
         if seed >= 0:
             # a map that agrees shares its weight with the maps it was averaged with
-            _move(groups, depths, rise)
-            _average_around(seed, groups, depths)
+            _move(groups, k, groups.rise[seed])
+            _average_around(seed, groups)
             for q in groups.fused[seed]:
                 if q >= 0 and abs(groups.depth[q] - groups.depth[seed]) < AGREE:
                     _share(q, groups.share[q], groups)
-        for q in range(cameras.size):
+        for q in range(k):
             maps.weights[tile.row[cameras[q]], j] = groups.weight[q]
 
 
@@ -644,13 +629,12 @@ def _per_square(c: int, j: int, tile: Tile, block: Block) -> float:
 
 
 @device
-def _lines_of(groups: Groups, maps: IntArray, j: int, tile: Tile) -> Lines:
-    """Return the lines of the maps of a point about the bed of the last look."""
+def _set_lines(groups: Groups, maps: IntArray, j: int, tile: Tile) -> None:
+    """Set the depths in the maps of a point, and their changes, about the bed of the last look."""
     for q in range(maps.size):
         k = tile.row[maps[q]]
         groups.t[q] = tile.looks[k, DEPTH * TILE + j]
         groups.slope[q] = tile.looks[k, BY_HEIGHT * TILE + j]
-    return Lines(groups.t[: maps.size], groups.slope[: maps.size])
 
 
 @device
@@ -687,72 +671,69 @@ def _share(q: int, share: float, groups: Groups) -> None:
 
 
 @device
-def _nearest(cameras: IntArray, depths: Lines, j: int, tile: Tile, block: Block) -> int:
+def _nearest(groups: Groups, cameras: IntArray, j: int, tile: Tile, block: Block) -> int:
     """Return the place of the image that is nearest in plan and has a depth, -1 for none."""
     nearest, least, p = -1, np.inf, three(tile.points, _ORIGINAL * TILE + j)
     for q in range(cameras.size):
         x, y, _ = minus(row_of(block.images.centres, cameras[q]), p)
-        if depths.slope[q] == depths.slope[q] and x * x + y * y < least:
+        if groups.slope[q] == groups.slope[q] and x * x + y * y < least:
             nearest, least = q, x * x + y * y
     return nearest
 
 
 @device
-def _best_seed(
-    groups: Groups, depths: Lines, wanted: float, width_m: float
-) -> tuple[int, float, float]:
-    """Return the seed of the group that made the point, its rise, and the ambiguity.
+def _best_seed(groups: Groups, k: int, wanted: float, width_m: float) -> tuple[int, float]:
+    """Return the seed of the group that made the point, of k maps, and the ambiguity.
 
     That is the group whose bed is nearest to the wanted height or, where this is NaN, the largest.
     The ambiguity is the standard deviation (m) of the beds of all groups that are likely.
     """
-    best, at_best, least, known = -1, 0.0, np.inf, wanted == wanted
+    best, least, known = -1, np.inf, wanted == wanted
     total, first, second = 0.0, 0.0, 0.0  # sum, and moments, of what is likely
-    for seed in range(depths.t.size):
+    for seed in range(k):
         # the seed has no depth of this bed
-        if depths.slope[seed] != depths.slope[seed]:
+        if groups.slope[seed] != groups.slope[seed]:
             continue
         rise = groups.rise[seed]
         # distance from the wanted bed, or else the larger group first
         misfit = abs(rise - wanted) if known else -groups.size[seed]
         if misfit < least:
-            best, at_best, least = seed, rise, misfit
+            best, least = seed, misfit
         likely = np.exp(-0.5 * (misfit / width_m) ** 2) if known else 1.0
         total += likely
         first, second = first + likely * rise, second + likely * rise * rise
     # all groups are far from the wanted bed
     if not total > 0.0:
-        return best, at_best, abs(least) if best >= 0 else 0.0
+        return best, abs(least) if best >= 0 else 0.0
     mean = first / total
-    return best, at_best, np.sqrt(max(second / total - mean * mean, 0.0))
+    return best, np.sqrt(max(second / total - mean * mean, 0.0))
 
 
 @device
-def _set_rises(groups: Groups, depths: Lines) -> None:
-    """Find the rise and the size of the group of each seed.
+def _set_rises(groups: Groups, k: int) -> None:
+    """Find the rise and the size of the group of each seed, of k maps.
 
     Which maps agree is decided for the bed of the lines, and again for that of each group.
     """
-    k = depths.t.size
-    spread = _move(groups, depths, 0.0)
+    spread = _move(groups, k, 0.0)
     for q in range(k):
-        _average(q, groups, depths)
+        _average(q, groups)
     for seed in range(k):
         groups.rise[seed], groups.size[seed] = _fuse(seed, groups)
     for seed in range(k):
         # where all depths agree, for both beds, so do the groups
-        if max(spread, _move(groups, depths, groups.rise[seed])) >= AGREE:
-            _average_around(seed, groups, depths)
+        if max(spread, _move(groups, k, groups.rise[seed])) >= AGREE:
+            _average_around(seed, groups)
             step, groups.size[seed] = _fuse(seed, groups)
             groups.rise[seed] += step
 
 
 @device
-def _move(groups: Groups, depths: Lines, rise: float) -> float:
-    """Set the depths of all maps for a bed higher by `rise`; return their range."""
+def _move(groups: Groups, k: int, rise: float) -> float:
+    """Set the depths of k maps for a bed higher by `rise`; return their range."""
     low, high = np.inf, -np.inf
-    for q in range(depths.t.size):
-        own = depths.t[q] + depths.slope[q] * rise
+    for q in range(k):
+        own = groups.t[q] + groups.slope[q] * rise
         # NaN is neither lower nor higher
         low, high = own if own < low else low, own if own > high else high
         groups.own[q] = own
@@ -760,16 +741,16 @@ def _move(groups: Groups, depths: Lines, rise: float) -> float:
 
 
 @device
-def _average_around(seed: int, groups: Groups, depths: Lines) -> None:
+def _average_around(seed: int, groups: Groups) -> None:
     """Average the depths that may be fused with that of a seed."""
     for q in groups.fused[seed]:
         if q < 0:
             break
-        _average(q, groups, depths)
+        _average(q, groups)
 
 
 @device(forceinline=True)
-def _average(q: int, groups: Groups, depths: Lines) -> None:
+def _average(q: int, groups: Groups) -> None:
     """Average a depth with those of its partners that agree."""
     own, total, change, count = groups.own[q], 0.0, 0.0, 0.0
     for a in groups.averaged[q]:
@@ -778,7 +759,7 @@ def _average(q: int, groups: Groups, depths: Lines) -> None:
         # no branch, which the processor would predict wrongly half the time
         agrees = abs(groups.own[a] - own) < AVERAGED_WITHIN
         total += groups.own[a] if agrees else 0.0
-        change += depths.slope[a] if agrees else 0.0
+        change += groups.slope[a] if agrees else 0.0
         count += 1.0 if agrees else 0.0
     each = 1.0 / count
     groups.depth[q], groups.change[q] = total * each, change * each
@@ -819,6 +800,7 @@ def _weigh_listed(maps: Maps, given: FloatArray, groups: Groups, tile: Tile, blo
             at, bed = maps.each[j], tile.room[BED * TILE + j]
             cameras = maps.camera[maps.start[at] : maps.start[at + 1]]
             _group(groups, cameras, block.matcher)
+            _set_lines(groups, cameras, j, tile)
             step[j] = _weigh_list(maps.rows[j], j, cameras, given, groups, tile, block)
             tile.going[j] = beds < _BEDS and abs(step[j]) > FAR * abs(bed)
             searched = searched or tile.going[j]
@@ -834,9 +816,9 @@ def _weigh_list(
     i: int, j: int, cameras: IntArray, given: FloatArray, groups: Groups, tile: Tile, block: Block
 ) -> float:
     """Set the weights of the maps of point i, the j-th of its tile; return the step of its bed."""
-    points, depths, step = block.points, _lines_of(groups, cameras, j, tile), 0.0
+    points, step = block.points, 0.0
     for _ in range(_ROUNDS):
-        _move(groups, depths, step)
+        _move(groups, cameras.size, step)
         groups.weight[: cameras.size] = 0.0
         for at in range(points.start[i], points.start[i + 1]):
             c = points.camera[at]
@@ -844,9 +826,9 @@ def _weigh_list(
             _share(groups.place[c], share, groups)
         total, change = 0.0, 0.0
         for q in range(cameras.size):
-            if groups.weight[q] > 0.0 and depths.slope[q] == depths.slope[q]:
-                total += groups.weight[q] * depths.t[q]
-                change += groups.weight[q] * depths.slope[q]
+            if groups.weight[q] > 0.0 and groups.slope[q] == groups.slope[q]:
+                total += groups.weight[q] * groups.t[q]
+                change += groups.weight[q] * groups.slope[q]
         step = -total / change
     return step
 

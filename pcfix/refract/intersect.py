@@ -18,7 +18,7 @@ import numpy as np
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot, minus, row_of, scaled, vector
 from pcfix.lens.frames import Frames, frames_of, mark, no_frames
-from pcfix.model import BoolArray, Cameras, FloatArray, IntArray
+from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.refract import tiling, uncertainty
 from pcfix.refract.batch import (
     CORRECTED,
@@ -69,13 +69,8 @@ def consistent(batch: Batch) -> Intersection:
     Points without a solution, under waves that focus the light, get that of ``snell``, with a
     warning.
     """
-    check_consistent(batch.survey.cameras)
+    require_orientation(batch.survey.cameras, "Method consistent", "use method snell")
     return _intersected(batch, optics_of(batch.survey.cameras))
-
-
-def check_consistent(cameras: Cameras) -> None:
-    """Raise SettingError if cameras have no angles or no lenses."""
-    require_orientation(cameras, "Method consistent", "use method snell")
 
 
 def _intersected(batch: Batch, optics: Optics | None) -> Intersection:

@@ -64,14 +64,8 @@ def find_water(xyz: FloatArray, rgb: npt.NDArray[Any] | None = None) -> WaterPro
 
     It is the height below which the ground gets flatter, as refraction lifts the bed, or colour
     fades with depth. Square tiles are summed separately, and resampling them gives the standard
-    error.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Apparent points without noise, metres, world frame.
-    rgb : array, shape (n, 3), optional
-        In any unit from zero up. Equal colours count as none.
+    error. The apparent points, shape (n, 3), are without noise; colours, shape (n, 3), are in any
+    unit from zero up, and equal ones count as none.
     """
     known = np.isfinite(xyz).all(axis=1)
     if known.sum() < LEAST_POINTS:
@@ -94,22 +88,11 @@ level. They are higher than for `find_water`, to avoid false alarms."""
 def find_elsewhere(
     xyz: FloatArray, water_m: FloatArray, rgb: npt.NDArray[Any] | None
 ) -> tuple[WaterProposal | None, Tilted | None]:
-    """Return water that a cloud shows elsewhere than the given water surface.
+    """Return water that a cloud shows elsewhere than the given water surface, and its tilt if any.
 
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Apparent points, metres, world frame.
-    water_m : array, shape (n,)
-        Height of the given water surface above each.
-    rgb : array, shape (n, 3), or None
-
-    Returns
-    -------
-    level : WaterProposal or None
-        With heights above the given surface; None if the cloud shows it there, or nothing. The full
-        search of `find_water` runs only if another height gains most.
-    tilted : Tilted or None
+    `water_m`, shape (n,), is the height of the given surface above each point. The heights found
+    are above it; None if the cloud shows the water there, or nothing. The full search of
+    `find_water` runs only if another height gains most.
     """
     samples = sample_cloud(np.column_stack([xyz[:, :2], xyz[:, 2] - water_m]), rgb)
     found, tilted = None, None

@@ -108,22 +108,12 @@ def fit_water(
 ) -> WaterFit:
     """Fit the water surface to shoreline points, nearly half of which may be wrong.
 
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Metres, world frame; rows that are not finite are ignored.
-    model : {"auto", "level", "plane", "along"}
-        ``along`` is tilted in the direction of the points and level across it. ``auto`` is tilted
-        only if that is significant, and only along the points if these are nearly on one line, or
-        along a river without tilt across it.
-    counts : array, shape (n,), optional
-        Number of independent observations that each point is worth: 1 by default, less if
-        neighbours share their errors. Standard errors and tests of tilts use their sum.
-
-    Returns
-    -------
-    WaterFit
-        One row per input point; the order of the points does not matter.
+    Of the points, shape (n, 3), world frame, those that are not finite are ignored; their order
+    does not matter. ``along`` is tilted in the direction of the points and level across it;
+    ``auto`` is tilted only if that is significant, and only along the points if these are nearly on
+    one line, or along a river without tilt across it. `counts`, shape (n,), are how many
+    independent observations each point is worth: 1 by default, less if neighbours share their
+    errors. Standard errors and tests of tilts use their sum.
     """
     known = usable_rows(xyz)
     if len(known) == 0:

@@ -140,18 +140,9 @@ def with_index(options: Options) -> Options:
 def index_of(given: float | str | None, formula: IndexFormula = "skarlatos") -> tuple[float, str]:
     """Return a refractive index and a description of its water, empty if only a number is given.
 
-    Parameters
-    ----------
-    given : float, str or None
-        A number, by default `DEFAULT_REFRACTIVE_INDEX`; ``fresh`` or ``sea``; or ``S,T`` or
-        ``S,T,W``: salinity in PSU, temperature in degrees Celsius and wavelength in micrometres.
-    formula : {"skarlatos", "quan-fry"}
-        See `refractive_index`.
-
-    Raises
-    ------
-    SettingError
-        ``option.index`` if it is none of these, ``option.range`` if a value is outside its range.
+    It is given as a number, by default `DEFAULT_REFRACTIVE_INDEX`; as ``fresh`` or ``sea``; or as
+    ``S,T`` or ``S,T,W``: salinity in PSU, temperature in degrees Celsius and wavelength in
+    micrometres. Raises SettingError ``option.index`` if it is none of these.
     """
     if given is None:
         return DEFAULT_REFRACTIVE_INDEX, ""

@@ -72,19 +72,11 @@ def fit_river(
 ) -> RiverFit:
     """Fit the water surface along a river to shoreline points, some of which may be wrong.
 
-    The height at a place is that of the nearest place on the axis, constant upstream of the first
-    point and downstream of the last.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Metres, world frame, of both banks or one; rows that are not finite are ignored.
-    bounds : tuple of 4 float
-        Least x, least y, greatest x, greatest y of the cloud, which the raster has to cover.
-    name : str
-        Name of the raster.
-    counts : array, shape (n,), optional
-        See `pcfix.water.fit.fit_water`.
+    The points, shape (n, 3), world frame, are of both banks or one; those that are not finite are
+    ignored. `bounds` are least x, least y, greatest x, greatest y of the cloud, which the raster of
+    that name covers; `counts` are as of `pcfix.water.fit.fit_water`. The height at a place is that
+    of the nearest place on the axis, constant upstream of the first point and downstream of the
+    last.
     """
     points = np.asarray(xyz, np.float64)
     known = usable_rows(points)
