@@ -29,8 +29,7 @@ IN_TURN, INVERSE, CENTRE_X, CENTRE_Y, DISC = range(11, 16)
 
 FOCAL_X, B2, B3, FOCAL_Y, PRINCIPAL_X, PRINCIPAL_Y, WIDTH, HEIGHT = range(16, 24)
 
-PLAIN = 24
-"""Whether the lens is the common one: perspective with Brown's k1 to k4, p1 and p2 only."""
+PLAIN = 24  # whether the lens is the common one: perspective with Brown's k1 to k4, p1 and p2 only
 
 RADIALS, DENOMINATORS, SHAPES, SHAPE, TAIL = range(25, 30)
 """Number of each; k1 is at `TAIL`, the others follow, the first shape number at `SHAPE`."""

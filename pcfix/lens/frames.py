@@ -41,8 +41,7 @@ def frame_shape(lens: Lens) -> tuple[FloatArray, bool]:
     ]), True  # fmt: skip
 
 
-BORDER = 400
-"""Points along each side of a frame, which is nearly straight between neighbours."""
+BORDER = 400  # points along each side of a frame, which is nearly straight between neighbours
 
 STEEPEST = np.cos(np.radians(80.0))
 """A pyramid with flatter sides would be too wide to exclude anything; that of zeros holds all."""

@@ -150,8 +150,7 @@ def _signed_miss(window: PortShape, n: float, w: Vector, point: Vector, across: 
     return dot(across, cross(minus(point, place), t))
 
 
-BY_PORT = 5
-"""First column of the derivatives by the position of the port, of `through_port`."""
+BY_PORT = 5  # first column of the derivatives by the position of the port, of `through_port`
 BY_DIRECTION, BY_INDEX, BY_PLACE, LEAST_SIZE_M = 3e-5, 3e-4, 3e-5, 0.01
 """Steps of central differences: radians, refractive index, and a share of the size of the port.
 They leave relative errors of about 1e-8."""

@@ -13,8 +13,7 @@ from typing import TypeAlias
 
 from pcfix.errors import SettingError
 
-ACRYLIC_INDEX = 1.49
-"""Refractive index of acrylic glass (PMMA), the material of most ports."""
+ACRYLIC_INDEX = 1.49  # refractive index of acrylic glass (PMMA), the material of most ports
 
 
 @dataclass(frozen=True, slots=True)

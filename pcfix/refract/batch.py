@@ -183,12 +183,6 @@ class Batch:
             n=survey.settings.refractive_index,
         )
 
-    def outcome(self) -> npt.NDArray[np.uint8]:
-        """Return the outcome of each point by its number of rays, shape (m,)."""
-        counts = self.counts
-        few = np.where(counts == 1, Outcome.ONE_CAMERA, Outcome.NO_CAMERA)
-        return np.where(counts >= 2, Outcome.CORRECTED, few).astype(np.uint8)
-
     def angles_deg(self) -> FloatArray:
         """Return the smallest and the largest incidence angle of each point's rays, shape (m, 2).
 

@@ -68,8 +68,7 @@ from pcfix.refract.rays import light_near, refracted
 from pcfix.refract.tiling import TILE, are_same, put, slots, three
 
 MAX_LOOKS = 5
-CLOSE_M = 0.002
-"""Step of the bed below which the rest is linear."""
+CLOSE_M = 0.002  # step of the bed below which the rest is linear
 
 LIKELY, LEAST_DEPTH_M = 1.1, 0.005
 """Likely height of the bed, in terms of (n - 1) times the depth; the least depth."""
@@ -77,8 +76,7 @@ LIKELY, LEAST_DEPTH_M = 1.1, 0.005
 LEAST_CHANGE, MOST_CHANGE = 0.35, 1.5
 """Range of the change of the apparent depth with that of the bed along a ray."""
 
-NOTHING = 14.0
-"""exp(-NOTHING), a millionth, is neglected."""
+NOTHING = 14.0  # exp(-NOTHING), a millionth, is neglected
 
 AVERAGED_WITHIN = 0.012
 """Depths of neighbouring maps that differ by less, relative, are averaged before the fusion."""
@@ -86,15 +84,13 @@ AVERAGED_WITHIN = 0.012
 BASE_RAY_DEG, LEAST_PRIOR = 27.0, 1e-4
 """Angle of the ray of a base image from the vertical at which it is e times less frequent."""
 
-AGREE = 0.01
-"""Depths that differ by less, relative, are fused."""
+AGREE = 0.01  # depths that differ by less, relative, are fused
 
 SHALLOW, DEEP = 0.3, 3.5
 """Range of the bed of the surroundings, in likely heights; outliers have it elsewhere."""
 
 _ROUNDS, _BEDS = 4, 3
-FAR = 0.1
-"""Of the way to the bed: farther off, it is decided anew which depths were averaged."""
+FAR = 0.1  # of the way to the bed: farther off, it is decided anew which depths were averaged
 
 SINGLE = ("single-map", "nearest-map")
 """Names of `pcfix.options` for software that keeps one map at each place."""
@@ -102,8 +98,7 @@ SINGLE = ("single-map", "nearest-map")
 ABSENT, _OUTSIDE = -1, -2
 
 _DISTANCE, AMBIGUITY, OUTCOME, _COUNT = 3, 4, 5, 6
-COLUMNS = 7
-"""Columns that the kernels write: the shift, and these."""
+COLUMNS = 7  # columns that the kernels write: the shift, and these
 
 # Runs of `TILE` numbers. Of the look of a bed in one depth map: the depth of that bed beyond P, by
 # the distance of P from the camera, and its change with the height of the bed (1/m); the place on
@@ -163,7 +158,8 @@ def invert_depth_maps(batch: Batch) -> Intersection:
         given = np.zeros(0) if rays.weight is None else rays.weight.astype(np.float64)
     else:
         given = np.full(len(batch), np.nan) if bed is None else bed.height_at(batch.xyz[:, :2])
-    result, none = np.zeros((len(batch), COLUMNS)), np.zeros((0, 0), np.float32)
+    result = np.zeros((len(batch), COLUMNS))
+    none: FloatArray = np.zeros((0, 0), np.float32)
     _invert_all(batch, listed, given, result, none)
     few = np.flatnonzero(result[:, OUTCOME] == ONE_CAMERA)
     if batch.survey.settings.matcher in SINGLE and not listed and len(few):

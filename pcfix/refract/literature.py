@@ -95,9 +95,10 @@ def _by_rays(batch: Batch, method: int) -> Intersection:
     m = len(batch)
     shift, distance, failed = np.zeros((m, 3)), np.zeros(m), np.zeros(m, np.bool_)
     in_tiles(_solve, m, batch.chosen(), method, shift, distance, failed, points=m)
-    outcome = np.where(failed, Outcome.PARALLEL_RAYS, batch.outcome())
-    if method == _MEAN:
-        outcome = np.where(batch.counts > 0, Outcome.CORRECTED, Outcome.NO_CAMERA)
+    outcome = np.where(failed, Outcome.PARALLEL_RAYS, Outcome.CORRECTED)
+    if method != _MEAN:
+        outcome[batch.counts == 1] = Outcome.ONE_CAMERA
+    outcome[batch.counts == 0] = Outcome.NO_CAMERA
     return batch.result(shift, outcome=outcome.astype(np.uint8), ray_miss_m=distance)
 
 
@@ -167,7 +168,9 @@ def butler(batch: Batch) -> Intersection:
         h = h_A tan r / tan(asin(sin r / n))
 
     for one image (``max_cameras=1``); for more images the mean with equal weights. Straight below a
-    camera, where that is 0 / 0, it has its limit n h_A.
+    camera, where that is 0 / 0, it has its limit n h_A. Over all cameras it is also the method of
+    Dietrich (2017), "Bathymetric Structure-from-Motion", Earth Surface Processes and Landforms 42,
+    355-364, as his program pyBathySfM computes it.
 
     The paper that they name it after (Butler, Lane, Chandler & Porfiri 2002, Photogrammetric Record
     17(99), 419-439) refracts both image rays of a stereo pair and intersects them again, which is
@@ -177,10 +180,6 @@ def butler(batch: Batch) -> Intersection:
     than steep ones, which a mean ignores: where incidences differ, the result is too shallow, by up
     to 1.5 % of the depth under nine nadir images (32 m apart, 80 m up) and by 4 % for one camera
     overhead and one at 32 degrees.
-
-    It is also the method of Dietrich (2017), "Bathymetric Structure-from-Motion", Earth Surface
-    Processes and Landforms 42, 355-364, over all cameras, as his program pyBathySfM computes it.
-    The program excludes a camera exactly above the point, as tan i is 0 there.
     """
     return _by_rays(batch, _MEAN)
 
@@ -258,21 +257,14 @@ def shan(batch: Batch) -> Intersection:
     The iteration starts with s = 1, takes tan a from the point found, and with the s of eq 7
     solves again, until no tan a changes by more than `TOLERANCE`.
 
-    Differences from the paper:
+    Here the image ray is the line from the projection centre to the apparent point, as a cloud has
+    no image coordinates; so the start is the apparent point itself, where the paper has eq 6 with
+    Z = 0. The equations of any number of rays are solved together in least squares, as horizontal
+    distances at the true depth; those of `snell` (eq 11) are distances from the rays, and the two
+    agree where the rays intersect. Vertical rays leave the depth open.
 
-    - The paper's first tan a is eq 6 with Z = 0; s = 1 is nearer, and saves an iteration.
-    - The image ray is the line from the projection centre to the apparent point, as a cloud has
-      no image coordinates. So the start, s = 1, is the apparent point itself.
-    - Any number of rays: the equations of all are solved together in least squares, each one
-      divided so that it is X or Y in metres. Two rays alone are overdetermined too (4 by 3).
-    - The equations are horizontal distances at the true depth, not distances from the rays as in
-      eq 11 (method snell); the two agree where the rays intersect.
-    - tan a is that of eq 6, from the point at the depth D / s, with the previous s.
-    - Vertical rays leave the depth open: the equations are singular.
-
-    Exact where the straight rays meet in the apparent point: two cameras at the same incidence,
-    or in one vertical plane with the point. The image ray determines s, so that the iteration only
-    accounts for rays that pass each other; a few iterations are enough.
+    Exact where the straight rays meet in the apparent point: two cameras at the same incidence, or
+    in one vertical plane with the point. Elsewhere a few iterations are enough.
     """
     return _by_rays(batch, _S_MODEL)
 

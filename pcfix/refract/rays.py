@@ -171,8 +171,7 @@ Path: TypeAlias = tuple[float, float, float, float, Vector]
 """k, S, H, D and s."""
 
 NEWTON_STEPS = 40
-CLOSE = 1e-8
-"""Relative step of k: each step squares the error, so that the next is below rounding."""
+CLOSE = 1e-8  # relative step of k: each step squares the error, so that the next is below rounding
 
 
 @device
@@ -304,8 +303,7 @@ def light_and_gradients(
 
 
 SETTLING_STEPS = 12
-HALVINGS = 36
-"""Most steps to the plane where the light leaves a mesh or raster, and on a crease."""
+HALVINGS = 36  # most steps to the plane where the light leaves a mesh or raster, and on a crease
 
 
 @device

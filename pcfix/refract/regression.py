@@ -18,8 +18,7 @@ from pcfix.water.surface import is_submerged
 LEAST_COUNT, FEW = 3, 10
 """A line through two check depths fits whatever they are; a third is the first that can disagree.
 Below ten the standard errors are themselves only known to a quarter or worse."""
-OUTLIER_CHANCE = 0.05
-"""That a set of good check depths is said to hold an outlier."""
+OUTLIER_CHANCE = 0.05  # that a set of good check depths is said to hold an outlier
 _SAME_M = 1e-3
 
 
@@ -194,8 +193,7 @@ class BeyondRange(Sums):
 
 
 NEIGHBOURS = 16
-MOST_PLACES = 1000
-"""That the distance between neighbours is taken at."""
+MOST_PLACES = 1000  # that the distance between neighbours is taken at
 REACH = 4.0
 """In distances between neighbours. On a grid that is 50 points; of points strewn at random, where
 the nearest neighbour is closer than on a grid, 10."""

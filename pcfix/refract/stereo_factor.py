@@ -49,16 +49,15 @@ class StereoFactor:
     aside: int  # images that look aside, which do not count
 
     def __str__(self) -> str:
-        text = (
+        aside = (
+            f" {self.aside} images look aside by more than {NADIR_DEG:g} degrees; points from these"
+            " need a larger factor."
+        )
+        return (
             f"Depth factor {self.factor:.4f}, from a flying height of {self.height_m:.2f} m above"
             f" the water and a base of {self.base_m:.2f} m (medians of {self.images} images)."
+            f"{aside if self.aside else ''}"
         )
-        if self.aside:
-            text += (
-                f" {self.aside} images look aside by more than {NADIR_DEG:g} degrees; points from"
-                " these need a larger factor."
-            )
-        return text
 
 
 def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
@@ -66,6 +65,8 @@ def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
 
     Raises GeometryError if fewer than two images look down, or neighbours do not overlap.
     """
+    from scipy.spatial import cKDTree
+
     require_orientation(cameras, "depth-factor auto")
     rotations, lenses = np.asarray(cameras.rotations), cameras.lenses or ()
     flat = np.array([lens.projection == "perspective" for lens in lenses])
@@ -78,12 +79,15 @@ def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
             nadir=len(rows),
         )
     centres = cameras.centres[rows]
-    length_m, base = _bases(centres, rotations[rows])
-    height_m, base_m = float(np.median(centres[:, 2] - level_m)), float(np.median(length_m))
+    # the base in plan from each image to the nearest other place, and in the frame of its camera
+    plan, place = np.unique(centres[:, :2].round(3), axis=0, return_inverse=True)
+    near = np.asarray(cKDTree(plan).query(plan, k=[2])[1])[:, 0]
+    way = (plan[np.minimum(near, len(plan) - 1)] - plan)[place.reshape(-1)]
+    right, down, _ = np.abs(np.einsum("kij,kj->ik", rotations[rows, :, :2], way))
+    height_m, base_m = float(np.median(centres[:, 2] - level_m)), float(np.median(np.hypot(*way.T)))
     frames = np.array([(lenses[i].focal, lenses[i].width, lenses[i].height) for i in rows])
     tangents = np.median(frames[:, 1:] / frames[:, :1], axis=0) / 2.0
-    is_upright = np.median(np.abs(base[:, 0])) < np.median(np.abs(base[:, 1]))
-    along, across = tangents[::-1] if is_upright else tangents
+    along, across = tangents[::-1] if np.median(right) < np.median(down) else tangents
     relative = base_m / height_m
     if not 0.0 < relative < 2.0 * along:
         raise GeometryError(
@@ -95,22 +99,6 @@ def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
         )
     factor = float(ratios(relative, along, across, n).mean())
     return StereoFactor(factor, height_m, base_m, len(rows), len(cameras) - len(rows))
-
-
-def _bases(centres: FloatArray, rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the base in plan from each of k images to the nearest other place.
-
-    Its length, shape (k,), and the vector in the frame of each camera, shape (k, 3).
-    """
-    from scipy.spatial import cKDTree
-
-    plan, place = np.unique(centres[:, :2].round(3), axis=0, return_inverse=True)
-    if len(plan) < 2:
-        return np.zeros(len(centres)), np.zeros_like(centres)
-    _, near = cKDTree(plan).query(plan, k=[2])
-    way = (plan[np.asarray(near)[:, 0]] - plan)[place.reshape(-1)]
-    in_world = np.column_stack([way, np.zeros(len(way))])
-    return np.hypot(*way.T), np.einsum("kij,kj->ki", rotations, in_world)
 
 
 def ratios(relative_base: float, along: float, across: float, n: float) -> FloatArray:

@@ -16,8 +16,7 @@ from pcfix.lens.frames import Frames, may_hold
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Batch, Chosen, normal_above
 
-TILE = 128
-"""Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""
+TILE = 128  # points of a tile: its sums (11 numbers a point) stay in the processor's first cache
 
 
 def tiles_of(batch: Batch) -> int:

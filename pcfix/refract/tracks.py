@@ -44,8 +44,7 @@ from pcfix.water.surface import Field, Tin, field_of
 STEPS, MOST_STEPS = 4, 60
 """Two or three are usual. A point that is not found by then starts again, and may need many."""
 
-CLOSE_M = 1e-7
-"""Estimated distance from the solution, from the last two steps."""
+CLOSE_M = 1e-7  # estimated distance from the solution, from the last two steps
 
 # Runs of `TILE` numbers for the rays of one camera: the gradients of the image by P, the image of
 # P, and the plane of the water (N, h), which moves under waves.

@@ -266,8 +266,7 @@ def _sigma_tilt(near: Scan, axis: FloatArray, step: float) -> float:
 
 
 LEAST_AGREED, LEAST_EACH = 12.0, 3.0
-LIFTS = 0.15, 0.75
-"""Range of the change of slope by refraction, about 0.36, on rough ground."""
+LIFTS = 0.15, 0.75  # range of the change of slope by refraction, about 0.36, on rough ground
 LEAST_SINGLE, LEAST_COLOUR_SINGLE = 25.0, 40.0
 """Physics gives the size of the change of slope; colours may change with height on land too."""
 MOST_RIVAL_AGREED, MOST_RIVAL_SINGLE = 0.75, 0.5

@@ -24,14 +24,12 @@ import numpy.typing as npt
 
 from pcfix.model import FloatArray, IntArray
 
-LEAST_SIDE = 8.0
-"""Least sum of weights of the cells of a tile above a height, and below."""
+LEAST_SIDE = 8.0  # least sum of weights of the cells of a tile above a height, and below
 _TINY = 1e-12
 _STEADY_M = 0.3
 
 
-LIFT = 0.36
-"""n - 1 and a little more for oblique rays: the apparent reduction of slopes."""
+LIFT = 0.36  # n - 1 and a little more for oblique rays: the apparent reduction of slopes
 MOST_FADING = 1.2
 """Per metre. Clear water has about 0.3, twice the difference in attenuation over the gamma of
 images; faster changes, except in the darkest water, are of the ground: plants, or a wet edge. They

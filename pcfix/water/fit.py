@@ -23,12 +23,10 @@ from pcfix.water.surface import FoundSurface
 
 Model = Literal["auto", "level", "plane", "along"]
 MAX_TILT_PERCENT = 5.0
-SIGNIFICANCE = 0.05
-"""A tilt is significant if chance gives it more rarely."""
+SIGNIFICANCE = 0.05  # a tilt is significant if chance gives it more rarely
 LINE_RATIO = 0.1
 """Points are on one line if their spread across it is less than this share of that along it."""
-LONG_RATIO = 1.0 / 3.0
-"""Points are along a river or a coast, level across, below this ratio."""
+LONG_RATIO = 1.0 / 3.0  # points are along a river or a coast, level across, below this ratio
 WIDE_SCATTER_M = 0.1
 _SAME_PLACE_M = 1e-3
 _FEWEST_FOR_PLANE = 3
@@ -256,8 +254,7 @@ def _chance_of_tilt(shore: _Shore, fit: Regression, unknowns: int) -> float:
     return float(f.sf(tilt @ np.linalg.solve(covariance, tilt) / tilts, tilts, spare))
 
 
-TUKEY = 4.685061
-"""Tukey's constant for 95 % efficiency."""
+TUKEY = 4.685061  # Tukey's constant for 95 % efficiency
 LEAST_SCALE_M = 0.005
 """Least scatter of residuals for their weights: the edge of water is no sharper."""
 SUBSETS, SAMPLE = 3000, 400
@@ -364,8 +361,7 @@ def _spread(X: FloatArray, residual: FloatArray, limit: float) -> tuple[FloatArr
     return np.asarray(k**2 * (psi**2).sum() / spare / slope**2 * inverse), sigma
 
 
-NEIGHBOURS, FEWEST = 25, 3
-"""Points whose median is the height of a place, at most and at least."""
+NEIGHBOURS, FEWEST = 25, 3  # points whose median is the height of a place, at most and at least
 
 
 class NearestPoints:

@@ -16,8 +16,7 @@ Options = TypeVar("Options", bound=MethodOptions)
 SALINITY_PSU, TEMPERATURE_C, WAVELENGTH_UM = (0.0, 40.0), (0.0, 30.0), (0.4, 0.7)
 """Ranges of the formulas (fitted up to 35 PSU; natural seas have a little more)."""
 
-GREEN_UM = 0.53
-"""Peak of the green pixels, where cameras see most through water."""
+GREEN_UM = 0.53  # peak of the green pixels, where cameras see most through water
 
 
 class Water(NamedTuple):

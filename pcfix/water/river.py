@@ -143,8 +143,7 @@ def _raster(axis: Axis, profile: Profile, bounds: Bounds, name: str) -> WaterRas
     return WaterRaster(height, left - cell / 2.0, y[0] + cell / 2.0, (cell, cell), name)
 
 
-REACH = 2.0
-"""Longest edge of the network, relative to the longest that keeps it connected."""
+REACH = 2.0  # longest edge of the network, relative to the longest that keeps it connected
 _ROUNDS, _NODES = 10, 300
 
 
@@ -227,8 +226,7 @@ def _smoothed(xy: FloatArray, station: FloatArray, bandwidth: float) -> FloatArr
 FOLDS = 5
 PENALTIES = tuple(10.0 ** np.arange(-4.0, 3.5, 0.5))
 MOST_NODES, NODES_A_POINT = 400, 2
-STIFF_PENALTY = 1e3
-"""Penalty on rises, and on bends near the ends."""
+STIFF_PENALTY = 1e3  # penalty on rises, and on bends near the ends
 END_POINTS = 7
 """The outermost points are on one straight piece, so that a single one cannot bend it."""
 RISES_IF_WORSE = 1.25
