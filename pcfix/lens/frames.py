@@ -17,8 +17,16 @@ import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Vector, dot, minus, row_of, scaled, times
-from pcfix.lens.formulas import HEIGHT, PLAIN, WIDTH
-from pcfix.lens.imaging import image_of, lens_table, plain_image, plain_lens, unproject
+from pcfix.lens.imaging import (
+    HEIGHT,
+    PLAIN,
+    WIDTH,
+    image_of,
+    lens_table,
+    plain_image,
+    plain_lens,
+    unproject,
+)
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, Views
 
 

@@ -79,7 +79,7 @@ from pcfix.refract.batch import (
     warn_of_unsolved,
 )
 from pcfix.refract.choice import ANY_NUMBER
-from pcfix.refract.rays import NO_LINE, nearest_point, plus_line
+from pcfix.refract.rays import line_terms, nearest_point
 from pcfix.refract.tiling import TILE, are_same, corners_of, near_cameras, spatial_order
 
 MAX_STEPS = 30
@@ -258,7 +258,7 @@ def _usable(
 @device(allocates=True)
 def _solve(row: FloatArray, point: Vector, chosen: IntArray, rig: Rig, is_consistent: bool) -> None:
     """Intersect the rays of a point and search the true point; fill in a row of the result."""
-    window, sums, least, k = window_of(rig.port), NO_LINE, 1.0, 0
+    window, sums, least, k = window_of(rig.port), np.zeros(9), 1.0, 0
     for c in chosen:
         r, away = rig.rotations[c], minus(row_of(rig.centres, c), point)
         d = times(r, scaled(-1.0, away))
@@ -266,9 +266,13 @@ def _solve(row: FloatArray, point: Vector, chosen: IntArray, rig: Rig, is_consis
         if np.isnan(leaves[0] + t[0]):
             continue
         a = plus(transposed_times(r, leaves), away)
-        k, sums = k + 1, plus_line(sums, a, transposed_times(r, t), 1.0)
+        k, terms = k + 1, line_terms(a, transposed_times(r, t), 1.0)
+        for i in range(9):
+            sums[i] += terms[i]
         least = min(least, cosine_at_port(window, d))
-    solved, q, distance = nearest_point(float(k), sums)
+    solved, q, distance = nearest_point(
+        float(k), (*vector(sums), *vector(sums, 3), *vector(sums, 6))
+    )
     row[:] = 0.0
     if k < 2:
         row[_OUTCOME] = ONE_CAMERA if k == 1 else NO_CAMERA

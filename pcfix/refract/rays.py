@@ -85,17 +85,6 @@ def line_terms(a: Vector, d: Vector, inv_length2: float) -> Nine:
     return d[0] * t[0], d[0] * t[1], d[0] * t[2], d[1] * t[1], d[1] * t[2], bx, by, bz, s
 
 
-@device
-def plus_line(sums: Nine, a: Vector, d: Vector, inv_length2: float) -> Nine:
-    """Return the sums with the terms of one more line."""
-    t = line_terms(a, d, inv_length2)
-    return (
-        sums[0] + t[0], sums[1] + t[1], sums[2] + t[2], sums[3] + t[3], sums[4] + t[4],
-        sums[5] + t[5], sums[6] + t[6], sums[7] + t[7], sums[8] + t[8],
-    )  # fmt: skip
-
-
-NO_LINE = (0.0,) * 9
 MIN_DETERMINANT = 1e-6
 """Least determinant of M / k. Two rays at an angle alpha have alpha^2 / 4: 1e-6 is a tenth of a
 degree, far below any usable base, and keeps rounding below 1e-9 m."""

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import root
 
 import pcfix
-from pcfix.lens.formulas import distorted
-from pcfix.lens.imaging import coefficients, project, unproject
+from pcfix.lens.imaging import coefficients, distorted, project, unproject
 from tests.utils.compiled import compiled
 from tests.utils.twins import brown_slowly, image_slowly
 
