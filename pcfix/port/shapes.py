@@ -8,6 +8,7 @@ Inside is air, then comes the glass, then the water.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -123,11 +124,9 @@ def port_of(text: str) -> Port:
         if word not in known or word in values:
             why = "is given twice" if word in values else f"is not one of {', '.join(known)}"
             raise _bad(text, f"'{word}' {why}", _EXAMPLES[kind])
-        try:
+        with suppress(ValueError):
             values[word] = float(number)
-        except ValueError:
-            values[word] = math.nan
-        if not math.isfinite(values[word]):
+        if not math.isfinite(values.get(word, math.nan)):
             raise _bad(text, f"{word} is not a number: '{number}'", _EXAMPLES[kind])
     if known[0] not in values:
         raise _bad(text, f"{known[0]} is missing", _EXAMPLES[kind])

@@ -167,7 +167,6 @@ class WaterMeeting(Sums):
     too_deep: int
     low_m: float = field(metadata=LEAST)
     high_m: float = field(metadata=MOST)
-    lowest_water_m: float = field(metadata=LEAST)
     most_depth_m: float = field(metadata=MOST)
 
     @classmethod
@@ -184,7 +183,6 @@ class WaterMeeting(Sums):
             too_deep=int((depth > TOO_DEEP_M).sum()),
             low_m=float(z.min(initial=np.inf)),
             high_m=float(z.max(initial=-np.inf)),
-            lowest_water_m=correction.lowest_water_m,
             most_depth_m=float(depth.max(initial=0.0)),
         )
 
