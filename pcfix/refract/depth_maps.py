@@ -118,8 +118,6 @@ _AT, _SQUARES, _CURVATURE, PARTNER = slots(1, 1, 1)
 _COST, _PAIR_AT, PAIR = slots(1, 1)
 # Of the points, after the runs of `tiling.gather`: P in the original model.
 _ORIGINAL, _POINT = 7, 10
-# Of the search: the step of the bed, and sums over the maps.
-_STEP, _WEIGHT, _CHANGE, _X, _Y, _SQUARE, _MAPS, SEARCH = slots(1, 1, 1, 1, 1, 1, 1)
 
 
 class Block(NamedTuple):
@@ -139,7 +137,7 @@ class Tile(NamedTuple):
     partners: FloatArray  # (p, `PARTNER`)
     pairs: FloatArray  # (p (p - 1) / 2, `PAIR`)
     looks: FloatArray  # (k, `LOOK`), of the images near the tile
-    search: FloatArray  # (`SEARCH`,)
+    step: FloatArray  # (`TILE`,), of the bed, metres
     going: BoolArray  # (`TILE`,), whether the bed is searched
     row: IntArray  # (k,), of each image in `looks`
 
@@ -285,7 +283,7 @@ def room_of_tile(k: int, partners: int) -> Tile:
         np.empty((partners, PARTNER * TILE)),
         np.empty((partners * (partners - 1) // 2, PAIR * TILE)),
         np.empty((k, LOOK * TILE)),
-        np.empty(SEARCH * TILE),
+        np.empty(TILE),
         np.empty(TILE, np.bool_),
         np.full(k, ABSENT),
     )
@@ -487,17 +485,16 @@ def _add_pair(room: FloatArray, pair: FloatArray, count: int, tolerance: float) 
 
 
 @device
-def _sum_lines(search: FloatArray, looks: FloatArray, weights: FloatArray) -> None:
+def _set_steps(tile: Tile, weights: FloatArray) -> None:
     """Set how far up the bed of each point is at which the weighted mean of the depths is zero."""
-    search[: _X * TILE] = 0.0
-    for k in range(len(weights)):
-        depth, change, weight = looks[k, DEPTH * TILE :], looks[k, BY_HEIGHT * TILE :], weights[k]
-        for j in range(weight.size):
-            counts = (weight[j] > 0.0) & (change[j] == change[j])
-            search[_STEP * TILE + j] -= weight[j] * depth[j] if counts else 0.0
-            search[_CHANGE * TILE + j] += weight[j] * change[j] if counts else 0.0
     for j in range(weights.shape[1]):
-        search[_STEP * TILE + j] /= search[_CHANGE * TILE + j]
+        total, change = 0.0, 0.0
+        for k in range(len(weights)):
+            slope = tile.looks[k, BY_HEIGHT * TILE + j]
+            if weights[k, j] > 0.0 and slope == slope:
+                total += weights[k, j] * tile.looks[k, DEPTH * TILE + j]
+                change += weights[k, j] * slope
+        tile.step[j] = -total / change
 
 
 @device
@@ -506,52 +503,42 @@ def _settle(tile: Tile, near: IntArray, weights: FloatArray, block: Block) -> No
 
     Starts from the looks at hand and repeats until the steps are small.
     """
-    room, step = tile.room, tile.search[_STEP * TILE :]
-    _sum_lines(tile.search, tile.looks, weights)
+    _set_steps(tile, weights)
     for _ in range(MAX_LOOKS):
         searched = False
         for j in range(weights.shape[1]):
             # NaN where no image with a weight sees the bed
-            tile.going[j] = np.isfinite(step[j]) and abs(step[j]) > CLOSE_M
+            tile.going[j] = np.isfinite(tile.step[j]) and abs(tile.step[j]) > CLOSE_M
             if tile.going[j]:
-                room[BED * TILE + j] += step[j]
+                tile.room[BED * TILE + j] += tile.step[j]
                 searched = True
         if not searched:
             break
         look(tile, near, weights, block)
-        _sum_lines(tile.search, tile.looks, weights)
+        _set_steps(tile, weights)
 
 
 @device
 def _finish(result: FloatArray, maps: Maps, tile: Tile) -> None:
     """Write the rows: the weighted mean of the Q, moved by the rest of the step."""
-    search, weights = tile.search, maps.weights
-    search[_WEIGHT * TILE : _CHANGE * TILE] = 0.0
-    search[_X * TILE :] = 0.0
-    for k in range(len(weights)):
-        look, weight = tile.looks[k], weights[k]
-        for j in range(weight.size):
-            change = look[BY_HEIGHT * TILE + j]
-            counts = (weight[j] > 0.0) & (change == change)
-            w, step = weight[j] if counts else 0.0, search[_STEP * TILE + j]
-            x = look[_PLACE * TILE + j] + step * look[_PLACE_BY_HEIGHT * TILE + j]
-            y = look[(_PLACE + 1) * TILE + j] + step * look[(_PLACE_BY_HEIGHT + 1) * TILE + j]
-            x, y = (x, y) if counts else (0.0, 0.0)
-            search[_WEIGHT * TILE + j] += w
-            search[_X * TILE + j] += w * x
-            search[_Y * TILE + j] += w * y
-            search[_SQUARE * TILE + j] += w * (x * x + y * y)
-            search[_MAPS * TILE + j] += 1.0 if counts else 0.0
+    weights = maps.weights
     for j in range(weights.shape[1]):
-        row, at, step = result[maps.rows[j]], maps.each[j], search[_STEP * TILE + j]
+        row, at, step = result[maps.rows[j]], maps.each[j], tile.step[j]
+        total, x, y, square, count = 0.0, 0.0, 0.0, 0.0, 0
+        for k in range(len(weights)):
+            look, w = tile.looks[k], weights[k, j]
+            if w > 0.0 and look[BY_HEIGHT * TILE + j] == look[BY_HEIGHT * TILE + j]:
+                u = look[_PLACE * TILE + j] + step * look[_PLACE_BY_HEIGHT * TILE + j]
+                v = look[(_PLACE + 1) * TILE + j] + step * look[(_PLACE_BY_HEIGHT + 1) * TILE + j]
+                total, count, square = total + w, count + 1, square + w * (u * u + v * v)
+                x, y = x + w * u, y + w * v
         row[OUTCOME] = ONE_CAMERA if maps.start[at + 1] > maps.start[at] else NO_CAMERA
-        per_weight = 1.0 / search[_WEIGHT * TILE + j]
-        square = search[_SQUARE * TILE + j] * per_weight
+        per_weight = 1.0 / total
+        x, y, square = x * per_weight, y * per_weight, square * per_weight
         if np.isfinite(step) and np.isfinite(square):
-            x, y = search[_X * TILE + j] * per_weight, search[_Y * TILE + j] * per_weight
             row[0], row[1], row[2] = x, y, tile.room[BED * TILE + j] + step
             row[_DISTANCE] = np.sqrt(max(square - x * x - y * y, 0.0))
-            row[OUTCOME], row[_COUNT] = CORRECTED, search[_MAPS * TILE + j]
+            row[OUTCOME], row[_COUNT] = CORRECTED, count
 
 
 class Groups(NamedTuple):
@@ -782,8 +769,8 @@ def _weigh_listed(maps: Maps, given: FloatArray, groups: Groups, tile: Tile, blo
 
     Which depths agree depends on the bed, and the bed on which agree.
     """
-    step = tile.search[_STEP * TILE :]
-    step[:TILE] = 0.0
+    step = tile.step
+    step[:] = 0.0
     for beds in range(1, _BEDS + 1):
         searched = False
         for j in range(maps.rows.size):

@@ -236,8 +236,7 @@ def _choose(coarse: Scan) -> tuple[Peak, Scan]:
     start = _best(coarse, NO_TILT[None])
     level, near = _refine(samples, start, NO_TILT)
     shore = samples.xyz[level.shore(samples), :2]
-    if len(shore) < 3:
-        shore = samples.xyz[:, :2]
+    shore = shore if len(shore) > 2 else samples.xyz[:, :2]
     axis = np.linalg.svd(shore - shore.mean(axis=0), full_matrices=False)[2][0]
     extent = float(np.ptp(samples.xyz[:, :2], axis=0).max())
     step = max(TILT_STEP_M / extent, LARGEST_TILT / MOST_TILT_STEPS)
@@ -323,7 +322,7 @@ def _judged(coarse: Scan) -> WaterProposal:
         lift = evidence["slope amplitude"]
     shore = samples.xyz[peak.shore(samples)]
     reason = ""
-    if not LEAST_SHARE <= wet <= 1.0 - LEAST_SHARE:
+    if not LEAST_SHARE <= wet <= 1.0 - LEAST_SHARE or len(shore) == 0:
         reason, why = "no_shoreline", "nearly all of the cloud is on one side of it"
     elif not LIFTS[0] <= lift <= LIFTS[1]:  # a break that refraction does not make
         reason = "bank"
@@ -335,8 +334,6 @@ def _judged(coarse: Scan) -> WaterProposal:
         why = f"its evidence is {total:.0f}, and {rival_m:.2f} m has {rival:.0f}, nearly as much"
     elif sigma_m > MOST_SIGMA_M:
         reason, why = "inconsistent", f"parts of the cloud differ by {sigma_m:.2f} m"
-    elif len(shore) == 0:
-        reason, why = "no_shoreline", "no ground crosses it"
     if reason:
         height = peak.level_m + float(samples.xyz[:, :2].mean(axis=0) @ peak.tilt + origin[2])
         raise GeometryError(
