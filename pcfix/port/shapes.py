@@ -43,12 +43,7 @@ class FlatPort:
         object.__setattr__(self, "normal", (x, y, z))
 
     def __str__(self) -> str:
-        tilt = math.degrees(math.atan2(math.hypot(*self.normal[:2]), self.normal[2]))
-        return (
-            f"flat port {1000.0 * self.distance_m:g} mm before the projection centre, "
-            + _glass_words(self)
-            + (f", tilted by {tilt:.3g} degrees" if tilt else "")
-        )
+        return spec_of(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +70,7 @@ class DomePort:
         )  # fmt: skip
 
     def __str__(self) -> str:
-        x, y, z = (1000.0 * part for part in self.centre_m)
-        return (
-            f"dome port of {1000.0 * self.radius_m:g} mm radius about ({x:g}, {y:g}, {z:g}) mm, "
-            + _glass_words(self)
-        )
+        return spec_of(self)
 
 
 Port: TypeAlias = FlatPort | DomePort
@@ -159,9 +150,3 @@ def _check_glass(port: Port) -> None:
         "glass", index, math.isfinite(index) and index >= 1.0,
         "must be at least 1: the refractive index of the glass, 1.49 for acrylic.",
     )  # fmt: skip
-
-
-def _glass_words(port: Port) -> str:
-    if port.thickness_m == 0.0:
-        return "thin"
-    return f"{1000.0 * port.thickness_m:g} mm of glass with the index {port.glass_index:g}"

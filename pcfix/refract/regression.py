@@ -53,13 +53,10 @@ class DepthRegression:
         """
         inside = self.rmse_m if self.cv_rmse_m is None else self.cv_rmse_m
         nearest = np.clip(apparent_m, self.shallowest_m, self.deepest_m)
-        more = self._variance_m2(apparent_m) - self._variance_m2(nearest)
+        # the variance of the line at x is se_a^2 + se_b^2 x^2 + 2 cov x
+        more = self.slope_se**2 * (apparent_m**2 - nearest**2)
+        more += 2.0 * self.covariance_m * (apparent_m - nearest)
         return np.asarray(np.sqrt(inside**2 + np.maximum(more, 0.0)))
-
-    def _variance_m2(self, apparent_m: FloatArray) -> FloatArray:
-        """Return the variance of the line itself at apparent depths."""
-        ends = self.intercept_se_m**2 + (self.slope_se * apparent_m) ** 2
-        return np.asarray(ends + 2.0 * self.covariance_m * apparent_m)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it in plain values."""

@@ -126,11 +126,11 @@ def find_elsewhere(
 
 LARGEST_TILT, USUAL_TILT = 0.006, 0.002
 TILT_STEP_M, MOST_TILT_STEPS = 0.15, 9
-TILT_SIGMAS, TILT_GAIN = 3.0, 6.0
+TILT_GAIN = 6.0
 COARSE_M, FINE_M, MOST_HEIGHTS = 0.04, 0.01, 800
 FINE_REACH_M, SAME_PLACE_M = 0.6, 0.3
 WATERLINE_M = 0.05
-DRAWS, TILT_DRAWS, TILT_REACH = 120, 40, 6
+DRAWS = 120
 NO_TILT = np.zeros(2)
 
 
@@ -227,7 +227,7 @@ def _refine(samples: Samples, start: Peak, step: FloatArray) -> tuple[Peak, Scan
 
 
 def _choose(coarse: Scan) -> tuple[Peak, Scan]:
-    """Return the level, or the plane if its tilt is significant and gains enough, and its sums.
+    """Return the level, or the plane if its tilt gains enough, and its sums.
 
     Standing water is level, and flowing water is level across: it may only fall along the line of
     the shore.
@@ -244,37 +244,19 @@ def _choose(coarse: Scan) -> tuple[Peak, Scan]:
     if tilted.score > start.score:
         plane, near_plane = _refine(samples, tilted, step * axis)
         along = abs(float(plane.tilt @ axis))
-        gains = plane.score > level.score + TILT_GAIN and along <= LARGEST_TILT
-        if gains and along > TILT_SIGMAS * _sigma_tilt(near_plane, axis, step):
+        if plane.score > level.score + TILT_GAIN and step / 2.0 < along <= LARGEST_TILT:
             return plane, near_plane
     return level, near
-
-
-def _around(near: Scan) -> tuple[FloatArray, BoolArray]:
-    """Return heights relative to the surface found, and which of them are at the same place."""
-    heights = near.heights_m - near.heights_m[len(near.heights_m) // 2]
-    return heights, np.asarray(np.abs(heights) <= SAME_PLACE_M)
 
 
 def _sigma_level(near: Scan) -> float:
     """Return the standard error of the level by bootstrap, with the tilt found."""
     rng = np.random.default_rng(0)
-    heights, same = _around(near)
+    heights = near.heights_m - near.heights_m[len(near.heights_m) // 2]
+    same = np.abs(heights) <= SAME_PLACE_M
     draws = [_gains(near, NO_TILT, rng)[same] for _ in range(DRAWS)]
     levels = np.array([heights[same][int(np.argmax(draw))] for draw in draws])
     return math.hypot(float(np.sqrt(np.mean(levels**2))), LEAST_SIGMA_M)
-
-
-def _sigma_tilt(near: Scan, axis: FloatArray, step: float) -> float:
-    """Return the standard error of the tilt along an axis by bootstrap."""
-    same, tilts = _around(near)[1], _tilts_along(step / 2.0 * axis, TILT_REACH)
-    tops = [  # with the same sample for all tilts
-        [_gains(near, tilt, np.random.default_rng(seed))[same].max() for tilt in tilts]
-        for seed in range(TILT_DRAWS)
-    ]
-    drawn = tilts[np.argmax(tops, axis=1)] @ axis
-    # the median absolute deviation, and the rounding to steps of tilt
-    return math.hypot(1.4826 * float(np.median(np.abs(drawn))), step / 6.0)
 
 
 LEAST_AGREED, LEAST_EACH = 12.0, 3.0
