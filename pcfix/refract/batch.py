@@ -346,15 +346,8 @@ class Images(NamedTuple):
 def images_of(original_model: OriginalModel | None, now: Cameras) -> Images:
     """Return the images for kernels; both cameras have angles and lenses."""
     original = now if original_model is None else original_model.cameras
-    if len(original) != len(now):
-        raise ValueError("the same images are needed twice")
-    same = original is now or (
-        np.array_equal(original.centres, now.centres)
-        and original.lenses == now.lenses
-        and np.array_equal(np.asarray(original.rotations), np.asarray(now.rotations))
-    )
-    centres = np.ascontiguousarray(original.centres, np.float64)
-    return Images(centres, optics_of(original), None if same else optics_of(now))
+    adjusted = None if original is now else optics_of(now)
+    return Images(np.ascontiguousarray(original.centres, np.float64), optics_of(original), adjusted)
 
 
 @device

@@ -586,11 +586,8 @@ def _weigh_groups(
                 if groups.slope[seed] == groups.slope[seed]:
                     likely[i, seed] = bed + groups.rise[seed]
             continue
-        if block.matcher.is_nearest:
-            seed, result[i, AMBIGUITY] = _nearest(groups, cameras, j, tile, block), 0.0
-        else:
-            wanted = around[i] - tile.points[2 * TILE + j] - bed
-            seed, result[i, AMBIGUITY] = _best_seed(groups, k, wanted, block.matcher.width_m)
+        wanted = around[i] - tile.points[2 * TILE + j] - bed
+        seed, result[i, AMBIGUITY] = _best_seed(groups, cameras, wanted, j, tile, block)
         groups.weight[:k] = 0.0
         if seed >= 0:
             # a map that agrees shares its weight with the maps it was averaged with
@@ -654,37 +651,35 @@ def _share(q: int, share: float, groups: Groups) -> None:
 
 
 @device
-def _nearest(groups: Groups, cameras: IntArray, j: int, tile: Tile, block: Block) -> int:
-    """Return the place of the image that is nearest in plan and has a depth, -1 for none."""
-    nearest, least, p = -1, np.inf, three(tile.points, _ORIGINAL * TILE + j)
-    for q in range(cameras.size):
-        x, y, _ = minus(row_of(block.images.centres, cameras[q]), p)
-        if groups.slope[q] == groups.slope[q] and x * x + y * y < least:
-            nearest, least = q, x * x + y * y
-    return nearest
+def _best_seed(
+    groups: Groups, cameras: IntArray, wanted: float, j: int, tile: Tile, block: Block
+) -> tuple[int, float]:
+    """Return the seed of the group that made the point, and the ambiguity.
 
-
-@device
-def _best_seed(groups: Groups, k: int, wanted: float, width_m: float) -> tuple[int, float]:
-    """Return the seed of the group that made the point, of k maps, and the ambiguity.
-
-    That is the group whose bed is nearest to the wanted height or, where this is NaN, the largest.
-    The ambiguity is the standard deviation (m) of the beds of all groups that are likely.
+    That is the group whose bed is nearest to the wanted height or, where this is NaN, the largest;
+    of software that takes the nearest map, that map. The ambiguity is the standard deviation (m) of
+    the beds of all groups that are likely.
     """
+    matcher, p = block.matcher, three(tile.points, _ORIGINAL * TILE + j)
     best, least, known = -1, np.inf, wanted == wanted
     total, first, second = 0.0, 0.0, 0.0  # sum, and moments, of what is likely
-    for seed in range(k):
+    for seed in range(cameras.size):
         # the seed has no depth of this bed
         if groups.slope[seed] != groups.slope[seed]:
             continue
         rise = groups.rise[seed]
         # distance from the wanted bed, or else the larger group first
         misfit = abs(rise - wanted) if known else -groups.size[seed]
+        likely = np.exp(-0.5 * (misfit / matcher.width_m) ** 2) if known else 1.0
+        if matcher.is_nearest:
+            x, y, _ = minus(row_of(block.images.centres, cameras[seed]), p)
+            misfit = x * x + y * y
         if misfit < least:
             best, least = seed, misfit
-        likely = np.exp(-0.5 * (misfit / width_m) ** 2) if known else 1.0
         total += likely
         first, second = first + likely * rise, second + likely * rise * rise
+    if matcher.is_nearest:
+        return best, 0.0
     # all groups are far from the wanted bed
     if not total > 0.0:
         return best, abs(least) if best >= 0 else 0.0
