@@ -26,8 +26,8 @@ from pcfix.water.surface import OwnWater, SurfaceAbove
 if TYPE_CHECKING:
     from pcfix.refract.matcher import Bed, Matcher
     from pcfix.refract.occlusion import Occluder
+    from pcfix.refract.pose_errors import PoseErrors
     from pcfix.refract.regression import DepthRegression
-    from pcfix.refract.uncertainty import PoseErrors
 
 NO_CAMERA, ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 PARALLEL, CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
