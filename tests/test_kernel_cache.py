@@ -18,11 +18,11 @@ PACKAGE = Path(kernels.__file__).parent
 PROGRAM = """
 import numpy as np
 from pcfix import kernels
-from pcfix.lens import formulas
+from pcfix.lens import imaging
 table = np.zeros(40)
-table[formulas.LARGEST_RADIUS] = 3.0
-formulas.angle(table, 0.1)
-stats = formulas.angle.stats
+table[imaging.LARGEST_RADIUS] = 3.0
+imaging.angle(table, 0.1)
+stats = imaging.angle.stats
 print(kernels.cache_folder(), sum(stats.cache_hits.values()))
 """
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from pcfix.adjust.block import B1, B2, CX, CY, FOCAL, INDEX, K1, P1, PLANES, PORT, SHAPE
 from pcfix.kernels import device
-from pcfix.lens import formulas
+from pcfix.lens import imaging as formulas
 from pcfix.lens.algebra import (
     Vector,
     beyond,
@@ -29,8 +29,7 @@ from pcfix.lens.algebra import (
     transposed_times,
     vector,
 )
-from pcfix.lens.formulas import distorted, undistorted
-from pcfix.lens.imaging import image_and_gradients, in_plane
+from pcfix.lens.imaging import distorted, image_and_gradients, in_plane, undistorted
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.port.light import BY_PORT, through_port
 from pcfix.refract.rays import direction, lay, light_and_gradients, light_path, plane_at, settle

@@ -4,10 +4,7 @@ The frame of a central projection without distortion is a pyramid with its tip i
 centre: a point is in the frame if it is on the inner side of its four planes.
 
 A distorted frame has curved sides, and the point has to be projected, except for tiles outside a
-pyramid and a cone around the frame.
-
-The border of the image is unprojected densely. If all of it has directions, what it encloses is
-the frame, as a lens is used only where it is one to one.
+pyramid around the frame, which is found by unprojecting the border of the image densely.
 """
 
 from __future__ import annotations
@@ -20,9 +17,10 @@ import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Vector, dot, minus, row_of, scaled, times
-from pcfix.lens.formulas import DISC, HEIGHT, LARGEST_ANGLE, PLAIN, WIDTH, angle
 from pcfix.lens.imaging import (
-    coefficients,
+    HEIGHT,
+    PLAIN,
+    WIDTH,
     image_of,
     lens_table,
     plain_image,
@@ -33,21 +31,28 @@ from pcfix.model import Cameras, FloatArray, IntArray, Lens, Views
 
 
 @lru_cache(maxsize=8192)
-def frame_shape(lens: Lens) -> tuple[FloatArray, float]:
-    """Return the pyramid of `Frames`, camera frame, and the widest angle of a distorted frame."""
+def frame_shape(lens: Lens) -> tuple[FloatArray, bool]:
+    """Return the pyramid of `Frames`, camera frame, and whether the frame is distorted."""
     brown = (*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism)
     if lens.projection == "perspective" and not any(brown):  # straight lines stay straight
         corners = unproject(lens, _border(lens, 1))
-        return np.cross(corners[:-1], corners[1:]), np.nan
+        return np.cross(corners[:-1], corners[1:]), False
     border = unproject(lens, _border(lens, BORDER))
-    return _planes_around(border), _widest_angle(lens, border)
+    if not (border[:, 2] > STEEPEST).all():
+        return np.zeros((4, 3)), True
+    flat = border[:, :2] / border[:, 2:]
+    # a curve deviates less from its points than the largest distance between neighbours
+    step = np.sqrt((np.diff(flat, axis=0) ** 2).sum(axis=1).max())
+    (left, top), (right, bottom) = flat.min(axis=0) - step, flat.max(axis=0) + step
+    return np.array([
+        (1.0, 0.0, -left), (-1.0, 0.0, right), (0.0, 1.0, -top), (0.0, -1.0, bottom),
+    ]), True  # fmt: skip
 
 
-BORDER = 400
-"""Points along each side of a frame, which is nearly straight between neighbours."""
+BORDER = 400  # points along each side of a frame, which is nearly straight between neighbours
 
 STEEPEST = np.cos(np.radians(80.0))
-"""A pyramid with flatter sides would be too wide to exclude anything."""
+"""A pyramid with flatter sides would be too wide to exclude anything; that of zeros holds all."""
 
 
 def _border(lens: Lens, count: int) -> FloatArray:
@@ -59,37 +64,6 @@ def _border(lens: Lens, count: int) -> FloatArray:
     return np.vstack([*sides, corners[:1]])
 
 
-def _widest_step(points: FloatArray) -> float:
-    """Return the largest distance between neighbours: a curve deviates less from its points."""
-    return float(np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1).max()))
-
-
-def _planes_around(border: FloatArray) -> FloatArray:
-    """Return a pyramid around the directions of the border, shape (4, 3)."""
-    if not (border[:, 2] > STEEPEST).all():
-        return np.zeros((4, 3))
-    flat = border[:, :2] / border[:, 2:]
-    step = _widest_step(flat)
-    (left, top), (right, bottom) = flat.min(axis=0) - step, flat.max(axis=0) + step
-    return np.array([
-        (1.0, 0.0, -left), (-1.0, 0.0, right), (0.0, 1.0, -top), (0.0, -1.0, bottom),
-    ])  # fmt: skip
-
-
-def _widest_angle(lens: Lens, border: FloatArray) -> float:
-    """Return an angle from the axis that no direction in the frame exceeds, radians."""
-    if np.isfinite(border).all():
-        widest = float(np.arccos(np.clip(border[:, 2].min(), -1.0, 1.0)))
-        return widest + 2.0 * _widest_step(border)
-    c = coefficients(lens)
-    widest = float(angle(c, c[DISC] + np.hypot(*lens.distortion_centre)))
-    if lens.inverse or np.isnan(widest):
-        widest = float(c[LARGEST_ANGLE])
-    return widest + 1e-6
-
-
-Pyramid: TypeAlias = tuple[Vector, Vector, Vector, Vector]
-
 NOT_DISTORTED = -1
 
 
@@ -98,7 +72,6 @@ class Frames(NamedTuple):
 
     planes: FloatArray  # (k, 4, 3), inward normals of the pyramid that is, or encloses, the frame
     row: IntArray  # (k,), lens of each camera; `NOT_DISTORTED` if the pyramid is the frame
-    cone: FloatArray  # (k, 4), an axis, and the largest angle (rad) of the frame from it
     lenses: FloatArray  # (l, ...), coefficients, one row per lens
     rotations: FloatArray  # (k, 3, 3), world to camera
 
@@ -108,7 +81,6 @@ def no_frames(k: int) -> Frames:
     return Frames(
         planes=np.zeros((k, 4, 3)),
         row=np.full(k, NOT_DISTORTED),
-        cone=np.zeros((k, 4)),
         lenses=np.zeros((1, 1)),
         rotations=np.zeros((k, 3, 3)),
     )
@@ -127,11 +99,10 @@ def frames_of(cameras: Cameras) -> Frames:
         return no_frames(len(cameras))._replace(planes=front)
     row, lenses = lens_table(cameras.lenses)
     shapes = [frame_shape(lens) for lens in dict.fromkeys(cameras.lenses)]
-    planes, widest = (np.array(one)[row] for one in zip(*shapes, strict=True))
+    planes, is_distorted = (np.array(one)[row] for one in zip(*shapes, strict=True))
     return Frames(
         planes=np.ascontiguousarray(planes @ rotations),
-        row=np.where(np.isnan(widest), NOT_DISTORTED, row),
-        cone=np.column_stack([rotations[:, 2], widest]),
+        row=np.where(is_distorted, row, NOT_DISTORTED),
         lenses=lenses,
         rotations=rotations,
     )
@@ -174,14 +145,17 @@ def with_border(lens: Lens, border: float) -> Lens:
     )
 
 
+Pyramid: TypeAlias = tuple[Vector, Vector, Vector, Vector]
+
+
 @device
-def pyramid(g: FloatArray) -> Pyramid:
+def _pyramid(g: FloatArray) -> Pyramid:
     """Return the planes of one camera, shape (4, 3), as numbers, which stay in registers."""
     return row_of(g, 0), row_of(g, 1), row_of(g, 2), row_of(g, 3)
 
 
 @device
-def in_frame(g: Pyramid, e: Vector) -> bool:
+def _in_pyramid(g: Pyramid, e: Vector) -> bool:
     """Whether the point at C - e is on the inner side of all four planes."""
     return (
         (dot(g[0], e) <= 0.0)
@@ -201,7 +175,7 @@ def _images(lens: FloatArray, r: FloatArray, e: Vector) -> bool:
 @device
 def holds(frames: Frames, c: int, e: Vector) -> bool:
     """Whether the frame of camera c holds the point at C - e, distortion included."""
-    if not in_frame(pyramid(frames.planes[c]), e):
+    if not _in_pyramid(_pyramid(frames.planes[c]), e):
         return False
     row = frames.row[c]
     return row == NOT_DISTORTED or _images(frames.lenses[row], frames.rotations[c], e)
@@ -217,11 +191,11 @@ def mark(
     The points are runs of `run` x, y and z. It is `holds` for many of them; returns whether the
     frame may hold any.
     """
-    around, row = pyramid(frames.planes[c]), frames.row[c]
+    around, row = _pyramid(frames.planes[c]), frames.row[c]
     if row == NOT_DISTORTED:
         for j in range(marks.size):
             e = centre[0] - points[j], centre[1] - points[run + j], centre[2] - points[2 * run + j]
-            marks[j] = 1.0 if in_frame(around, e) else 0.0
+            marks[j] = 1.0 if _in_pyramid(around, e) else 0.0
         return True
     lens, r, count = frames.lenses[row], frames.rotations[c], 0
     plain = plain_lens(lens)
@@ -234,7 +208,7 @@ def mark(
         count += 1 if inside else 0
     for j in range(marks.size if lens[PLAIN] == 0.0 else 0):
         e = centre[0] - points[j], centre[1] - points[run + j], centre[2] - points[2 * run + j]
-        inside = in_frame(around, e) and _images(lens, r, e)
+        inside = _in_pyramid(around, e) and _images(lens, r, e)
         marks[j] = 1.0 if inside else 0.0
         count += 1 if inside else 0
     return count > 0
@@ -250,49 +224,30 @@ def may_hold(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: 
             reach += inward[axis] * (corner - centre[axis])
         if reach < 0.0:
             return False
-    # a distorted frame is narrower than its pyramid; the camera sees the ball around the box
-    # within the angle `turn` about its middle
-    if frames.row[c] == NOT_DISTORTED:
-        return True
-    e = (
-        centre[0] - 0.5 * (low[0] + high[0]),
-        centre[1] - 0.5 * (low[1] + high[1]),
-        centre[2] - 0.5 * (low[2] + high[2]),
-    )
-    far2 = dot(e, e)
-    size2 = (high[0] - low[0]) ** 2 + (high[1] - low[1]) ** 2 + (high[2] - low[2]) ** 2
-    if not 0.25 * size2 < far2:
-        return True
-    turn = np.arcsin(np.sqrt(0.25 * size2 / far2)) + 1e-6
-    along = -dot(row_of(frames.cone, c), e) / np.sqrt(far2)
-    return bool(np.arccos(max(-1.0, min(1.0, along))) <= frames.cone[c, 3] + turn)
+    return True
 
 
 BORDER_POINTS = 8
 """Points on each side of a footprint, enough to show the curve of a distorted frame."""
 
 
-def cameras_in_sight(xyz: FloatArray, cameras: Cameras) -> IntArray:
-    """Return how many cameras have each point, (n, 3), in their frame; occlusion is ignored."""
-    none = np.zeros(0, np.int64)
-    return _count_held(xyz, cameras, frames_of(cameras), none, none)
+def cameras_in_sight(xyz: FloatArray, cameras: Cameras, views: Views | None = None) -> IntArray:
+    """Return how many cameras have each point, (n, 3), in their frame; occlusion is ignored.
+
+    Only those of the view lists count, if there are any, in frames as of `listed_frames_of`.
+    """
+    counts, none = np.zeros(len(xyz), np.int64), np.zeros(0, np.int64)
+    start = none if views is None else np.asarray(views.start, np.int64)
+    camera = none if views is None else np.asarray(views.camera, np.int64)
+    frames = frames_of(cameras) if views is None else listed_frames_of(cameras)
+    points = np.ascontiguousarray(xyz)
+    in_tiles(_count, len(xyz), points, start, camera, cameras.centres, frames, counts)
+    return counts
 
 
 def beside_frames(xyz: FloatArray, views: Views, cameras: Cameras) -> IntArray:
     """Return the number of cameras in the view list of each point, (n, 3), that cannot image it."""
-    start, camera = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
-    held = _count_held(xyz, cameras, listed_frames_of(cameras), start, camera)
-    return np.asarray(np.diff(start) - held)
-
-
-def _count_held(
-    xyz: FloatArray, cameras: Cameras, frames: Frames, start: IntArray, camera: IntArray
-) -> IntArray:
-    """Return how many cameras, of the lists if there are any, hold each point."""
-    counts = np.zeros(len(xyz), np.int64)
-    points = np.ascontiguousarray(xyz)
-    in_tiles(_count, len(xyz), points, start, camera, cameras.centres, frames, counts)
-    return counts
+    return np.asarray(np.diff(views.start) - cameras_in_sight(xyz, cameras, views))
 
 
 @kernel

@@ -104,19 +104,13 @@ STEPS, CLOSE = 100, 1e-13
 def light_through(port: FloatArray, n: float, x: float, y: float, z: float) -> Vector:
     """Return the unit direction in which the light of a point reaches the projection centre.
 
+    The port is that of `coefficients`, n the refractive index of the water relative to air, at
+    least 1, and x, y, z the point, camera frame, metres; NaN if it is not in the water.
+
     Seen from the point, the place on the inner face that is nearest to it is its foot. The light
     stays in the plane of foot, point and projection centre, and crosses the face between the foot
     and the straight line: for refractive indices of at least 1 there is exactly one such ray. The
     secant method finds the one that passes the point, with bisection if a step leaves the bracket.
-
-    Parameters
-    ----------
-    port : array, shape (7,)
-        See `coefficients`.
-    n : float
-        Refractive index of the water relative to air, at least 1.
-    x, y, z : float
-        The point, camera frame, metres. NaN is returned if it is not in the water.
     """
     window, point = window_of(port), (x, y, z)
     kind, where, size, thickness, _ = window
@@ -156,8 +150,7 @@ def _signed_miss(window: PortShape, n: float, w: Vector, point: Vector, across: 
     return dot(across, cross(minus(point, place), t))
 
 
-BY_PORT = 5
-"""First column of the derivatives by the position of the port, of `through_port`."""
+BY_PORT = 5  # first column of the derivatives by the position of the port, of `through_port`
 BY_DIRECTION, BY_INDEX, BY_PLACE, LEAST_SIZE_M = 3e-5, 3e-4, 3e-5, 0.01
 """Steps of central differences: radians, refractive index, and a share of the size of the port.
 They leave relative errors of about 1e-8."""
@@ -165,20 +158,15 @@ They leave relative errors of about 1e-8."""
 
 @device
 def through_port(port: FloatArray, n: float, x: float, y: float, z: float, out: FloatArray) -> None:
-    """Fill in the direction of `light_through` and its derivatives.
+    """Fill in the direction w of `light_through` and its derivatives.
+
+    Column 0 of `out`, shape (3, 5) or (3, 8), gets w, columns 1 to 3 the derivatives of w by x, y,
+    z, column 4 that by n. Of eight columns, 5 gets that by the distance of a flat port, or 5 to 7
+    those by the centre of a dome. NaN if no light comes from the point.
 
     Let the spot be where the ray of a direction w crosses the plane through the point X, across the
     ray. As it has to stay in X, dw = M^-1 (dX - d spot / d p dp), with M = d spot / d w and p the
     refractive index or a number of the port. The derivatives of the spot are differences.
-
-    Parameters
-    ----------
-    port, n, x, y, z
-        See `light_through`.
-    out : array, shape (3, 5) or (3, 8)
-        Column 0 gets the direction w, columns 1 to 3 the derivatives of w by x, y, z, column 4 that
-        by n. Of eight columns, 5 gets that by the distance of a flat port, or 5 to 7 those by the
-        centre of a dome. NaN if no light comes from the point.
     """
     window, point, w = window_of(port), (x, y, z), light_through(port, n, x, y, z)
     t = ray_through(window, n, w)[1]

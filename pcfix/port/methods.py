@@ -79,7 +79,7 @@ from pcfix.refract.batch import (
     warn_of_unsolved,
 )
 from pcfix.refract.choice import ANY_NUMBER
-from pcfix.refract.rays import NO_LINE, nearest_point, plus_line
+from pcfix.refract.rays import line_terms, nearest_point
 from pcfix.refract.tiling import TILE, are_same, corners_of, near_cameras, spatial_order
 
 MAX_STEPS = 30
@@ -132,37 +132,18 @@ def correct_through_port(
     Snell's law at each face (Skarlatos & Agrafiotis 2018, eq 10), then the point nearest to all
     rays (eq 11), and with the method consistent the point that has the images of the apparent one.
 
-    Parameters
-    ----------
-    xyz : array, shape (m, 3)
-        Apparent points, metres, world frame; all of them under water.
-    cameras : Cameras
-        Correct poses, world frame, and lenses. (If the lens absorbed the port, run `pcfix adjust`
-        first.)
-    port : Port
-        The same for all cameras.
-    settings : ScienceOptions
-        The incidence angle is that in air at the inner face. With the method consistent the
-        residuals of the straight rays are used, with any other they are taken as zero.
-    views : Views, optional
-        The cameras of each point. Without it, every camera whose frame holds the image of the true
-        point (method consistent) or of the apparent one (other methods).
+    The apparent points, shape (m, 3), world frame, are all under water. Poses are correct, and all
+    cameras have the same port; a lens that absorbed it needs `pcfix adjust` first. Without view
+    lists a point has every camera whose frame holds the image of the true point (method consistent)
+    or of the apparent one. The incidence angle is that in air at the inner face.
 
-    Returns
-    -------
-    Intersection
-        One row per input point. The ray distance is that of the rays through the apparent point; a
-        ray that does not meet the port is ignored. Points without a solution of `consistent` keep
-        that of `snell`, with a warning. Covariances are zero if fewer than two rays meet.
-
-    Raises
-    ------
-    SettingError
-        If the cameras have no angles or no lenses.
+    The ray distance is that of the rays through the apparent point; a ray that does not meet the
+    port is ignored. Points without a solution of `consistent` get that of `snell`, with a warning.
+    Covariances are zero if fewer than two rays meet. Raises SettingError without angles or lenses.
     """
     require_orientation(cameras, "A port")
-    lenses = cameras.lenses or ()
-    lists, frames = (np.zeros(0, np.int64), np.zeros(0, np.int64)), frames_of(cameras)
+    lenses, none = cameras.lenses or (), np.zeros(0, np.int64)
+    lists, frames = (none, none), frames_of(cameras)
     if views is not None:
         lists = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
         frames = no_frames(len(cameras))
@@ -242,9 +223,7 @@ def _correct(
                 _solve(row, point, chosen, rig, rule.is_consistent)
             if row[_OUTCOME] == CORRECTED:
                 row[_COUNT] = chosen.size
-                _set_covariance(
-                    covariance[i], plus(point, vector(row)), chosen, rig, sigmas
-                )  # fmt: skip
+                _set_covariance(covariance[i], plus(point, vector(row)), chosen, rig, sigmas)
                 for c in chosen:
                     used[c] = True
 
@@ -279,7 +258,7 @@ def _usable(
 @device(allocates=True)
 def _solve(row: FloatArray, point: Vector, chosen: IntArray, rig: Rig, is_consistent: bool) -> None:
     """Intersect the rays of a point and search the true point; fill in a row of the result."""
-    window, sums, least, k = window_of(rig.port), NO_LINE, 1.0, 0
+    window, sums, least, k = window_of(rig.port), np.zeros(9), 1.0, 0
     for c in chosen:
         r, away = rig.rotations[c], minus(row_of(rig.centres, c), point)
         d = times(r, scaled(-1.0, away))
@@ -287,21 +266,22 @@ def _solve(row: FloatArray, point: Vector, chosen: IntArray, rig: Rig, is_consis
         if np.isnan(leaves[0] + t[0]):
             continue
         a = plus(transposed_times(r, leaves), away)
-        k, sums = k + 1, plus_line(sums, a, transposed_times(r, t), 1.0)
+        k, terms = k + 1, line_terms(a, transposed_times(r, t), 1.0)
+        for i in range(9):
+            sums[i] += terms[i]
         least = min(least, cosine_at_port(window, d))
-    solved, q, distance = nearest_point(float(k), sums)
+    solved, q, distance = nearest_point(
+        float(k), (*vector(sums), *vector(sums, 3), *vector(sums, 6))
+    )
     row[:] = 0.0
     if k < 2:
         row[_OUTCOME] = ONE_CAMERA if k == 1 else NO_CAMERA
     elif not solved:
         row[_OUTCOME] = PARALLEL
     else:
-        is_found = True
-        if is_consistent:
-            q, is_found = _search(q, point, chosen, rig)
+        q, row[_FOUND] = _search(q, point, chosen, rig) if is_consistent else (q, True)
         row[0], row[1], row[2] = q
         row[_DISTANCE], row[_COSINE], row[_OUTCOME] = distance, least, CORRECTED
-        row[_FOUND] = is_found
 
 
 Projected: TypeAlias = tuple[float, float, Vector, Vector, float, float]
@@ -373,9 +353,8 @@ def _set_covariance(
     noise = plus_square(noise, scaled(sigmas.refractive_index, by_n))
     det, (xx, xy, xz, yy, yz, zz) = cofactors(h)
     if det > 0.0:
-        rows = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
-        at = 0
-        for i in range(3):
-            for j in range(i, 3):
-                out[at] = dot(rows[i], product(noise, rows[j])) / (det * det)
-                at += 1
+        x, y, z = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+        by_x, by_y, by_z = product(noise, x), product(noise, y), product(noise, z)
+        out[0], out[1], out[2] = dot(x, by_x), dot(x, by_y), dot(x, by_z)
+        out[3], out[4], out[5] = dot(y, by_y), dot(y, by_z), dot(z, by_z)
+        out /= det * det

@@ -8,13 +8,13 @@ Inside is air, then comes the glass, then the water.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TypeAlias
 
 from pcfix.errors import SettingError
 
-ACRYLIC_INDEX = 1.49
-"""Refractive index of acrylic glass (PMMA), the material of most ports."""
+ACRYLIC_INDEX = 1.49  # refractive index of acrylic glass (PMMA), the material of most ports
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +43,7 @@ class FlatPort:
         object.__setattr__(self, "normal", (x, y, z))
 
     def __str__(self) -> str:
-        tilt = math.degrees(math.atan2(math.hypot(*self.normal[:2]), self.normal[2]))
-        return (
-            f"flat port {1000.0 * self.distance_m:g} mm before the projection centre, "
-            + _glass_words(self)
-            + (f", tilted by {tilt:.3g} degrees" if tilt else "")
-        )
+        return spec_of(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +70,7 @@ class DomePort:
         )  # fmt: skip
 
     def __str__(self) -> str:
-        x, y, z = (1000.0 * part for part in self.centre_m)
-        return (
-            f"dome port of {1000.0 * self.radius_m:g} mm radius about ({x:g}, {y:g}, {z:g}) mm, "
-            + _glass_words(self)
-        )
+        return spec_of(self)
 
 
 Port: TypeAlias = FlatPort | DomePort
@@ -124,11 +115,9 @@ def port_of(text: str) -> Port:
         if word not in known or word in values:
             why = "is given twice" if word in values else f"is not one of {', '.join(known)}"
             raise _bad(text, f"'{word}' {why}", _EXAMPLES[kind])
-        try:
+        with suppress(ValueError):
             values[word] = float(number)
-        except ValueError:
-            values[word] = math.nan
-        if not math.isfinite(values[word]):
+        if not math.isfinite(values.get(word, math.nan)):
             raise _bad(text, f"{word} is not a number: '{number}'", _EXAMPLES[kind])
     if known[0] not in values:
         raise _bad(text, f"{known[0]} is missing", _EXAMPLES[kind])
@@ -161,9 +150,3 @@ def _check_glass(port: Port) -> None:
         "glass", index, math.isfinite(index) and index >= 1.0,
         "must be at least 1: the refractive index of the glass, 1.49 for acrylic.",
     )  # fmt: skip
-
-
-def _glass_words(port: Port) -> str:
-    if port.thickness_m == 0.0:
-        return "thin"
-    return f"{1000.0 * port.thickness_m:g} mm of glass with the index {port.glass_index:g}"

@@ -149,9 +149,7 @@ class Batch:
         parts = []
         for one in np.unique(key):
             rows = np.flatnonzero(key == one)
-            part = self.take(rows)
-            if one != MAIN:
-                part = replace(part, survey=surveys[int(one)])
+            part = replace(self.take(rows), survey=surveys.get(int(one), self.survey))
             parts.append((rows, replace(part, views=None) if one == UNLISTED else part))
         return parts or [(np.arange(0), self)]
 
@@ -182,12 +180,6 @@ class Batch:
             camera=none if views is None else np.ascontiguousarray(views.camera, np.int64),
             n=survey.settings.refractive_index,
         )
-
-    def outcome(self) -> npt.NDArray[np.uint8]:
-        """Return the outcome of each point by its number of rays, shape (m,)."""
-        counts = self.counts
-        few = np.where(counts == 1, Outcome.ONE_CAMERA, Outcome.NO_CAMERA)
-        return np.where(counts >= 2, Outcome.CORRECTED, few).astype(np.uint8)
 
     def angles_deg(self) -> FloatArray:
         """Return the smallest and the largest incidence angle of each point's rays, shape (m, 2).
@@ -354,15 +346,8 @@ class Images(NamedTuple):
 def images_of(original_model: OriginalModel | None, now: Cameras) -> Images:
     """Return the images for kernels; both cameras have angles and lenses."""
     original = now if original_model is None else original_model.cameras
-    if len(original) != len(now):
-        raise ValueError("the same images are needed twice")
-    same = original is now or (
-        np.array_equal(original.centres, now.centres)
-        and original.lenses == now.lenses
-        and np.array_equal(np.asarray(original.rotations), np.asarray(now.rotations))
-    )
-    centres = np.ascontiguousarray(original.centres, np.float64)
-    return Images(centres, optics_of(original), None if same else optics_of(now))
+    adjusted = None if original is now else optics_of(now)
+    return Images(np.ascontiguousarray(original.centres, np.float64), optics_of(original), adjusted)
 
 
 @device

@@ -68,8 +68,7 @@ from pcfix.refract.rays import light_near, refracted
 from pcfix.refract.tiling import TILE, are_same, put, slots, three
 
 MAX_LOOKS = 5
-CLOSE_M = 0.002
-"""Step of the bed below which the rest is linear."""
+CLOSE_M = 0.002  # step of the bed below which the rest is linear
 
 LIKELY, LEAST_DEPTH_M = 1.1, 0.005
 """Likely height of the bed, in terms of (n - 1) times the depth; the least depth."""
@@ -77,8 +76,7 @@ LIKELY, LEAST_DEPTH_M = 1.1, 0.005
 LEAST_CHANGE, MOST_CHANGE = 0.35, 1.5
 """Range of the change of the apparent depth with that of the bed along a ray."""
 
-NOTHING = 14.0
-"""exp(-NOTHING), a millionth, is neglected."""
+NOTHING = 14.0  # exp(-NOTHING), a millionth, is neglected
 
 AVERAGED_WITHIN = 0.012
 """Depths of neighbouring maps that differ by less, relative, are averaged before the fusion."""
@@ -86,15 +84,13 @@ AVERAGED_WITHIN = 0.012
 BASE_RAY_DEG, LEAST_PRIOR = 27.0, 1e-4
 """Angle of the ray of a base image from the vertical at which it is e times less frequent."""
 
-AGREE = 0.01
-"""Depths that differ by less, relative, are fused."""
+AGREE = 0.01  # depths that differ by less, relative, are fused
 
 SHALLOW, DEEP = 0.3, 3.5
 """Range of the bed of the surroundings, in likely heights; outliers have it elsewhere."""
 
 _ROUNDS, _BEDS = 4, 3
-FAR = 0.1
-"""Of the way to the bed: farther off, it is decided anew which depths were averaged."""
+FAR = 0.1  # of the way to the bed: farther off, it is decided anew which depths were averaged
 
 SINGLE = ("single-map", "nearest-map")
 """Names of `pcfix.options` for software that keeps one map at each place."""
@@ -102,8 +98,7 @@ SINGLE = ("single-map", "nearest-map")
 ABSENT, _OUTSIDE = -1, -2
 
 _DISTANCE, AMBIGUITY, OUTCOME, _COUNT = 3, 4, 5, 6
-COLUMNS = 7
-"""Columns that the kernels write: the shift, and these."""
+COLUMNS = 7  # columns that the kernels write: the shift, and these
 
 # Runs of `TILE` numbers. Of the look of a bed in one depth map: the depth of that bed beyond P, by
 # the distance of P from the camera, and its change with the height of the bed (1/m); the place on
@@ -123,8 +118,6 @@ _AT, _SQUARES, _CURVATURE, PARTNER = slots(1, 1, 1)
 _COST, _PAIR_AT, PAIR = slots(1, 1)
 # Of the points, after the runs of `tiling.gather`: P in the original model.
 _ORIGINAL, _POINT = 7, 10
-# Of the search: the step of the bed, and sums over the maps.
-_STEP, _WEIGHT, _CHANGE, _X, _Y, _SQUARE, _MAPS, SEARCH = slots(1, 1, 1, 1, 1, 1, 1)
 
 
 class Block(NamedTuple):
@@ -144,19 +137,9 @@ class Tile(NamedTuple):
     partners: FloatArray  # (p, `PARTNER`)
     pairs: FloatArray  # (p (p - 1) / 2, `PAIR`)
     looks: FloatArray  # (k, `LOOK`), of the images near the tile
-    search: FloatArray  # (`SEARCH`,)
+    step: FloatArray  # (`TILE`,), of the bed, metres
     going: BoolArray  # (`TILE`,), whether the bed is searched
     row: IntArray  # (k,), of each image in `looks`
-
-
-class Lines(NamedTuple):
-    """The depths of the maps of one point as linear functions of the height of the bed.
-
-    NaN where there is none.
-    """
-
-    t: FloatArray  # (maps,), the depth of a bed; see `DEPTH`
-    slope: FloatArray  # its change with the height, 1/m
 
 
 def invert_depth_maps(batch: Batch) -> Intersection:
@@ -174,14 +157,13 @@ def invert_depth_maps(batch: Batch) -> Intersection:
     else:
         given = np.full(len(batch), np.nan) if bed is None else bed.height_at(batch.xyz[:, :2])
     result = np.zeros((len(batch), COLUMNS))
-    _invert_all(batch, listed, given, result, np.zeros((0, 0), np.float32))
+    none: FloatArray = np.zeros((0, 0), np.float32)
+    _invert_all(batch, listed, given, result, none)
     few = np.flatnonzero(result[:, OUTCOME] == ONE_CAMERA)
     if batch.survey.settings.matcher in SINGLE and not listed and len(few):
         # no image shows the point with `LEAST_NEAR` others: at the edge of the block
         again = np.zeros((len(few), COLUMNS))
-        _invert_all(
-            batch.take(few), listed, given[few], again, np.zeros((0, 0), np.float32), least=1
-        )
+        _invert_all(batch.take(few), listed, given[few], again, none, least=1)
         result[few] = again
     outcome = result[:, OUTCOME].astype(np.uint8)
     found = batch.result(result[:, :3], outcome=outcome, ray_miss_m=result[:, _DISTANCE])
@@ -301,7 +283,7 @@ def room_of_tile(k: int, partners: int) -> Tile:
         np.empty((partners, PARTNER * TILE)),
         np.empty((partners * (partners - 1) // 2, PAIR * TILE)),
         np.empty((k, LOOK * TILE)),
-        np.empty(SEARCH * TILE),
+        np.empty(TILE),
         np.empty(TILE, np.bool_),
         np.full(k, ABSENT),
     )
@@ -446,10 +428,9 @@ def best_pairs(
     """
     room[_SOLE * TILE : ROOM * TILE] = 0.0
     room[_LEAST * TILE : _TOTAL * TILE] = np.inf
-    for p in range(len(partners)):
-        _count_partner(room, partners[p], count)
     at = 0
     for p in range(len(partners)):
+        _count_partner(room, partners[p], count)
         for q in range(p + 1, len(partners)):
             _agree_best(pairs[at], partners[p], partners[q], room, count)
             at += 1
@@ -504,17 +485,16 @@ def _add_pair(room: FloatArray, pair: FloatArray, count: int, tolerance: float) 
 
 
 @device
-def _sum_lines(search: FloatArray, looks: FloatArray, weights: FloatArray) -> None:
+def _set_steps(tile: Tile, weights: FloatArray) -> None:
     """Set how far up the bed of each point is at which the weighted mean of the depths is zero."""
-    search[: _X * TILE] = 0.0
-    for k in range(len(weights)):
-        depth, change, weight = looks[k, DEPTH * TILE :], looks[k, BY_HEIGHT * TILE :], weights[k]
-        for j in range(weight.size):
-            counts = (weight[j] > 0.0) & (change[j] == change[j])
-            search[_STEP * TILE + j] -= weight[j] * depth[j] if counts else 0.0
-            search[_CHANGE * TILE + j] += weight[j] * change[j] if counts else 0.0
     for j in range(weights.shape[1]):
-        search[_STEP * TILE + j] /= search[_CHANGE * TILE + j]
+        total, change = 0.0, 0.0
+        for k in range(len(weights)):
+            slope = tile.looks[k, BY_HEIGHT * TILE + j]
+            if weights[k, j] > 0.0 and slope == slope:
+                total += weights[k, j] * tile.looks[k, DEPTH * TILE + j]
+                change += weights[k, j] * slope
+        tile.step[j] = -total / change
 
 
 @device
@@ -523,52 +503,42 @@ def _settle(tile: Tile, near: IntArray, weights: FloatArray, block: Block) -> No
 
     Starts from the looks at hand and repeats until the steps are small.
     """
-    room, step = tile.room, tile.search[_STEP * TILE :]
-    _sum_lines(tile.search, tile.looks, weights)
+    _set_steps(tile, weights)
     for _ in range(MAX_LOOKS):
         searched = False
         for j in range(weights.shape[1]):
             # NaN where no image with a weight sees the bed
-            tile.going[j] = np.isfinite(step[j]) and abs(step[j]) > CLOSE_M
+            tile.going[j] = np.isfinite(tile.step[j]) and abs(tile.step[j]) > CLOSE_M
             if tile.going[j]:
-                room[BED * TILE + j] += step[j]
+                tile.room[BED * TILE + j] += tile.step[j]
                 searched = True
         if not searched:
             break
         look(tile, near, weights, block)
-        _sum_lines(tile.search, tile.looks, weights)
+        _set_steps(tile, weights)
 
 
 @device
 def _finish(result: FloatArray, maps: Maps, tile: Tile) -> None:
     """Write the rows: the weighted mean of the Q, moved by the rest of the step."""
-    search, weights = tile.search, maps.weights
-    search[_WEIGHT * TILE : _CHANGE * TILE] = 0.0
-    search[_X * TILE :] = 0.0
-    for k in range(len(weights)):
-        look, weight = tile.looks[k], weights[k]
-        for j in range(weight.size):
-            change = look[BY_HEIGHT * TILE + j]
-            counts = (weight[j] > 0.0) & (change == change)
-            w, step = weight[j] if counts else 0.0, search[_STEP * TILE + j]
-            x = look[_PLACE * TILE + j] + step * look[_PLACE_BY_HEIGHT * TILE + j]
-            y = look[(_PLACE + 1) * TILE + j] + step * look[(_PLACE_BY_HEIGHT + 1) * TILE + j]
-            x, y = (x, y) if counts else (0.0, 0.0)
-            search[_WEIGHT * TILE + j] += w
-            search[_X * TILE + j] += w * x
-            search[_Y * TILE + j] += w * y
-            search[_SQUARE * TILE + j] += w * (x * x + y * y)
-            search[_MAPS * TILE + j] += 1.0 if counts else 0.0
+    weights = maps.weights
     for j in range(weights.shape[1]):
-        row, at, step = result[maps.rows[j]], maps.each[j], search[_STEP * TILE + j]
+        row, at, step = result[maps.rows[j]], maps.each[j], tile.step[j]
+        total, x, y, square, count = 0.0, 0.0, 0.0, 0.0, 0
+        for k in range(len(weights)):
+            look, w = tile.looks[k], weights[k, j]
+            if w > 0.0 and look[BY_HEIGHT * TILE + j] == look[BY_HEIGHT * TILE + j]:
+                u = look[_PLACE * TILE + j] + step * look[_PLACE_BY_HEIGHT * TILE + j]
+                v = look[(_PLACE + 1) * TILE + j] + step * look[(_PLACE_BY_HEIGHT + 1) * TILE + j]
+                total, count, square = total + w, count + 1, square + w * (u * u + v * v)
+                x, y = x + w * u, y + w * v
         row[OUTCOME] = ONE_CAMERA if maps.start[at + 1] > maps.start[at] else NO_CAMERA
-        per_weight = 1.0 / search[_WEIGHT * TILE + j]
-        square = search[_SQUARE * TILE + j] * per_weight
+        per_weight = 1.0 / total
+        x, y, square = x * per_weight, y * per_weight, square * per_weight
         if np.isfinite(step) and np.isfinite(square):
-            x, y = search[_X * TILE + j] * per_weight, search[_Y * TILE + j] * per_weight
             row[0], row[1], row[2] = x, y, tile.room[BED * TILE + j] + step
             row[_DISTANCE] = np.sqrt(max(square - x * x - y * y, 0.0))
-            row[OUTCOME], row[_COUNT] = CORRECTED, search[_MAPS * TILE + j]
+            row[OUTCOME], row[_COUNT] = CORRECTED, count
 
 
 class Groups(NamedTuple):
@@ -577,8 +547,8 @@ class Groups(NamedTuple):
     averaged: IntArray  # (k, 9), each map and its partners by their places; -1 after the last
     fused: IntArray  # (k, 13), likewise
     place: IntArray  # (k,), of each image among those of the point, or `ABSENT`
-    t: FloatArray  # (k,), of `Lines`
-    slope: FloatArray  # (k,)
+    t: FloatArray  # (k,), the depth of a bed in each map; see `DEPTH`
+    slope: FloatArray  # (k,), its change with the height of the bed, 1/m; NaN without a depth
     weight: FloatArray  # (k,), of each map, with what is averaged into it
     share: FloatArray  # (k,), the weight of each map by itself
     depth: FloatArray  # (k,), the averaged depth of each map, relative
@@ -605,33 +575,28 @@ def _weigh_groups(
         if not are_same(cameras, before):
             _group(groups, cameras, block.matcher)
         before = cameras
-        depths = _lines_of(groups, cameras, j, tile)
-        for q in range(cameras.size):
+        k = cameras.size
+        _set_lines(groups, cameras, j, tile)
+        for q in range(k):
             # the pixel on the ground grows with the distance
             groups.share[q] = _per_square(cameras[q], j, tile, block)
-        _set_rises(groups, depths)
+        _set_rises(groups, k)
         if len(likely):
-            for seed in range(cameras.size):
-                if depths.slope[seed] == depths.slope[seed]:
+            for seed in range(k):
+                if groups.slope[seed] == groups.slope[seed]:
                     likely[i, seed] = bed + groups.rise[seed]
             continue
-        if block.matcher.is_nearest:
-            seed, result[i, AMBIGUITY] = _nearest(cameras, depths, j, tile, block), 0.0
-            rise = groups.rise[seed]
-        else:
-            wanted = around[i] - tile.points[2 * TILE + j] - bed
-            seed, rise, result[i, AMBIGUITY] = _best_seed(
-                groups, depths, wanted, block.matcher.width_m
-            )
-        groups.weight[: cameras.size] = 0.0
+        wanted = around[i] - tile.points[2 * TILE + j] - bed
+        seed, result[i, AMBIGUITY] = _best_seed(groups, cameras, wanted, j, tile, block)
+        groups.weight[:k] = 0.0
         if seed >= 0:
             # a map that agrees shares its weight with the maps it was averaged with
-            _move(groups, depths, rise)
-            _average_around(seed, groups, depths)
+            _move(groups, k, groups.rise[seed])
+            _average_around(seed, groups)
             for q in groups.fused[seed]:
                 if q >= 0 and abs(groups.depth[q] - groups.depth[seed]) < AGREE:
                     _share(q, groups.share[q], groups)
-        for q in range(cameras.size):
+        for q in range(k):
             maps.weights[tile.row[cameras[q]], j] = groups.weight[q]
 
 
@@ -644,13 +609,12 @@ def _per_square(c: int, j: int, tile: Tile, block: Block) -> float:
 
 
 @device
-def _lines_of(groups: Groups, maps: IntArray, j: int, tile: Tile) -> Lines:
-    """Return the lines of the maps of a point about the bed of the last look."""
+def _set_lines(groups: Groups, maps: IntArray, j: int, tile: Tile) -> None:
+    """Set the depths in the maps of a point, and their changes, about the bed of the last look."""
     for q in range(maps.size):
         k = tile.row[maps[q]]
         groups.t[q] = tile.looks[k, DEPTH * TILE + j]
         groups.slope[q] = tile.looks[k, BY_HEIGHT * TILE + j]
-    return Lines(groups.t[: maps.size], groups.slope[: maps.size])
 
 
 @device
@@ -687,72 +651,67 @@ def _share(q: int, share: float, groups: Groups) -> None:
 
 
 @device
-def _nearest(cameras: IntArray, depths: Lines, j: int, tile: Tile, block: Block) -> int:
-    """Return the place of the image that is nearest in plan and has a depth, -1 for none."""
-    nearest, least, p = -1, np.inf, three(tile.points, _ORIGINAL * TILE + j)
-    for q in range(cameras.size):
-        x, y, _ = minus(row_of(block.images.centres, cameras[q]), p)
-        if depths.slope[q] == depths.slope[q] and x * x + y * y < least:
-            nearest, least = q, x * x + y * y
-    return nearest
-
-
-@device
 def _best_seed(
-    groups: Groups, depths: Lines, wanted: float, width_m: float
-) -> tuple[int, float, float]:
-    """Return the seed of the group that made the point, its rise, and the ambiguity.
+    groups: Groups, cameras: IntArray, wanted: float, j: int, tile: Tile, block: Block
+) -> tuple[int, float]:
+    """Return the seed of the group that made the point, and the ambiguity.
 
-    That is the group whose bed is nearest to the wanted height or, where this is NaN, the largest.
-    The ambiguity is the standard deviation (m) of the beds of all groups that are likely.
+    That is the group whose bed is nearest to the wanted height or, where this is NaN, the largest;
+    of software that takes the nearest map, that map. The ambiguity is the standard deviation (m) of
+    the beds of all groups that are likely.
     """
-    best, at_best, least, known = -1, 0.0, np.inf, wanted == wanted
+    matcher, p = block.matcher, three(tile.points, _ORIGINAL * TILE + j)
+    best, least, known = -1, np.inf, wanted == wanted
     total, first, second = 0.0, 0.0, 0.0  # sum, and moments, of what is likely
-    for seed in range(depths.t.size):
+    for seed in range(cameras.size):
         # the seed has no depth of this bed
-        if depths.slope[seed] != depths.slope[seed]:
+        if groups.slope[seed] != groups.slope[seed]:
             continue
         rise = groups.rise[seed]
         # distance from the wanted bed, or else the larger group first
         misfit = abs(rise - wanted) if known else -groups.size[seed]
+        likely = np.exp(-0.5 * (misfit / matcher.width_m) ** 2) if known else 1.0
+        if matcher.is_nearest:
+            x, y, _ = minus(row_of(block.images.centres, cameras[seed]), p)
+            misfit = x * x + y * y
         if misfit < least:
-            best, at_best, least = seed, rise, misfit
-        likely = np.exp(-0.5 * (misfit / width_m) ** 2) if known else 1.0
+            best, least = seed, misfit
         total += likely
         first, second = first + likely * rise, second + likely * rise * rise
+    if matcher.is_nearest:
+        return best, 0.0
     # all groups are far from the wanted bed
     if not total > 0.0:
-        return best, at_best, abs(least) if best >= 0 else 0.0
+        return best, abs(least) if best >= 0 else 0.0
     mean = first / total
-    return best, at_best, np.sqrt(max(second / total - mean * mean, 0.0))
+    return best, np.sqrt(max(second / total - mean * mean, 0.0))
 
 
 @device
-def _set_rises(groups: Groups, depths: Lines) -> None:
-    """Find the rise and the size of the group of each seed.
+def _set_rises(groups: Groups, k: int) -> None:
+    """Find the rise and the size of the group of each seed, of k maps.
 
     Which maps agree is decided for the bed of the lines, and again for that of each group.
     """
-    k = depths.t.size
-    spread = _move(groups, depths, 0.0)
+    spread = _move(groups, k, 0.0)
     for q in range(k):
-        _average(q, groups, depths)
+        _average(q, groups)
     for seed in range(k):
         groups.rise[seed], groups.size[seed] = _fuse(seed, groups)
     for seed in range(k):
         # where all depths agree, for both beds, so do the groups
-        if max(spread, _move(groups, depths, groups.rise[seed])) >= AGREE:
-            _average_around(seed, groups, depths)
+        if max(spread, _move(groups, k, groups.rise[seed])) >= AGREE:
+            _average_around(seed, groups)
             step, groups.size[seed] = _fuse(seed, groups)
             groups.rise[seed] += step
 
 
 @device
-def _move(groups: Groups, depths: Lines, rise: float) -> float:
-    """Set the depths of all maps for a bed higher by `rise`; return their range."""
+def _move(groups: Groups, k: int, rise: float) -> float:
+    """Set the depths of k maps for a bed higher by `rise`; return their range."""
     low, high = np.inf, -np.inf
-    for q in range(depths.t.size):
-        own = depths.t[q] + depths.slope[q] * rise
+    for q in range(k):
+        own = groups.t[q] + groups.slope[q] * rise
         # NaN is neither lower nor higher
         low, high = own if own < low else low, own if own > high else high
         groups.own[q] = own
@@ -760,16 +719,16 @@ def _move(groups: Groups, depths: Lines, rise: float) -> float:
 
 
 @device
-def _average_around(seed: int, groups: Groups, depths: Lines) -> None:
+def _average_around(seed: int, groups: Groups) -> None:
     """Average the depths that may be fused with that of a seed."""
     for q in groups.fused[seed]:
         if q < 0:
             break
-        _average(q, groups, depths)
+        _average(q, groups)
 
 
 @device(forceinline=True)
-def _average(q: int, groups: Groups, depths: Lines) -> None:
+def _average(q: int, groups: Groups) -> None:
     """Average a depth with those of its partners that agree."""
     own, total, change, count = groups.own[q], 0.0, 0.0, 0.0
     for a in groups.averaged[q]:
@@ -778,7 +737,7 @@ def _average(q: int, groups: Groups, depths: Lines) -> None:
         # no branch, which the processor would predict wrongly half the time
         agrees = abs(groups.own[a] - own) < AVERAGED_WITHIN
         total += groups.own[a] if agrees else 0.0
-        change += depths.slope[a] if agrees else 0.0
+        change += groups.slope[a] if agrees else 0.0
         count += 1.0 if agrees else 0.0
     each = 1.0 / count
     groups.depth[q], groups.change[q] = total * each, change * each
@@ -805,8 +764,8 @@ def _weigh_listed(maps: Maps, given: FloatArray, groups: Groups, tile: Tile, blo
 
     Which depths agree depends on the bed, and the bed on which agree.
     """
-    step = tile.search[_STEP * TILE :]
-    step[:TILE] = 0.0
+    step = tile.step
+    step[:] = 0.0
     for beds in range(1, _BEDS + 1):
         searched = False
         for j in range(maps.rows.size):
@@ -819,6 +778,7 @@ def _weigh_listed(maps: Maps, given: FloatArray, groups: Groups, tile: Tile, blo
             at, bed = maps.each[j], tile.room[BED * TILE + j]
             cameras = maps.camera[maps.start[at] : maps.start[at + 1]]
             _group(groups, cameras, block.matcher)
+            _set_lines(groups, cameras, j, tile)
             step[j] = _weigh_list(maps.rows[j], j, cameras, given, groups, tile, block)
             tile.going[j] = beds < _BEDS and abs(step[j]) > FAR * abs(bed)
             searched = searched or tile.going[j]
@@ -834,9 +794,9 @@ def _weigh_list(
     i: int, j: int, cameras: IntArray, given: FloatArray, groups: Groups, tile: Tile, block: Block
 ) -> float:
     """Set the weights of the maps of point i, the j-th of its tile; return the step of its bed."""
-    points, depths, step = block.points, _lines_of(groups, cameras, j, tile), 0.0
+    points, step = block.points, 0.0
     for _ in range(_ROUNDS):
-        _move(groups, depths, step)
+        _move(groups, cameras.size, step)
         groups.weight[: cameras.size] = 0.0
         for at in range(points.start[i], points.start[i + 1]):
             c = points.camera[at]
@@ -844,9 +804,9 @@ def _weigh_list(
             _share(groups.place[c], share, groups)
         total, change = 0.0, 0.0
         for q in range(cameras.size):
-            if groups.weight[q] > 0.0 and depths.slope[q] == depths.slope[q]:
-                total += groups.weight[q] * depths.t[q]
-                change += groups.weight[q] * depths.slope[q]
+            if groups.weight[q] > 0.0 and groups.slope[q] == groups.slope[q]:
+                total += groups.weight[q] * groups.t[q]
+                change += groups.weight[q] * groups.slope[q]
         step = -total / change
     return step
 

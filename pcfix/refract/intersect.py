@@ -18,7 +18,7 @@ import numpy as np
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot, minus, row_of, scaled, vector
 from pcfix.lens.frames import Frames, frames_of, mark, no_frames
-from pcfix.model import BoolArray, Cameras, FloatArray, IntArray
+from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.refract import tiling, uncertainty
 from pcfix.refract.batch import (
     CORRECTED,
@@ -35,7 +35,7 @@ from pcfix.refract.batch import (
 )
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of, shapes_of
 from pcfix.refract.rays import line_terms, nearest_point, pierce, ray_distance, refracted
-from pcfix.refract.tiling import TILE, nine, put, spatial_order, three, tiles_of
+from pcfix.refract.tiling import TILE, add_three, nine, put, spatial_order, three, tiles_of
 from pcfix.refract.tracks import FOUND, LOST, POINT_RUNS, RAY_RUNS, SEARCHED, STATE, Q, search_tile
 from pcfix.refract.uncertainty import Budget, room_of
 from pcfix.water.surface import Field, Tin
@@ -69,13 +69,8 @@ def consistent(batch: Batch) -> Intersection:
     Points without a solution, under waves that focus the light, get that of ``snell``, with a
     warning.
     """
-    check_consistent(batch.survey.cameras)
+    require_orientation(batch.survey.cameras, "Method consistent", "use method snell")
     return _intersected(batch, optics_of(batch.survey.cameras))
-
-
-def check_consistent(cameras: Cameras) -> None:
-    """Raise SettingError if cameras have no angles or no lenses."""
-    require_orientation(cameras, "Method consistent", "use method snell")
 
 
 def _intersected(batch: Batch, optics: Optics | None) -> Intersection:
@@ -221,16 +216,10 @@ def add_camera(
         inv = height * q if use else 0.0
         bend = r if h > 0.0 else 1.0
         d = refracted(e, length2, normal, height, bend)
-        xx, xy, xz, yy, yz, bx, by, bz, s = line_terms(scaled(f, e), d, inv)
-        sums[j] += times * xx
-        sums[TILE + j] += times * xy
-        sums[2 * TILE + j] += times * xz
-        sums[3 * TILE + j] += times * yy
-        sums[4 * TILE + j] += times * yz
-        sums[5 * TILE + j] += times * bx
-        sums[6 * TILE + j] += times * by
-        sums[7 * TILE + j] += times * bz
-        sums[8 * TILE + j] += times * s
+        terms = line_terms(scaled(f, e), d, inv)
+        add_three(sums, j, times, terms[0:3])
+        add_three(sums, 3 * TILE + j, times, terms[3:6])
+        add_three(sums, 6 * TILE + j, times, terms[6:9])
         sums[9 * TILE + j] += times
         cosine2 = height * height * inv
         sums[10 * TILE + j] = min(sums[10 * TILE + j], cosine2 if use else 1.0)

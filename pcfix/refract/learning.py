@@ -28,8 +28,8 @@ from pcfix.refract.tiling import spatial_order
 from pcfix.water.surface import is_submerged
 
 if TYPE_CHECKING:
+    from pcfix.refract.literature import StereoFactor
     from pcfix.refract.matcher import Bed
-    from pcfix.refract.stereo_factor import StereoFactor
 
 
 def resolved(
@@ -79,7 +79,7 @@ def with_factor(batch: Batch) -> tuple[Batch, StereoFactor | None]:
     survey = batch.survey
     if survey.settings.depth_factor != "auto":
         return batch, None
-    from pcfix.refract.stereo_factor import stereo_factor
+    from pcfix.refract.literature import stereo_factor
 
     known = batch.surface.height_m[np.isfinite(batch.surface.height_m)]
     found = None

@@ -181,29 +181,29 @@ def with_rays(batch: Batch, shift_m: FloatArray | None = None) -> Batch:
     methods get the steepest image and those it was matched with. With `shift_m`, shape (m, 3), the
     frames hold the images of the true points instead of the apparent points.
     """
-    survey, learned = batch.survey, batch.survey.learned
-    any_number = replace(survey, settings=replace(survey.settings, max_cameras=None))
-    whole, by_model = survey, batch.views is None and learned.matcher is not None
-    seeds = by_model and survey.settings.method != "consistent"
-    if seeds or learned.occluder is not None:  # the number is limited in the end
-        whole = any_number
-    if by_model:
-        from pcfix.refract.matcher import steepest_and_partners, without_border
+    from pcfix.refract.matcher import steepest_and_partners, without_border
+    from pcfix.refract.occlusion import visible_cameras
 
+    survey, centres = batch.survey, batch.survey.cameras.centres
+    occluder = survey.learned.occluder
+    matcher = survey.learned.matcher if batch.views is None else None
+    seeds = None if survey.settings.method == "consistent" else matcher
+    whole = survey
+    # the number is limited in the end
+    if seeds is not None or occluder is not None or shift_m is not None:
+        whole = replace(survey, settings=replace(survey.settings, max_cameras=None))
+    if matcher is not None:
         whole = replace(whole, cameras=without_border(survey.cameras))
-    if shift_m is not None:
-        views = views_of_images(replace(batch, survey=any_number), shift_m)
-    else:
+    if shift_m is None:
         views = chosen_views(replace(batch, survey=whole))
-    is_final = (any_number if shift_m is not None else whole).settings == survey.settings
-    if learned.occluder is not None:
-        from pcfix.refract.occlusion import visible_cameras
-
-        views = visible_cameras(batch.xyz, survey.cameras.centres, views, learned.occluder)
-    if seeds and learned.matcher is not None:
-        centres = survey.cameras.centres
-        views = steepest_and_partners(batch.xyz, centres, views, learned.matcher)
-    if seeds or not is_final:
+    else:
+        whole = replace(whole, cameras=survey.cameras)
+        views = views_of_images(replace(batch, survey=whole), shift_m)
+    if occluder is not None:
+        views = visible_cameras(batch.xyz, centres, views, occluder)
+    if seeds is not None:
+        views = steepest_and_partners(batch.xyz, centres, views, seeds)
+    if seeds is not None or whole.settings != survey.settings:
         views = chosen_views(replace(batch, views=views))
     return replace(batch, views=views)
 

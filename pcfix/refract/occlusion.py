@@ -28,16 +28,14 @@ from pcfix.options.correct import ScienceOptions
 
 Heights = npt.NDArray[np.float32]
 
-NEAR_CELLS = 2.0
-"""Distance from the point, in plan, within which nothing occludes it."""
+NEAR_CELLS = 2.0  # distance from the point, in plan, within which nothing occludes it
 BLOCK, LARGE_BLOCK = 8, 64
 """Cells along the side of the blocks whose highest cell is known, to pass them at once. Without
 the larger ones rays take half as long again."""
 MARGIN_BLOCK = 16
 ROOF_MARGINS = 2.0
 """Least height of a roof over the point, in margins; else it may be a low point of an even bed."""
-_ONWARD = 1e-6
-"""Step past the edge of a cell into the next one, in cells."""
+_ONWARD = 1e-6  # step past the edge of a cell into the next one, in cells
 
 CELLS_A_POINT = 16
 """Most cells per point at first, so that a cloud may fill a sixteenth of its rectangle."""
@@ -45,8 +43,7 @@ WIDE_GAP = 0.75
 GAPS_TO_MARGIN = 4.5
 """The margin is 4.5 times the upper quartile, over the cells of a block, of the gap between the
 highest two points of a cell: four standard deviations of noise, without walls."""
-FEWEST_CELLS = 9
-"""With heights, in a block with a margin of its own."""
+FEWEST_CELLS = 9  # with heights, in a block with a margin of its own
 OBLIQUE_DEG = 15.0
 """An image whose axis is farther off the nadir is an oblique. The axes of stabilised nadir blocks
 stay within a few degrees; obliques are flown at 20 and more."""

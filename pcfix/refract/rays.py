@@ -85,17 +85,6 @@ def line_terms(a: Vector, d: Vector, inv_length2: float) -> Nine:
     return d[0] * t[0], d[0] * t[1], d[0] * t[2], d[1] * t[1], d[1] * t[2], bx, by, bz, s
 
 
-@device
-def plus_line(sums: Nine, a: Vector, d: Vector, inv_length2: float) -> Nine:
-    """Return the sums with the terms of one more line."""
-    t = line_terms(a, d, inv_length2)
-    return (
-        sums[0] + t[0], sums[1] + t[1], sums[2] + t[2], sums[3] + t[3], sums[4] + t[4],
-        sums[5] + t[5], sums[6] + t[6], sums[7] + t[7], sums[8] + t[8],
-    )  # fmt: skip
-
-
-NO_LINE = (0.0,) * 9
 MIN_DETERMINANT = 1e-6
 """Least determinant of M / k. Two rays at an angle alpha have alpha^2 / 4: 1e-6 is a tenth of a
 degree, far below any usable base, and keeps rounding below 1e-9 m."""
@@ -171,8 +160,7 @@ Path: TypeAlias = tuple[float, float, float, float, Vector]
 """k, S, H, D and s."""
 
 NEWTON_STEPS = 40
-CLOSE = 1e-8
-"""Relative step of k: each step squares the error, so that the next is below rounding."""
+CLOSE = 1e-8  # relative step of k: each step squares the error, so that the next is below rounding
 
 
 @device
@@ -304,8 +292,7 @@ def light_and_gradients(
 
 
 SETTLING_STEPS = 12
-HALVINGS = 36
-"""Most steps to the plane where the light leaves a mesh or raster, and on a crease."""
+HALVINGS = 36  # most steps to the plane where the light leaves a mesh or raster, and on a crease
 
 
 @device

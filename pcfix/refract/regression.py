@@ -18,8 +18,7 @@ from pcfix.water.surface import is_submerged
 LEAST_COUNT, FEW = 3, 10
 """A line through two check depths fits whatever they are; a third is the first that can disagree.
 Below ten the standard errors are themselves only known to a quarter or worse."""
-OUTLIER_CHANCE = 0.05
-"""That a set of good check depths is said to hold an outlier."""
+OUTLIER_CHANCE = 0.05  # that a set of good check depths is said to hold an outlier
 _SAME_M = 1e-3
 
 
@@ -54,13 +53,10 @@ class DepthRegression:
         """
         inside = self.rmse_m if self.cv_rmse_m is None else self.cv_rmse_m
         nearest = np.clip(apparent_m, self.shallowest_m, self.deepest_m)
-        more = self._variance_m2(apparent_m) - self._variance_m2(nearest)
+        # the variance of the line at x is se_a^2 + se_b^2 x^2 + 2 cov x
+        more = self.slope_se**2 * (apparent_m**2 - nearest**2)
+        more += 2.0 * self.covariance_m * (apparent_m - nearest)
         return np.asarray(np.sqrt(inside**2 + np.maximum(more, 0.0)))
-
-    def _variance_m2(self, apparent_m: FloatArray) -> FloatArray:
-        """Return the variance of the line itself at apparent depths."""
-        ends = self.intercept_se_m**2 + (self.slope_se * apparent_m) ** 2
-        return np.asarray(ends + 2.0 * self.covariance_m * apparent_m)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it in plain values."""
@@ -194,8 +190,7 @@ class BeyondRange(Sums):
 
 
 NEIGHBOURS = 16
-MOST_PLACES = 1000
-"""That the distance between neighbours is taken at."""
+MOST_PLACES = 1000  # that the distance between neighbours is taken at
 REACH = 4.0
 """In distances between neighbours. On a grid that is 50 points; of points strewn at random, where
 the nearest neighbour is closer than on a grid, 10."""

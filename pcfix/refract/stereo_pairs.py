@@ -35,9 +35,20 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import Vector, beyond, cross, dot, minus, row_of, scaled, solved, vector
-from pcfix.lens.formulas import KIND, PERSPECTIVE, PLAIN
-from pcfix.lens.imaging import Plain, image_and_slopes, plain_lens
+from pcfix.lens.algebra import (
+    Vector,
+    beyond,
+    cross,
+    dot,
+    minus,
+    row_of,
+    scaled,
+    solved,
+    times,
+    transposed_times,
+    vector,
+)
+from pcfix.lens.imaging import KIND, PERSPECTIVE, PLAIN, Plain, image_and_slopes, plain_lens
 from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, Views
 from pcfix.refract import tiling
 from pcfix.refract.batch import (
@@ -50,11 +61,12 @@ from pcfix.refract.batch import (
     Images,
     Intersection,
     images_of,
+    require_orientation,
     to_original,
     warn_of_unsolved,
 )
 from pcfix.refract.choice import Rig, Rule, cameras_of_pairs, rig_of, rule_of
-from pcfix.refract.intersect import add_camera, check_consistent
+from pcfix.refract.intersect import add_camera
 from pcfix.refract.rays import MIN_DETERMINANT, light_near, nearest_point, ray_distance
 from pcfix.refract.tiling import TILE, nine, put, slots, three
 
@@ -67,10 +79,10 @@ ABSENT = -1
 # Columns of the result.
 _DISTANCE, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6
 
-# Columns of a search: Q, the nearest Q so far, F there and its size, the share of a step, B row by
-# row, whether it goes on, and the ratio of true to apparent depth at the start.
-_, _NEAREST, _AT_NEAREST, _BEST, _SHARE, _B, _GOES_ON, _RATIO, _SEARCH = slots(
-    3, 3, 3, 1, 1, 9, 1, 1
+# Columns of a search: Q, the nearest Q so far, F there and its size, the share of a step, whether
+# it goes on, and the ratio of true to apparent depth at the start.
+_, _NEAREST, _AT_NEAREST, _BEST, _SHARE, _GOES_ON, _RATIO, _WIDTH_OF_SEARCH = slots(
+    3, 3, 3, 1, 1, 1, 1
 )  # fmt: skip
 
 # Runs of `TILE` numbers of a ray: the gradient of the scale of its image by place, and of the image
@@ -79,12 +91,14 @@ _BY_PLACE, _SQUARE, _RIGHT, _REST, RAY = slots(3, 6, 3, 1)
 
 
 class Block(NamedTuple):
-    """All points and cameras, and the pairs, for kernels."""
+    """All points and cameras, the pairs, and the searches, for kernels."""
 
     points: Chosen
     images: Images
     rig: Rig
     rule: Rule
+    search: FloatArray  # (m, `_WIDTH_OF_SEARCH`)
+    derivative: FloatArray  # (m, 3, 3), B: of Q by the median
     listed_start: IntArray  # the pairs of each point, if there are lists
     listed_camera: IntArray
     partners: IntArray  # (k, ...), otherwise the partners of each image, each pair once
@@ -111,7 +125,7 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     cameras but without a pair is `ONE_CAMERA`, one with narrow pairs only `PARALLEL_RAYS`. Points
     without a solution get that of `snell`, with a warning.
     """
-    check_consistent(batch.survey.cameras)
+    require_orientation(batch.survey.cameras, "Method consistent", "use method snell")
     if batch.rays.kind == "pairs":
         pairs, batch = batch.rays, replace(batch, views=cameras_of_pairs(batch.rays))
     survey, matcher = batch.survey, batch.survey.learned.matcher
@@ -123,15 +137,16 @@ def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     elif matcher is not None:
         partners = _each_once(matcher.matched)
     images, rule = images_of(batch.original_model, survey.cameras), rule_of(survey)
+    search, derivative = np.zeros((len(batch), _WIDTH_OF_SEARCH)), np.zeros((len(batch), 3, 3))
     block = Block(
-        batch.chosen(), images, rig_of(survey), rule._replace(least_cosine2=0.0), start, camera,
-        partners,
+        batch.chosen(), images, rig_of(survey), rule._replace(least_cosine2=0.0), search,
+        derivative, start, camera, partners,
     )  # fmt: skip
     used, result = np.zeros(len(batch.rays.camera), np.bool_), np.zeros((len(batch), _WIDTH))
-    search, rows = np.zeros((len(batch), _SEARCH)), tiling.spatial_order(batch.xyz)
+    rows = tiling.spatial_order(batch.xyz)
     for steps in range(0, MAX_STEPS, STEPS):
         in_tiles(
-            _search, -(-len(rows) // TILE), rows, block, steps == 0, search, used, result,
+            _search, -(-len(rows) // TILE), rows, block, steps == 0, used, result,
             points=0 if steps else len(batch),
         )  # fmt: skip
         rows = rows[search[rows, _GOES_ON] > 0.0]
@@ -156,9 +171,8 @@ def _each_once(matched: IntArray) -> IntArray:
 
 @kernel(allocates=True)
 def _search(
-    span: Span, order: IntArray, block: Block, first: bool, search: FloatArray, used: BoolArray,
-    result: FloatArray,
-) -> None:  # fmt: skip
+    span: Span, order: IntArray, block: Block, first: bool, used: BoolArray, result: FloatArray
+) -> None:
     """Search the points of some tiles, the first time from `snell`'s solution, by a few steps."""
     points, k = block.points, len(block.rig.centres)
     row, now = np.full(k, ABSENT), np.empty(3 * TILE)
@@ -177,14 +191,19 @@ def _search(
         for q in range(near.size):
             add_camera(sums, tile, marks[q], block.rig, near[q], block.rule, None, None)
         if first:
-            _start(rows, tile, marks, row, sums, pairs, block.points, search, used, result)
+            _start(rows, tile, marks, row, sums, pairs, block, used, result)
         rays = np.empty((near.size, RAY * TILE))
         places = np.empty((len(pairs.rays), 3 * TILE))
         values = np.empty(pairs.own.shape[2])
         for _ in range(STEPS):
-            if not _step(rows, rays, places, values, now, tile, near, pairs, block, search):
+            if not _step(rows, rays, places, values, now, tile, near, pairs, block):
                 break
-        _write(rows, sums, search, result)
+        for j in range(rows.size):
+            found, one = result[rows[j]], block.search[rows[j]]
+            if found[_OUTCOME] == CORRECTED and one[_BEST] <= CLOSE_M:
+                found[0], found[1], found[2] = vector(one)
+                found[_DISTANCE] = ray_distance(sums[9 * TILE + j], nine(sums, j), vector(one))
+                found[_FOUND] = 1.0
 
 
 @device(allocates=True)
@@ -196,30 +215,27 @@ def _pairs_of(
     `marks`, a row for each of the images near the tile, say which cameras each point has; `row`,
     which row is that of a camera.
     """
-    points, listed, most, k = block.points, block.listed_start, 0, len(marks)
-    for i in rows:
+    points, listed, k, step = block.points, block.listed_start, len(marks), block.partners.shape[1]
+    # the number of candidates of each point
+    candidates = np.empty(rows.size, np.int64)
+    for j in range(rows.size):
+        i = rows[j]
+        candidates[j] = (points.start[i + 1] - points.start[i]) * step
         if listed.size:
-            most = max(most, (listed[i + 1] - listed[i]) // 2)
-        else:
-            most = max(most, (points.start[i + 1] - points.start[i]) * block.partners.shape[1])
-    number, total = np.full((k, k), ABSENT), 0
+            candidates[j] = (listed[i + 1] - listed[i]) // 2
+    number, total, most = np.full((k, k), ABSENT), 0, candidates.max()
     rays = np.empty((min(k * k, rows.size * most), 2), np.int64)
     own = np.empty((3, rows.size, most), np.int64)
     count, narrow = np.zeros(rows.size, np.int64), np.zeros(rows.size, np.int64)
     in_pair = np.zeros(marks.shape)
     for j in range(rows.size):
         i = rows[j]
-        first, last = points.start[i], points.start[i + 1]
-        step = block.partners.shape[1]
-        candidates = (last - first) * step
-        if listed.size:
-            candidates = (listed[i + 1] - listed[i]) // 2
-        for one in range(candidates):
+        for one in range(candidates[j]):
             if listed.size:
                 at = listed[i] + 2 * one
                 a, b = block.listed_camera[at], block.listed_camera[at + 1]
             else:
-                a = points.camera[first + one // step]
+                a = points.camera[points.start[i] + one // step]
                 b = block.partners[a, one % step]
             if a < 0 or b < 0 or a == b or row[a] < 0 or row[b] < 0:
                 continue
@@ -258,11 +274,12 @@ def _is_wide(a: int, b: int, j: int, tile: FloatArray, points: Chosen) -> bool:
 @device
 def _start(
     rows: IntArray, tile: FloatArray, marks: FloatArray, row: IntArray, sums: FloatArray,
-    pairs: Pairs, points: Chosen, search: FloatArray, used: BoolArray, result: FloatArray,
+    pairs: Pairs, block: Block, used: BoolArray, result: FloatArray,
 ) -> None:  # fmt: skip
     """Set the start of each search, the outcome, and which cameras are used."""
+    points = block.points
     for j in range(rows.size):
-        i = rows[j]
+        i, one = rows[j], block.search[rows[j]]
         first, last = points.start[i], points.start[i + 1]
         if pairs.wide[j] == 0:
             few = ONE_CAMERA if last > first else NO_CAMERA
@@ -275,21 +292,21 @@ def _start(
         if fixed:
             result[i, 0], result[i, 1], result[i, 2] = q
             result[i, _DISTANCE] = distance
-            search[i, 0], search[i, 1], search[i, 2] = q
-            search[i, _BEST], search[i, _SHARE], search[i, _GOES_ON] = np.inf, 1.0, 1.0
+            one[0], one[1], one[2] = q
+            one[_BEST], one[_SHARE], one[_GOES_ON] = np.inf, 1.0, 1.0
             # a place sinks as the true point does, times the ratio of their depths
             depth = tile[3 * TILE + j] - tile[2 * TILE + j]
-            search[i, _RATIO] = 1.0 - q[2] / depth if depth > 0.0 else 1.0
-            _start_b(search[i])
+            one[_RATIO] = 1.0 - q[2] / depth if depth > 0.0 else 1.0
+            _start_derivative(block.derivative[i], one)
 
 
 @device
 def _step(
     rows: IntArray, rays: FloatArray, places: FloatArray, values: FloatArray, now: FloatArray,
-    tile: FloatArray, near: IntArray, pairs: Pairs, block: Block, search: FloatArray,
+    tile: FloatArray, near: IntArray, pairs: Pairs, block: Block,
 ) -> bool:  # fmt: skip
     """Do one step of all searches of a tile; return whether any goes on."""
-    optics, goes_on = block.images.original, False
+    optics, search, goes_on = block.images.original, block.search, False
     for j in range(rows.size):
         put(now, j, vector(search[rows[j]]))
     for q in range(near.size):
@@ -307,7 +324,7 @@ def _step(
             x = _median(places, values, pairs.own[0, j, : pairs.wide[j]], j)
             y = _median(places, values, pairs.own[1, j, : pairs.wide[j]], TILE + j)
             z = _median(places, values, pairs.own[2, j, : pairs.wide[j]], 2 * TILE + j)
-            _advance(search[rows[j]], (x, y, z))
+            _advance(search[rows[j]], block.derivative[rows[j]], (x, y, z))
             goes_on = goes_on or search[rows[j], _GOES_ON] > 0.0
     return goes_on
 
@@ -425,7 +442,7 @@ def _median(places: FloatArray, values: FloatArray, own: IntArray, at: int) -> f
 
 
 @device
-def _advance(one: FloatArray, f: Vector) -> None:
+def _advance(one: FloatArray, b: FloatArray, f: Vector) -> None:
     """Move the Q of a search to where the median F of the pairs' places is P.
 
     From the nearest Q so far goes a step s = -B F. Where F comes nearer, by y, the good Broyden
@@ -435,55 +452,28 @@ def _advance(one: FloatArray, f: Vector) -> None:
     if size < one[_BEST]:
         if one[_BEST] < np.inf and size > CLOSE_M:
             s, y = minus(vector(one), vector(one, _NEAREST)), minus(f, vector(one, _AT_NEAREST))
-            missing, left = minus(s, _b_times(one, y)), _times_b(s, one)
+            missing, left = minus(s, times(b, y)), transposed_times(b, s)
             along = dot(left, y)
             for i in range(3 if along != 0.0 else 0):
                 for j in range(3):
-                    one[_B + 3 * i + j] += missing[i] * left[j] / along
+                    b[i, j] += missing[i] * left[j] / along
         for i in range(3):
             one[_NEAREST + i], one[_AT_NEAREST + i] = one[i], f[i]
         one[_BEST] = size
     elif one[_BEST] < np.inf:
         one[_SHARE] *= 0.5
-        _start_b(one)
+        _start_derivative(b, one)
     else:  # no image of the start
         one[_GOES_ON] = 0.0
         return
-    step = _b_times(one, vector(one, _AT_NEAREST))
+    step = times(b, vector(one, _AT_NEAREST))
     one[0], one[1], one[2] = minus(vector(one, _NEAREST), step)
     # the last step is small enough for the B so far
     one[_GOES_ON] = 1.0 if one[_BEST] > CLOSE_M else 0.0
 
 
 @device
-def _b_times(one: FloatArray, a: Vector) -> Vector:
-    """Return B a."""
-    return (
-        dot(vector(one, _B), a), dot(vector(one, _B + 3), a), dot(vector(one, _B + 6), a)
-    )  # fmt: skip
-
-
-@device
-def _times_b(a: Vector, one: FloatArray) -> Vector:
-    """Return a'B."""
-    x = beyond(scaled(a[0], vector(one, _B)), a[1], vector(one, _B + 3))
-    return beyond(x, a[2], vector(one, _B + 6))
-
-
-@device
-def _start_b(one: FloatArray) -> None:
+def _start_derivative(b: FloatArray, one: FloatArray) -> None:
     """Set B to a share of diag(1, 1, true by apparent depth)."""
-    one[_B:_GOES_ON] = 0.0
-    share = one[_SHARE]
-    one[_B], one[_B + 4], one[_B + 8] = share, share, share * one[_RATIO]
-
-
-@device
-def _write(rows: IntArray, sums: FloatArray, search: FloatArray, result: FloatArray) -> None:
-    """Write the points that are found."""
-    for j in range(rows.size):
-        row, one = result[rows[j]], search[rows[j]]
-        if row[_OUTCOME] == CORRECTED and one[_BEST] <= CLOSE_M:
-            row[0], row[1], row[2] = vector(one)
-            row[_DISTANCE] = ray_distance(sums[9 * TILE + j], nine(sums, j), vector(one))
-            row[_FOUND] = 1.0
+    b[:] = 0.0
+    b[0, 0], b[1, 1], b[2, 2] = one[_SHARE], one[_SHARE], one[_SHARE] * one[_RATIO]

@@ -88,11 +88,9 @@ class _Figures(Sums):
         if not self.count:
             return {}
         found = {"min": self.least_m, "mean": self.sum_m / self.count, "max": self.most_m}
-        for name in names:
-            if name not in found:
-                rank = float(name[1:]) / 100.0 * self.count
-                place = int(np.searchsorted(np.cumsum(self.bins), rank))
-                found[name] = place * _BIN_M + self.low_m
+        for name in {*names} - {*found}:
+            rank = float(name[1:]) / 100.0 * self.count
+            found[name] = np.searchsorted(np.cumsum(self.bins), rank) * _BIN_M + self.low_m
         return {name: round(float(times * found[name]), 4) for name in names}
 
 
@@ -147,16 +145,13 @@ class Tally(Sums):
     def of(cls, correction: Correction) -> Tally:
         """Return the tally of a chunk."""
         apparent, moved = correction.apparent_xyz, correction.corrected
-        submerged = apparent[correction.submerged]
         # axis by axis: numpy is slow along the short one
-        low = np.array([values.min(initial=np.inf) for values in submerged.T])
-        high = np.array([values.max(initial=-np.inf) for values in submerged.T])
-        depth = correction.depth_m[moved]
+        submerged, depth = apparent[correction.submerged].T, correction.depth_m[moved]
         return cls(
             outcomes=np.bincount(correction.outcome, minlength=len(Outcome)),
             camera_used=correction.camera_used,
-            low=low,
-            high=high,
+            low=np.array([values.min(initial=np.inf) for values in submerged]),
+            high=np.array([values.max(initial=-np.inf) for values in submerged]),
             shift=_Figures.of(correction.shift_m[moved, 2], -100.0, 100.0),
             depth=_Figures.of(depth),
             errors=UncertaintyTally.of(correction.sigma_z_m[moved], depth),

@@ -16,8 +16,7 @@ from pcfix.lens.frames import Frames, may_hold
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Batch, Chosen, normal_above
 
-TILE = 128
-"""Points of a tile: its sums (11 numbers a point) stay in the processor's first cache."""
+TILE = 128  # points of a tile: its sums (11 numbers a point) stay in the processor's first cache
 
 
 def tiles_of(batch: Batch) -> int:
@@ -87,6 +86,14 @@ def three(runs: FloatArray, at: int) -> Vector:
 def put(runs: FloatArray, at: int, a: Vector) -> None:
     """Write the numbers of a point into three runs that follow each other."""
     runs[at], runs[at + TILE], runs[at + 2 * TILE] = a
+
+
+@device(forceinline=True)
+def add_three(runs: FloatArray, at: int, c: float, a: Vector) -> None:
+    """Add c a to the numbers of a point in three runs that follow each other."""
+    runs[at] += c * a[0]
+    runs[at + TILE] += c * a[1]
+    runs[at + 2 * TILE] += c * a[2]
 
 
 @device(forceinline=True)

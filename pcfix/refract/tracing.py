@@ -42,30 +42,23 @@ Surface: TypeAlias = WaterPlane | WaterRaster | WaterMesh
 
 METHODS = ("kotowski", "afrt", "mdfrt", "scattershot")
 
-BLOCK = 32_768
-"""Endpoints traced at once."""
-CLOSE_M = 1e-9
-"""A step that ends a search: no finer than UTM northings allow in doubles."""
+BLOCK = 32_768  # endpoints traced at once
+CLOSE_M = 1e-9  # a step that ends a search: no finer than UTM northings allow in doubles
 SHORT = 0.1
 """In depths: a step that is taken although it seems to lead away, as it may from one patch of a
 broken surface to the next."""
-SEARCH_STEPS, HALVINGS = 60, 24
-"""Most steps of a search, and most halvings of a step."""
+SEARCH_STEPS, HALVINGS = 60, 24  # most steps of a search, and most halvings of a step
 DIFFERENCE_M = 1e-6
 """Distance of the places for differences; with less, rounding exceeds what differences neglect."""
 HIGHEST_START = 0.95
 """Of the straight line: the search starts below the camera even where a tilted water is higher
 above the point than the camera."""
-KNOTS = 10
-"""To each side of the middle of the first grid of `scattershot`."""
-SHOTS = 200
+KNOTS, SHOTS = 10, 200  # to each side of the first grid of `scattershot`; most grids
 BLUNT_M = 1e-7
 """Half the grid below which the lengths of neighbouring paths are the same by rounding."""
 NEIGHBOUR_M = 1e-4
-CREASE_M = 1e-7
-"""A path by which the ray misses the point by more goes through a crease."""
-NEAR = 0.25
-"""In depths: how far around the end of a method the shortest path is searched."""
+CREASE_M = 1e-7  # a path by which the ray misses the point by more goes through a crease
+NEAR = 0.25  # in depths: how far around the end of a method the shortest path is searched
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,8 +151,7 @@ def trace(
         )
     point, centre = (np.array(a, float).T for a in np.broadcast_arrays(xyz, seen_from))
     pairs, count = Endpoints(surface, point, centre - point, n), point.shape[1]
-    pierced = np.full((3, count), np.nan)
-    steps = np.zeros(count, np.int64)
+    pierced, steps = np.full((3, count), np.nan), np.zeros(count, np.int64)
     on_crease = np.zeros(count, np.bool_)
 
     def run(span: Span) -> None:
@@ -170,10 +162,9 @@ def trace(
                 pierced[:, rows], steps[rows], on_crease[rows] = path
 
     in_tiles(run, -(-count // BLOCK))
-    way = pairs.e - pierced
     return Tracing(
         piercing_xyz=(point + pierced).T,
-        direction=-(way / np.sqrt(_dot(way, way))).T,
+        direction=_unit(pierced - pairs.e).T,
         iterations=steps,
         converged=np.isfinite(pierced[0]),
         on_crease=on_crease,
@@ -219,14 +210,6 @@ class Endpoints(NamedTuple):
         a, t = self.refracted(xy)
         return xy - t[:2] * (a[2] / t[2])
 
-    def snell_normal(self, a: FloatArray) -> FloatArray:
-        """Return u - n v, with the unit vectors u from the cameras to A and v from A to the points.
-
-        By Snell's law it is normal to the surface.
-        """
-        u = a - self.e
-        return u / np.sqrt(_dot(u, u)) + a * (self.n / np.sqrt(_dot(a, a)))
-
     def length(self, xy: FloatArray) -> FloatArray:
         """Return the optical lengths of paths, metres, (m,); infinite where there is none."""
         a, slope = self.pierced(xy)
@@ -238,7 +221,8 @@ class Endpoints(NamedTuple):
     def residual(self, xy: FloatArray, method: str) -> FloatArray:
         r"""Return the two numbers, (2, m), that vanish where light pierces the surface at x, y.
 
-        kotowski: u - n v is normal to the surface, hence to its tangents (1, 0, b) and (0, 1, c):
+        kotowski: with the unit vectors u from the camera to A and v from A to the point, u - n v is
+        normal to the surface by Snell's law, hence to its tangents (1, 0, b) and (0, 1, c):
 
             g = (u_x - n v_x + b (u_z - n v_z), u_y - n v_y + c (u_z - n v_z)) = 0
 
@@ -254,7 +238,7 @@ class Endpoints(NamedTuple):
         """
         if method == "kotowski":
             a, slope = self.pierced(xy)
-            g = self.snell_normal(a)
+            g = _unit(a - self.e) + self.n * _unit(a)
             return np.asarray(g[:2] + slope * g[2])
         if method == "afrt":
             return self.offset(xy)
@@ -266,6 +250,10 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray((a * b).sum(axis=0))
 
 
+def _unit(a: FloatArray) -> FloatArray:
+    return a / np.sqrt(_dot(a, a))
+
+
 def _path(pairs: Endpoints, method: str, narrow: bool) -> Found:
     """Return where the light of pairs pierces the surface, the steps, and whether on a crease."""
     e, m = pairs.e, pairs.e.shape[1]
@@ -275,9 +263,8 @@ def _path(pairs: Endpoints, method: str, narrow: bool) -> Found:
     # not where the camera is under the water, or somewhere infinite
     is_above = ~(e[2] <= over) & (np.abs(e).sum(axis=0) < np.inf)
     # a point above the water is seen straight
-    straight = is_above & ~(level > 0.0)
-    found[:, straight] = 0.0
-    rows = np.flatnonzero(is_above & ~straight & (e[2] > 0.0))
+    found[:, is_above & ~(level > 0.0)] = 0.0
+    rows = np.flatnonzero(is_above & (level > 0.0) & (e[2] > 0.0))
     wet, level = pairs.of(rows), level[rows]
     # the straight line pierces the surface about here
     share = np.minimum(level / wet.e[2], HIGHEST_START)
@@ -313,10 +300,9 @@ def _search(pairs: Endpoints, start: FloatArray, level: FloatArray, method: str)
     is brought to zero. Here it is Newton's method with differences of neighbouring places. A step
     that makes the residual grow, or leaves the water, is halved until it is short.
     """
-    xy, rest = start.copy(), pairs.residual(start, method)
     # beyond the edge of the water: start above the point
-    off = np.isnan(rest[0])
-    xy[:, off], rest[:, off] = 0.0, pairs.of(off).residual(np.zeros((2, off.sum())), method)
+    xy = np.where(np.isnan(pairs.residual(start, method)[0]), 0.0, start)
+    rest = pairs.residual(xy, method)
     steps, found = np.zeros(len(level), np.int64), np.zeros(len(level), np.bool_)
     rows, some = np.arange(len(level)), pairs
     for step in range(1, SEARCH_STEPS + 1):
@@ -340,10 +326,9 @@ def _search(pairs: Endpoints, start: FloatArray, level: FloatArray, method: str)
         xy[:, rows[goes_on]] += s[:, goes_on]
         found[rows] = goes_on & (size <= CLOSE_M)
         goes_on &= size > CLOSE_M
-        if not goes_on.any():
+        rows, some = rows[goes_on], some.of(goes_on)
+        if not len(rows):
             break
-        if not goes_on.all():
-            rows, some = rows[goes_on], some.of(goes_on)
     return xy, steps, found & (np.hypot(*pairs.offset(xy)) <= CREASE_M)
 
 

@@ -31,21 +31,19 @@ from __future__ import annotations
 import numpy as np
 
 from pcfix.kernels import device
-from pcfix.lens.algebra import Vector, beyond, dot, minus, row_of, scaled
-from pcfix.lens.formulas import PLAIN
-from pcfix.lens.imaging import Plain, image_and_slopes, image_of, plain_image, plain_lens
+from pcfix.lens.algebra import beyond, dot, minus, row_of, scaled
+from pcfix.lens.imaging import PLAIN, Plain, image_and_slopes, image_of, plain_image, plain_lens
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Optics
 from pcfix.refract.choice import Rig
 from pcfix.refract.rays import light_near, settle
-from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, put, slots, three
+from pcfix.refract.tiling import TILE, add_three, inverse_of, nine, product_of, put, slots, three
 from pcfix.water.surface import Field, Tin, field_of
 
 STEPS, MOST_STEPS = 4, 60
 """Two or three are usual. A point that is not found by then starts again, and may need many."""
 
-CLOSE_M = 1e-7
-"""Estimated distance from the solution, from the last two steps."""
+CLOSE_M = 1e-7  # estimated distance from the solution, from the last two steps
 
 # Runs of `TILE` numbers for the rays of one camera: the gradients of the image by P, the image of
 # P, and the plane of the water (N, h), which moves under waves.
@@ -176,9 +174,7 @@ def _add(
         du = times * (u - ray[_IMAGE * TILE + j]) if times > 0.0 else 0.0
         dv = times * (v - ray[(_IMAGE + 1) * TILE + j]) if times > 0.0 else 0.0
         by_u, by_v = three(ray, _BY_U * TILE + j), three(ray, _BY_V * TILE + j)
-        room[_G * TILE + j] += by_u[0] * du + by_v[0] * dv
-        room[(_G + 1) * TILE + j] += by_u[1] * du + by_v[1] * dv
-        room[(_G + 2) * TILE + j] += by_u[2] * du + by_v[2] * dv
+        add_three(room, _G * TILE + j, 1.0, beyond(scaled(du, by_u), dv, by_v))
         # d w / d Q = k (I - N N') + s (grad k)', with G(k, D, s.s) = 0 implicitly:
         # grad k = (k / S N + D k^3 (n^2 - 1) / S^3 s) / (H + D n^2 / S^3)
         across = dot(normal, e)
@@ -189,20 +185,7 @@ def _add(
         times = times * across if times > 0.0 else 0.0
         du_q = beyond(scaled(k, minus(by_u, scaled(dot(by_u, normal), normal))), dot(by_u, s), by_k)
         dv_q = beyond(scaled(k, minus(by_v, scaled(dot(by_v, normal), normal))), dot(by_v, s), by_k)
-        _add_products(room, j, by_u, scaled(times, du_q))
-        _add_products(room, j, by_v, scaled(times, dv_q))
-
-
-@device
-def _add_products(room: FloatArray, j: int, a: Vector, b: Vector) -> None:
-    """Add a b' to d g / d Q."""
-    at = _BY_Q * TILE + j
-    room[at] += a[0] * b[0]
-    room[at + TILE] += a[0] * b[1]
-    room[at + 2 * TILE] += a[0] * b[2]
-    room[at + 3 * TILE] += a[1] * b[0]
-    room[at + 4 * TILE] += a[1] * b[1]
-    room[at + 5 * TILE] += a[1] * b[2]
-    room[at + 6 * TILE] += a[2] * b[0]
-    room[at + 7 * TILE] += a[2] * b[1]
-    room[at + 8 * TILE] += a[2] * b[2]
+        du_q, dv_q, at = scaled(times, du_q), scaled(times, dv_q), _BY_Q * TILE + j
+        add_three(room, at, 1.0, beyond(scaled(by_u[0], du_q), by_v[0], dv_q))
+        add_three(room, at + 3 * TILE, 1.0, beyond(scaled(by_u[1], du_q), by_v[1], dv_q))
+        add_three(room, at + 6 * TILE, 1.0, beyond(scaled(by_u[2], du_q), by_v[2], dv_q))

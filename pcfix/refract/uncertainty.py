@@ -31,9 +31,9 @@ slope, N + tau         -y (1 - r H / kappa) tau + (gamma + m r / kappa) (d.tau) 
 What a delta of each ray does to Q depends on what Q is the least of.
 
 *In space* (`snell` and most others) that is the squared distances from the refracted rays, eq 11 of
-Skarlatos & Agrafiotis 2018. With M = I - t t'
+Skarlatos & Agrafiotis 2018. With S = M = I - t t'
 
-    dQ = (sum M)^-1 sum M delta,    M d = E = (kappa^2 d - r kappa rho^2 N) / L^2.
+    dQ = (sum M)^-1 sum M delta,    M d = (kappa^2 d - r kappa rho^2 N) / L^2.
 
 *In images* (`consistent`) the residuals are those at P: sum J' (x(Q) - pi(P)) = 0. A Q that is off
 its ray, by T Q = Q - (N.Q) (N + (r / kappa) d) at its own depth, is seen where P would be after a
@@ -44,13 +44,16 @@ move of D^-1 T Q. With W = J'J and S = W D^-1, D^-1 across as in the table,
 as W e = 0. Q depends on P only through pi(P): dQ / dP = (sum S T)^-1 sum W, and K cancels out. Up
 to 45 degrees the two differ by less than 2 %; of rays at 73 degrees the first is twice as large.
 
+In both cases S delta = c A delta + b (d.delta) g with a symmetric A, g = S d and two numbers: M, 1
+and 0 in space; W, 1 / (1 - m) and -beta / (1 - m) in images.
+
 Neglected is the turn of M, and of J, times the residual, which is of second order.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
@@ -75,7 +78,7 @@ from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Chosen, Intersection, Survey
 from pcfix.refract.choice import Rig, rig_of
 from pcfix.refract.rays import refracted
-from pcfix.refract.tiling import TILE, inverse_of, nine, product_of, put, slots, three
+from pcfix.refract.tiling import TILE, add_three, inverse_of, nine, product_of, put, slots, three
 from pcfix.water.surface import Field, height_at
 
 MIN_DETERMINANT = 1e-6
@@ -94,7 +97,8 @@ _XZ, _YZ, _ZZ = 2, 4, 5
 class Budget(NamedTuple):
     """Standard deviations, angles in radians; the place about which the water tilts.
 
-    `in_images` says which residuals the correction makes least.
+    `in_images` says which residuals the correction makes least, `by_ray` whether rays have errors
+    other than the noise of image coordinates.
     """
 
     image_px: float
@@ -106,6 +110,7 @@ class Budget(NamedTuple):
     pivot_x: float
     pivot_y: float
     in_images: bool
+    by_ray: bool
 
 
 def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
@@ -218,17 +223,16 @@ def budget_of(survey: Survey) -> Budget:
         pivot_x=x,
         pivot_y=y,
         in_images=settings.method == "consistent",
+        by_ray=max(settings.sigma_waves, settings.sigma_centre, settings.sigma_attitude) > 0.0,
     )
 
 
 # Runs of `TILE` numbers for the points of a tile: how far above the true point P is, along N; the
-# number of rays; what level (3) and n (3) add to M delta or S delta; W (6); M or S T (9); M D (9);
-# what slopes add, to be multiplied by tau (9); noise (6).
+# number of rays; what level (3) and n (3) add to S delta; W (6); S T (9); M D (9); what slopes add,
+# to be multiplied by tau (9); noise (6).
 _ABOVE, RAYS, BY_LEVEL, BY_N, SIGHT, BY_Q, BY_P, BY_TILT, NOISE, ROOM = slots(
     1, 1, 3, 3, 6, 9, 9, 9, 6
 )
-
-RayTerms: TypeAlias = tuple[float, Vector, Vector, float, float, float, float, float]
 
 
 class Sight(NamedTuple):
@@ -241,6 +245,24 @@ class Sight(NamedTuple):
     bend: float  # 1 / n
 
 
+class Ray(NamedTuple):
+    """One ray, for kernels; see the table above."""
+
+    one: float  # how often it counts
+    e: Vector
+    normal: Vector  # N
+    height: float  # H
+    length2: float  # L^2
+    h: float
+    y: float
+    bend: float  # r, 1 where light goes straight
+    kappa: float
+    inv_h: float  # 1 / H
+    lean: float  # r / kappa: the tangent in water for each metre across in air
+    away: float  # 1 - m
+    beta: float
+
+
 @device(allocates=True)
 def room_of(tile: FloatArray, shift: FloatArray, rows: IntArray) -> FloatArray:
     """Return room for the sums of a tile, which start at zero."""
@@ -251,52 +273,38 @@ def room_of(tile: FloatArray, shift: FloatArray, rows: IntArray) -> FloatArray:
 
 
 @device(forceinline=True)
-def _ray_terms(
-    room: FloatArray, tile: FloatArray, marks: FloatArray, j: int, sight: Sight
-) -> RayTerms:
-    """Return how often a ray counts; e, N, H, L^2, h, y and r where the light bends.
-
-    A ray that does not count goes straight up.
-    """
+def _ray_of(room: FloatArray, tile: FloatArray, marks: FloatArray, j: int, sight: Sight) -> Ray:
+    """Return the ray of a point; one that does not count goes straight up."""
     p, normal = three(tile, j), three(tile, 4 * TILE + j)
     e = minus(sight.centre, p) if marks[j] > 0.0 else normal
+    height, length2 = dot(normal, e), dot(e, e)
     h = normal[2] * (tile[3 * TILE + j] - (p[2] - sight.offset))
     # light of a point above the water goes straight
-    bend = sight.bend if h > 0.0 else 1.0
-    # y: depth of the true point below the surface
-    return marks[j], e, normal, dot(normal, e), dot(e, e), h, h + room[_ABOVE * TILE + j], bend
-
-
-@device(forceinline=True)
-def _bent(
-    height: float, length2: float, h: float, y: float, bend: float
-) -> tuple[float, float, float, float, float, float]:
-    """Return kappa, 1 / H, r / kappa, 1 - m, beta, and delta by n over d."""
+    bend, y = sight.bend if h > 0.0 else 1.0, h + room[_ABOVE * TILE + j]
     kappa = np.sqrt(length2 - bend * bend * (length2 - height * height))
-    share = 1.0 / (height * kappa)  # one division for two
+    # one division for two
+    share = 1.0 / (height * kappa)
     inv_k, inv_h = share * height, share * kappa
-    # r / kappa, the tangent in water for each metre across in air
     lean = bend * inv_k
-    fall = y * lean * inv_k * inv_k
-    by_n = fall * bend * length2 if bend < 1.0 else 0.0
-    return kappa, inv_h, lean, 1.0 - h * inv_h + y * lean, fall * (bend * bend - 1.0), by_n
+    away, beta = 1.0 - h * inv_h + y * lean, y * lean * inv_k * inv_k * (bend * bend - 1.0)
+    return Ray(marks[j], e, normal, height, length2, h, y, bend, kappa, inv_h, lean, away, beta)
 
 
 @device(forceinline=True)
-def _weight(one: float, e: Vector, length2: float, sight: Sight) -> Symmetric:
+def _weight(ray: Ray, sight: Sight) -> Symmetric:
     """Return J'J of a camera at P.
 
     With the optical axis z and Z = -z.e it is (f / Z)^2 (I + x z' + z x'), x = e / Z +
     L^2 / (2 Z^2) z; without an axis (zeros), of angles, (f / L)^2 (I - e e' / L^2).
     """
-    axis = sight.axis
+    axis, e, length2 = sight.axis, ray.e, ray.length2
     # cameras without an axis, such as fisheyes, have equal angles per pixel
     flat = axis[0] != 0.0 or axis[1] != 0.0 or axis[2] != 0.0
     # depth along the axis, or the squared distance
     deep = -dot(axis, e) if flat else length2
-    inv = 1.0 / deep if one > 0.0 else 0.0
+    inv = 1.0 / deep if ray.one > 0.0 else 0.0
     # (f / Z)^2 or (f / L)^2; 0 for rays that do not count
-    w = one * sight.square * (inv * inv if flat else inv)
+    w = ray.one * sight.square * (inv * inv if flat else inv)
     a = inv if flat else -0.5 * inv
     b = 0.5 * length2 * inv * inv if flat else 0.0
     zx, zy, zz = axis[0] if flat else e[0], axis[1] if flat else e[1], axis[2] if flat else e[2]
@@ -308,130 +316,99 @@ def _weight(one: float, e: Vector, length2: float, sight: Sight) -> Symmetric:
 
 
 @device(forceinline=True)
-def _add_three(sums: FloatArray, at: int, c: float, a: Vector) -> None:
-    """Add c a."""
-    sums[at] += c * a[0]
-    sums[at + TILE] += c * a[1]
-    sums[at + 2 * TILE] += c * a[2]
+def _inverse(ray: Ray) -> tuple[float, float]:
+    """Return what D^-1 does to p across d, and along it."""
+    # 1 - m + beta rho^2
+    outer = ray.away + ray.beta * (ray.length2 - ray.height * ray.height)
+    share = 1.0 / (ray.away * outer)
+    return share * outer, share * ray.away
+
+
+@device(forceinline=True)
+def _effect(
+    ray: Ray, w: Symmetric, in_space: bool | None
+) -> tuple[Symmetric, Vector, float, float]:
+    """Return A, g, c and b, by which a move of the ray goes into the sums; see the docstring.
+
+    numba compiles a version for residuals in space, and one for None: in images.
+    """
+    if in_space is None:
+        inner, outer = _inverse(ray)
+        return w, scaled(-ray.height * outer, product(w, ray.normal)), inner, -ray.beta * inner
+    height, length2, kappa = ray.height, ray.length2, ray.kappa
+    d, per = refracted(ray.e, length2, ray.normal, height, ray.bend), ray.one / length2
+    # M = I - t t', with the refracted ray of the length L
+    xx, xy, xz, yy, yz, zz = plus_square(NO_SQUARES, d)
+    m = ray.one - per * xx, -per * xy, -per * xz, ray.one - per * yy, -per * yz, ray.one - per * zz
+    # M d = (kappa^2 d - r kappa rho^2 N) / L^2, d = e - H N
+    along = kappa * kappa * per
+    up = along * height + ray.bend * kappa * (length2 - height * height) * per
+    return m, minus(scaled(along, ray.e), scaled(up, ray.normal)), 1.0, 0.0
 
 
 @device(forceinline=True)
 def _add_six(sums: FloatArray, at: int, c: float, m: Symmetric) -> None:
     """Add c m."""
-    _add_three(sums, at, c, (m[0], m[1], m[2]))
-    _add_three(sums, at + 3 * TILE, c, (m[3], m[4], m[5]))
+    add_three(sums, at, c, (m[0], m[1], m[2]))
+    add_three(sums, at + 3 * TILE, c, (m[3], m[4], m[5]))
 
 
 @device(forceinline=True)
 def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: Vector) -> None:
     """Add c m + g q'."""
-    sums[at] += c * m[0] + g[0] * q[0]
-    sums[at + TILE] += c * m[1] + g[0] * q[1]
-    sums[at + 2 * TILE] += c * m[2] + g[0] * q[2]
-    sums[at + 3 * TILE] += c * m[1] + g[1] * q[0]
-    sums[at + 4 * TILE] += c * m[3] + g[1] * q[1]
-    sums[at + 5 * TILE] += c * m[4] + g[1] * q[2]
-    sums[at + 6 * TILE] += c * m[2] + g[2] * q[0]
-    sums[at + 7 * TILE] += c * m[4] + g[2] * q[1]
-    sums[at + 8 * TILE] += c * m[5] + g[2] * q[2]
-
-
-@device(forceinline=True)
-def _in_space(
-    one: float, e: Vector, normal: Vector, height: float, length2: float, bend: float, kappa: float
-) -> tuple[Symmetric, Vector]:
-    """Return M and E."""
-    d, per = refracted(e, length2, normal, height, bend), one / length2
-    # M = I - t t', with d of the length L; E = (kappa^2 d - r kappa rho^2 N) / L^2, d = e - H N
-    m = plus_square(NO_SQUARES, d)
-    m = one - per * m[0], -per * m[1], -per * m[2], one - per * m[3], -per * m[4], one - per * m[5]
-    along = kappa * kappa * per
-    up = along * height + bend * kappa * (length2 - height * height) * per
-    return m, minus(scaled(along, e), scaled(up, normal))
+    add_three(sums, at, 1.0, beyond(scaled(c, (m[0], m[1], m[2])), g[0], q))
+    add_three(sums, at + 3 * TILE, 1.0, beyond(scaled(c, (m[1], m[3], m[4])), g[1], q))
+    add_three(sums, at + 6 * TILE, 1.0, beyond(scaled(c, (m[2], m[4], m[5])), g[2], q))
 
 
 @device
-def add_in_space(room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight) -> None:
-    """Add one camera's rays to the sums of a tile's points, for residuals in space."""
+def _add_common(
+    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, in_space: bool | None
+) -> None:
+    """Add one camera's rays to the sums of a tile's points: what moves Q, P, level and index."""
     for j in range(marks.size):
-        one, e, normal, height, length2, h, y, bend = _ray_terms(room, tile, marks, j, sight)
-        kappa, inv_h, lean, away, beta, by_n = _bent(height, length2, h, y, bend)
-        m, g = _in_space(one, e, normal, height, length2, bend, kappa)
-        # M D (p - (N.p) e / H), where M e = (1 - r H / kappa) E
-        up = (away * (lean * height - 1.0) - beta * length2) * inv_h
-        room[RAYS * TILE + j] += one
-        _add_nine(room, BY_Q * TILE + j, 1.0, m, (0.0, 0.0, 0.0), g)
-        _add_nine(room, BY_P * TILE + j, away, m, g, plus(scaled(up, normal), scaled(beta, e)))
-        _add_three(room, BY_LEVEL * TILE + j, inv_h - lean, g)
-        _add_three(room, BY_N * TILE + j, by_n, g)
-        _add_six(room, SIGHT * TILE + j, 1.0, _weight(one, e, length2, sight))
-
-
-@device
-def add_in_images(room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight) -> None:
-    """Add one camera's rays to the sums of a tile's points, for residuals in images.
-
-    S T = W / (1 - m) + W N (u N + v e)', with c = 1 - m + beta rho^2, v = H beta / ((1 - m) c) and
-    u = (r H / kappa) / c - 1 / (1 - m) - H v.
-    """
-    for j in range(marks.size):
-        one, e, normal, height, length2, h, y, bend = _ray_terms(room, tile, marks, j, sight)
-        _, inv_h, lean, away, beta, by_n = _bent(height, length2, h, y, bend)
-        w = _weight(one, e, length2, sight)
-        g = product(w, normal)
-        # D^-1 across d and along it; see the docstring for u and v
-        inner, outer = _inverse(height, length2, away, beta)
-        v = height * beta * inner * outer
-        u = lean * height * outer - inner - height * v
-        q = plus(scaled(u, normal), scaled(v, e))
-        room[RAYS * TILE + j] += one
-        _add_nine(room, BY_Q * TILE + j, inner, w, g, q)
-        # S d = -H W N / c
-        scale = -height * outer
-        _add_three(room, BY_LEVEL * TILE + j, scale * (inv_h - lean), g)
-        _add_three(room, BY_N * TILE + j, scale * by_n, g)
+        ray = _ray_of(room, tile, marks, j, sight)
+        w, e, normal, lean = _weight(ray, sight), ray.e, ray.normal, ray.lean
+        a, g, c, b = _effect(ray, w, in_space)
+        if in_space is None:
+            # S T = c W + g (b e + up N)', as W N = -g (1 + beta rho^2 / (1 - m)) (1 - m) / H
+            rho2 = ray.length2 - ray.height * ray.height
+            up = (1.0 - b * rho2) * ray.inv_h - b * ray.height - lean
+            _add_nine(room, BY_Q * TILE + j, c, a, g, plus(scaled(up, normal), scaled(b, e)))
+        else:
+            # M T = M, as M t = 0; M D (p - (N.p) e / H), as M e = (1 - r H / kappa) g
+            up = (ray.away * (lean * ray.height - 1.0) - ray.beta * ray.length2) * ray.inv_h
+            q = plus(scaled(up, normal), scaled(ray.beta, e))
+            _add_nine(room, BY_Q * TILE + j, 1.0, a, g, (0.0, 0.0, 0.0))
+            _add_nine(room, BY_P * TILE + j, ray.away, a, g, q)
+        # delta by n over d: y r^2 L^2 / kappa^3
+        inv_k2 = 1.0 / (ray.kappa * ray.kappa)
+        by_n = ray.y * lean * ray.bend * ray.length2 * inv_k2 if ray.bend < 1.0 else 0.0
+        room[RAYS * TILE + j] += ray.one
+        add_three(room, BY_LEVEL * TILE + j, ray.inv_h - lean, g)
+        add_three(room, BY_N * TILE + j, by_n, g)
         _add_six(room, SIGHT * TILE + j, 1.0, w)
 
 
-@device(forceinline=True)
-def _inverse(height: float, length2: float, away: float, beta: float) -> tuple[float, float]:
-    """Return what D^-1 does to p across d, and along it."""
-    # 1 - m + beta rho^2
-    outer = away + beta * (length2 - height * height)
-    share = 1.0 / (away * outer)
-    return share * outer, share * away
-
-
 @device
-def add_tilt(
-    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, in_images: bool
+def _add_tilt(
+    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, in_space: bool | None
 ) -> None:
-    """Add how the slope of the water moves each of one camera's rays, M delta or S delta.
+    """Add how the slope of the water moves each of one camera's rays: S delta by tau.
 
-    S delta = (a W + (a beta - (1 - m) b) H / c W N d') / (1 - m) tau, c as above, for delta =
-    a tau + b (d.tau) d; d.tau = e.tau.
+    delta = turn tau + along (d.tau) d, along = gamma + m r / kappa; d.tau = e.tau.
     """
     for j in range(marks.size):
-        one, e, normal, height, length2, h, y, bend = _ray_terms(room, tile, marks, j, sight)
-        kappa, inv_h, lean, away, beta, _ = _bent(height, length2, h, y, bend)
-        # delta by the slope is turn (tau) + along (d.tau) d, along = gamma + m r / kappa
-        inv_k, turn = 1.0 / kappa, -y * (1.0 - height * lean)
-        along = y * bend * bend * lean * height * inv_k * inv_k
-        along += (h * inv_h - y * lean) * lean - h * inv_h * inv_h
-        if in_images:
-            w = _weight(one, e, length2, sight)
-            g = product(w, normal)
-            inner, outer = _inverse(height, length2, away, beta)
-            # both parts through D^-1
-            along = (turn * beta * inner - along) * height * outer
-            turn *= inner
-        else:
-            w, g = _in_space(one, e, normal, height, length2, bend, kappa)
-        _add_nine(room, BY_TILT * TILE + j, turn, w, g, scaled(along, e))
+        ray = _ray_of(room, tile, marks, j, sight)
+        a, g, c, b = _effect(ray, _weight(ray, sight), in_space)
+        turn, inv_k = -ray.y * (1.0 - ray.height * ray.lean), 1.0 / ray.kappa
+        along = ray.y * ray.bend * ray.bend * ray.lean * ray.height * inv_k * inv_k
+        along += (ray.h * ray.inv_h - ray.y * ray.lean) * ray.lean - ray.h * ray.inv_h * ray.inv_h
+        _add_nine(room, BY_TILT * TILE + j, turn * c, a, g, scaled(turn * b + along, ray.e))
 
 
 @device
-def add_noise(
+def _add_noise(
     room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, budget: Budget
 ) -> None:
     """Add the noise of one camera's rays to the normal equations of the straight rays.
@@ -442,32 +419,28 @@ def add_noise(
     -y (1 - r H / kappa) (tau + r^2 / kappa^2 d (d.tau)); D^-1 of that is what moves P, by c_t
     across d and c_r along.
     """
-    image_px, centre_m = budget.image_px, budget.centre_m
-    attitude, waves = budget.attitude, budget.waves
     for j in range(marks.size):
-        one, e, normal, height, length2, h, y, bend = _ray_terms(room, tile, marks, j, sight)
-        kappa, _, lean, away, beta, _ = _bent(height, length2, h, y, bend)
-        w = _weight(one, e, length2, sight)
-        g = product(w, normal)
-        inner, outer = _inverse(height, length2, away, beta)
+        ray = _ray_of(room, tile, marks, j, sight)
+        w, length2, height = _weight(ray, sight), ray.length2, ray.height
+        inner, outer = _inverse(ray)
         # a slope of the wave moves the refracted ray by this across d
-        across = waves * y * (1.0 - height * lean)
+        across = budget.waves * ray.y * (1.0 - height * ray.lean)
         # and by the factor 1 + bow rho^2 along d
-        bow = bend * bend / (kappa * kappa)
+        bow = ray.bend * ray.bend / (ray.kappa * ray.kappa)
         c_t = across * inner
         c_r = across * outer * (1.0 + bow * (length2 - height * height))
         # (c_r^2 - c_t^2) / rho^2, also straight down; W d = -H W N
-        more = across * outer * (bow - beta * inner) * (c_r + c_t)
+        more = across * outer * (bow - ray.beta * inner) * (c_r + c_t)
         # variance of the place of P from attitude, centre and waves, with C isotropic
-        by_place = attitude * attitude * length2 + centre_m * centre_m + c_t * c_t
+        by_place = budget.attitude**2 * length2 + budget.centre_m**2 + c_t * c_t
         by_normal = more * height * height - c_t * c_t
-        noise = plus_square(NO_SQUARES, (w[0], w[1], w[2]))
         # W W, as W is symmetric: the sum of the squares of its rows
-        square = plus_square(plus_square(noise, (w[1], w[3], w[4])), (w[2], w[4], w[5]))
+        square = plus_square(NO_SQUARES, (w[0], w[1], w[2]))
+        square = plus_square(plus_square(square, (w[1], w[3], w[4])), (w[2], w[4], w[5]))
         at = NOISE * TILE + j
-        _add_six(room, at, image_px * image_px, w)
+        _add_six(room, at, budget.image_px**2, w)
         _add_six(room, at, by_place, square)
-        _add_six(room, at, by_normal, plus_square(NO_SQUARES, g))
+        _add_six(room, at, by_normal, plus_square(NO_SQUARES, product(w, ray.normal)))
 
 
 @kernel(allocates=True)
@@ -476,21 +449,14 @@ def _of_lists(
     level_sigma: FloatArray, result: FloatArray,
 ) -> None:  # fmt: skip
     """Compute the covariances of points with view lists, a tile at a time."""
-    start, camera = points.start, points.camera
     for t in range(*span):
         rows = order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
         tiling.gather(tile, rows, points)
         room = room_of(tile, shift, rows)
-        named, marks = tiling.marks_of_lists(start, camera, rows, len(rig.centres))
+        named, marks = tiling.marks_of_lists(points.start, points.camera, rows, len(rig.centres))
         add_errors(room, tile, marks, named, rig, 1.0 / points.n, budget)
         finish_tile(result, rows, room, tile, level_sigma, budget)
-
-
-@device
-def differ_by_ray(budget: Budget) -> bool:
-    """Whether rays have errors other than the noise of image coordinates."""
-    return max(budget.waves, max(budget.centre_m, budget.attitude)) > 0.0
 
 
 @device
@@ -507,15 +473,16 @@ def add_errors(
         sight = Sight(
             row_of(rig.centres, c), rig.offset[c], row_of(rig.axes, c), rig.focal_px[c] ** 2, bend
         )
-        # the derivative of consistent, or that of snell
         if budget.in_images:
-            add_in_images(room, tile, marks[k], sight)
+            _add_common(room, tile, marks[k], sight, None)
         else:
-            add_in_space(room, tile, marks[k], sight)
-        if budget.tilt > 0.0:
-            add_tilt(room, tile, marks[k], sight, budget.in_images)
-        if differ_by_ray(budget):
-            add_noise(room, tile, marks[k], sight, budget)
+            _add_common(room, tile, marks[k], sight, True)
+        if budget.tilt > 0.0 and budget.in_images:
+            _add_tilt(room, tile, marks[k], sight, None)
+        elif budget.tilt > 0.0:
+            _add_tilt(room, tile, marks[k], sight, True)
+        if budget.by_ray:
+            _add_noise(room, tile, marks[k], sight, budget)
 
 
 @device(allocates=True)
@@ -531,9 +498,8 @@ def finish_tile(
     """
     out, sigma, sums = np.empty(6 * TILE), level_sigma[rows], room
     # R = sigma^2 K if all rays have the same image noise
-    if not differ_by_ray(budget):
-        for at in range(6 * TILE):
-            sums[NOISE * TILE + at] = budget.image_px**2 * sums[SIGHT * TILE + at]
+    if not budget.by_ray:
+        sums[NOISE * TILE :] = budget.image_px**2 * sums[SIGHT * TILE : BY_Q * TILE]
     for j in range(rows.size):
         m, k = nine(sums, BY_Q * TILE + j), sums[RAYS * TILE + j]
         det, b = inverse_of(m)
@@ -546,7 +512,11 @@ def finish_tile(
             by_noise = _product(_product(b, nine(sums, BY_P * TILE + j)), by_sight)
             solved &= full > 0.0
         noise = _product(by_noise, _symmetric(sums, NOISE * TILE + j))
-        n = _product(noise, _transposed(by_noise))
+        x, y, z = by_noise[0:3], by_noise[3:6], by_noise[6:9]
+        cov = (
+            dot(noise[0:3], x), dot(noise[0:3], y), dot(noise[0:3], z),
+            dot(noise[3:6], y), dot(noise[3:6], z), dot(noise[6:9], z),
+        )  # fmt: skip
         nx, ny, nz = three(tile, 4 * TILE + j)
         # two horizontal directions of slope: u towards x, v across it
         scale = 1.0 / np.sqrt(nx * nx + nz * nz)
@@ -558,22 +528,16 @@ def finish_tile(
         # the normal leans away from where the slope rises
         u = plus(product_of(by_tilt, (-ux, 0.0, -uz)), scaled(away_u, level))
         v = plus(product_of(by_tilt, (-ny * uz, nx * uz - nz * ux, ny * ux)), scaled(away_v, level))
-        cov = n[0], n[1], n[2], n[4], n[5], n[8]
         cov = plus_square(cov, scaled(sigma[j], product_of(b, level)))
         cov = plus_square(cov, scaled(budget.refractive_index, product_of(b, index)))
         cov = plus_square(cov, scaled(budget.tilt, product_of(b, u)))
         cov = plus_square(cov, scaled(budget.tilt, product_of(b, v)))
-        put(out, j, (cov[0], cov[1], cov[2]))
-        put(out, 3 * TILE + j, (cov[3], cov[4], cov[5]))
+        put(out, j, cov[0:3])
+        put(out, 3 * TILE + j, cov[3:6])
         sums[RAYS * TILE + j] = 1.0 if solved else 0.0
     for j in range(rows.size):
         for at in range(6):
             result[rows[j], at] = out[at * TILE + j] if sums[RAYS * TILE + j] > 0.0 else 0.0
-
-
-@device(forceinline=True)
-def _transposed(m: Nine) -> Nine:
-    return m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]
 
 
 @device(forceinline=True)

@@ -1,4 +1,18 @@
-"""Find the water surface in the cloud itself: the level, or plane, that the cues agree on best."""
+"""Find the water surface in the cloud itself: the level, or plane, that the cues agree on best.
+
+Slope: refraction lifts the bed towards the surface, so that its slopes below the waterline are
+about 1/1.34 of the true ones (less under oblique rays), and a beach has a break of known size.
+Colour: water absorbs red light first (brown water with peat, blue), so that the ratio to green is
+constant on land and falls with depth: logarithms of light fall linearly with depth (Lyzenga 1978,
+Applied Optics 17: 379-383).
+
+A broken line is tested against an unbroken one, tile by tile, for every height of the break: y =
+(smooth within each tile) + trend * height + amplitude * f(depth), where f(d) = D (1 - exp(-d / D))
+below that height and 0 above it; trend and amplitude are common to all tiles. A free amplitude must
+exceed the trend: what fades under water is constant on land. Each tile has its sums of squares and
+products, so that adding tiles, at their own heights under a tilted surface, or resampling them is
+cheap.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import GeometryError
-from pcfix.model import BoolArray, FloatArray, WaterPlane
-from pcfix.water.cues import BLUE, RED, SLOPE, Moments, Samples, cue_moments, gain_of, sample_cloud
+from pcfix.model import BoolArray, FloatArray, IntArray, WaterPlane
 from pcfix.water.surface import FoundSurface
 
 LEAST_POINTS = 2_000
@@ -64,14 +77,8 @@ def find_water(xyz: FloatArray, rgb: npt.NDArray[Any] | None = None) -> WaterPro
 
     It is the height below which the ground gets flatter, as refraction lifts the bed, or colour
     fades with depth. Square tiles are summed separately, and resampling them gives the standard
-    error.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Apparent points without noise, metres, world frame.
-    rgb : array, shape (n, 3), optional
-        In any unit from zero up. Equal colours count as none.
+    error. The apparent points, shape (n, 3), are without noise; colours, shape (n, 3), are in any
+    unit from zero up, and equal ones count as none.
     """
     known = np.isfinite(xyz).all(axis=1)
     if known.sum() < LEAST_POINTS:
@@ -94,22 +101,11 @@ level. They are higher than for `find_water`, to avoid false alarms."""
 def find_elsewhere(
     xyz: FloatArray, water_m: FloatArray, rgb: npt.NDArray[Any] | None
 ) -> tuple[WaterProposal | None, Tilted | None]:
-    """Return water that a cloud shows elsewhere than the given water surface.
+    """Return water that a cloud shows elsewhere than the given water surface, and its tilt if any.
 
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Apparent points, metres, world frame.
-    water_m : array, shape (n,)
-        Height of the given water surface above each.
-    rgb : array, shape (n, 3), or None
-
-    Returns
-    -------
-    level : WaterProposal or None
-        With heights above the given surface; None if the cloud shows it there, or nothing. The full
-        search of `find_water` runs only if another height gains most.
-    tilted : Tilted or None
+    `water_m`, shape (n,), is the height of the given surface above each point. The heights found
+    are above it; None if the cloud shows the water there, or nothing. The full search of
+    `find_water` runs only if another height gains most.
     """
     samples = sample_cloud(np.column_stack([xyz[:, :2], xyz[:, 2] - water_m]), rgb)
     found, tilted = None, None
@@ -130,11 +126,11 @@ def find_elsewhere(
 
 LARGEST_TILT, USUAL_TILT = 0.006, 0.002
 TILT_STEP_M, MOST_TILT_STEPS = 0.15, 9
-TILT_SIGMAS, TILT_GAIN = 3.0, 6.0
+TILT_GAIN = 6.0
 COARSE_M, FINE_M, MOST_HEIGHTS = 0.04, 0.01, 800
 FINE_REACH_M, SAME_PLACE_M = 0.6, 0.3
 WATERLINE_M = 0.05
-DRAWS, TILT_DRAWS, TILT_REACH = 120, 40, 6
+DRAWS = 120
 NO_TILT = np.zeros(2)
 
 
@@ -184,7 +180,7 @@ def _scan_at(samples: Samples, heights_m: FloatArray, tilt: FloatArray) -> Scan:
         for cue in ((SLOPE, RED, BLUE) if len(samples.colour) else (SLOPE,))
     )
     known = [sums for sums in light if sums is not None]
-    stronger = sorted(known, key=lambda sums: -float(gain_of(sums).gain.max()))[:1]
+    stronger = sorted(known, key=lambda sums: -float(gain_of(sums)[0].max()))[:1]
     return Scan([*([slope] if slope else []), *stronger], samples, heights_m, tilt)
 
 
@@ -199,7 +195,7 @@ def _gains(scan: Scan, tilt: FloatArray, rng: np.random.Generator | None = None)
         count, times = len(sums.sums), None
         if rng is not None:
             times = np.bincount(rng.integers(0, count, count), minlength=count).astype(float)
-        total += np.maximum(gain_of(sums.shifted(tilt) if tilt.any() else sums, times).gain, 0.0)
+        total += np.maximum(gain_of(sums.shifted(tilt) if tilt.any() else sums, times)[0], 0.0)
     return total
 
 
@@ -231,7 +227,7 @@ def _refine(samples: Samples, start: Peak, step: FloatArray) -> tuple[Peak, Scan
 
 
 def _choose(coarse: Scan) -> tuple[Peak, Scan]:
-    """Return the level, or the plane if its tilt is significant and gains enough, and its sums.
+    """Return the level, or the plane if its tilt gains enough, and its sums.
 
     Standing water is level, and flowing water is level across: it may only fall along the line of
     the shore.
@@ -240,8 +236,7 @@ def _choose(coarse: Scan) -> tuple[Peak, Scan]:
     start = _best(coarse, NO_TILT[None])
     level, near = _refine(samples, start, NO_TILT)
     shore = samples.xyz[level.shore(samples), :2]
-    if len(shore) < 3:
-        shore = samples.xyz[:, :2]
+    shore = shore if len(shore) > 2 else samples.xyz[:, :2]
     axis = np.linalg.svd(shore - shore.mean(axis=0), full_matrices=False)[2][0]
     extent = float(np.ptp(samples.xyz[:, :2], axis=0).max())
     step = max(TILT_STEP_M / extent, LARGEST_TILT / MOST_TILT_STEPS)
@@ -249,42 +244,23 @@ def _choose(coarse: Scan) -> tuple[Peak, Scan]:
     if tilted.score > start.score:
         plane, near_plane = _refine(samples, tilted, step * axis)
         along = abs(float(plane.tilt @ axis))
-        gains = plane.score > level.score + TILT_GAIN and along <= LARGEST_TILT
-        if gains and along > TILT_SIGMAS * _sigma_tilt(near_plane, axis, step):
+        if plane.score > level.score + TILT_GAIN and step / 2.0 < along <= LARGEST_TILT:
             return plane, near_plane
     return level, near
-
-
-def _around(near: Scan) -> tuple[FloatArray, BoolArray]:
-    """Return heights relative to the surface found, and which of them are at the same place."""
-    heights = near.heights_m - near.heights_m[len(near.heights_m) // 2]
-    return heights, np.asarray(np.abs(heights) <= SAME_PLACE_M)
 
 
 def _sigma_level(near: Scan) -> float:
     """Return the standard error of the level by bootstrap, with the tilt found."""
     rng = np.random.default_rng(0)
-    heights, same = _around(near)
+    heights = near.heights_m - near.heights_m[len(near.heights_m) // 2]
+    same = np.abs(heights) <= SAME_PLACE_M
     draws = [_gains(near, NO_TILT, rng)[same] for _ in range(DRAWS)]
     levels = np.array([heights[same][int(np.argmax(draw))] for draw in draws])
     return math.hypot(float(np.sqrt(np.mean(levels**2))), LEAST_SIGMA_M)
 
 
-def _sigma_tilt(near: Scan, axis: FloatArray, step: float) -> float:
-    """Return the standard error of the tilt along an axis by bootstrap."""
-    same, tilts = _around(near)[1], _tilts_along(step / 2.0 * axis, TILT_REACH)
-    tops = [  # with the same sample for all tilts
-        [_gains(near, tilt, np.random.default_rng(seed))[same].max() for tilt in tilts]
-        for seed in range(TILT_DRAWS)
-    ]
-    drawn = tilts[np.argmax(tops, axis=1)] @ axis
-    # the median absolute deviation, and the rounding to steps of tilt
-    return math.hypot(1.4826 * float(np.median(np.abs(drawn))), step / 6.0)
-
-
 LEAST_AGREED, LEAST_EACH = 12.0, 3.0
-LIFTS = 0.15, 0.75
-"""Range of the change of slope by refraction, about 0.36, on rough ground."""
+LIFTS = 0.15, 0.75  # range of the change of slope by refraction, about 0.36, on rough ground
 LEAST_SINGLE, LEAST_COLOUR_SINGLE = 25.0, 40.0
 """Physics gives the size of the change of slope; colours may change with height on land too."""
 MOST_RIVAL_AGREED, MOST_RIVAL_SINGLE = 0.75, 0.5
@@ -328,7 +304,7 @@ def _judged(coarse: Scan) -> WaterProposal:
         lift = evidence["slope amplitude"]
     shore = samples.xyz[peak.shore(samples)]
     reason = ""
-    if not LEAST_SHARE <= wet <= 1.0 - LEAST_SHARE:
+    if not LEAST_SHARE <= wet <= 1.0 - LEAST_SHARE or len(shore) == 0:
         reason, why = "no_shoreline", "nearly all of the cloud is on one side of it"
     elif not LIFTS[0] <= lift <= LIFTS[1]:  # a break that refraction does not make
         reason = "bank"
@@ -340,8 +316,6 @@ def _judged(coarse: Scan) -> WaterProposal:
         why = f"its evidence is {total:.0f}, and {rival_m:.2f} m has {rival:.0f}, nearly as much"
     elif sigma_m > MOST_SIGMA_M:
         reason, why = "inconsistent", f"parts of the cloud differ by {sigma_m:.2f} m"
-    elif len(shore) == 0:
-        reason, why = "no_shoreline", "no ground crosses it"
     if reason:
         height = peak.level_m + float(samples.xyz[:, :2].mean(axis=0) @ peak.tilt + origin[2])
         raise GeometryError(
@@ -365,7 +339,7 @@ def _judged(coarse: Scan) -> WaterProposal:
         evidence=evidence,
         reasons=tuple(sentences),
         curve_height_m=coarse.heights_m + rise,
-        curves={sums.cue.name: gain_of(sums.shifted(peak.tilt)).gain for sums in coarse.cues},
+        curves={sums.cue.name: gain_of(sums.shifted(peak.tilt))[0] for sums in coarse.cues},
         ground=samples.xyz + origin,
     )
 
@@ -410,3 +384,249 @@ def _find_tilt(coarse: Scan) -> Tilted | None:
     if len(heights) < 2 or np.ptp(heights) < LEAST_APART_M:
         return None
     return Tilted(wind, float(np.hypot(*peak.tilt)), float(heights.min()), float(heights.max()))
+
+
+LEAST_SIDE = 8.0  # least sum of weights of the cells of a tile above a height, and below
+_TINY = 1e-12
+_STEADY_M = 0.3
+
+
+LIFT = 0.36  # n - 1 and a little more for oblique rays: the apparent reduction of slopes
+MOST_FADING = 1.2
+"""Per metre. Clear water has about 0.3, twice the difference in attenuation over the gamma of
+images; faster changes, except in the darkest water, are of the ground: plants, or a wet edge. They
+count less, and not at all from twice as much."""
+
+
+class Cue(NamedTuple):
+    """A property of the ground, and its break at the waterline."""
+
+    name: str
+    meaning: str
+    colour: int | None  # column of the colours, whose ratio to green it is; None for the slope
+    tile_cells: float  # side of a tile
+    window_m: float  # observations weigh less towards this distance above and below
+    scale_m: float = math.inf  # D; infinite for a straight line below
+    amplitude: float | None = None  # given by physics, or negative and free
+
+
+SLOPE = Cue("slope", "the ground looks flatter below", None, 12.0, 0.6, amplitude=LIFT)
+RED = Cue("red/green", "red fades against green below", 0, 24.0, 0.8, scale_m=0.7)
+BLUE = RED._replace(name="blue/green", meaning="blue fades against green below", colour=2)
+
+
+class Moments(NamedTuple):
+    """Sums of t tiles at h heights."""
+
+    # (t, h, 6): yy, yx, yf, xx, xf, ff without the smooth part of y, x (height) and f; each tile
+    # in units of its own residual variance
+    sums: FloatArray
+    number: FloatArray  # (t, h), observations
+    xy: FloatArray  # (t, 2), centre of each tile
+    heights_m: FloatArray  # (h,), evenly spaced
+    cue: Cue
+
+    def shifted(self, tilt: FloatArray) -> Moments:
+        """Return the sums at the heights `heights_m` + tilt . xy of each tile."""
+        step = self.heights_m[1] - self.heights_m[0]
+        offset = np.rint(self.xy @ tilt / step).astype(np.int64)
+        column = np.arange(len(self.heights_m)) + offset[:, None]
+        inside = (column >= 0) & (column < len(self.heights_m))
+        rows = np.arange(len(self.sums))[:, None]
+        column = np.clip(column, 0, len(self.heights_m) - 1)
+        sums = self.sums[rows, column] * inside[..., None]
+        return self._replace(sums=sums, number=self.number[rows, column] * inside)
+
+
+def gain_of(
+    moments: Moments, times: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Add the tiles, each `times` times, and return what a break gains at h heights.
+
+    The gain, shape (h,), is a log likelihood ratio, reduced by the differences between tiles. Its
+    amplitude follows, shape (h,), and the standard error of that from these differences.
+    """
+    times = np.ones(len(moments.sums)) if times is None else times
+    sums, count = moments.sums * times[:, None, None], moments.number * times[:, None]
+    yy, yx, yf, xx, xf, ff = np.moveaxis(sums.sum(axis=0), -1, 0)
+    slope, share = yx / (xx + _TINY), xf / (xx + _TINY)
+    sse = np.maximum(yy - slope * yx, 0.0) + _TINY
+    cross, own = yf - share * yx, np.maximum(ff - share * xf, _TINY)
+    amplitude = cross / own
+    cue = moments.cue
+    if cue.amplitude is None:
+        steady = np.clip(2.0 - 2.0 * np.abs(slope / (amplitude + _TINY) - share), 0.0, 1.0)
+        likely = np.clip(2.0 - np.abs(amplitude) / MOST_FADING, 0.0, 1.0)
+        saved = np.minimum(cross, 0.0) ** 2 / own * steady * likely
+    else:
+        saved = 2.0 * cue.amplitude * cross - cue.amplitude**2 * own
+    left = np.maximum(sse - saved, 1e-3 * sse)
+    n = count.sum(axis=0)
+    variance = np.maximum(sse - cross**2 / own, 1e-3 * sse) / np.maximum(n, 1.0)
+    trend = slope - amplitude * share
+    scores = (
+        sums[..., 2] - trend * sums[..., 4] - amplitude * sums[..., 5]
+        - share * (sums[..., 1] - trend * sums[..., 3] - amplitude * sums[..., 4])
+    )  # fmt: skip
+    scatter = (scores**2 / np.maximum(times, 1.0)[:, None]).sum(axis=0)
+    held = np.maximum(variance * own, scatter)
+    sigma = np.sqrt(held) / own
+    temper = variance * own / (held + _TINY)
+    width = max(1, round(_STEADY_M / (moments.heights_m[1] - moments.heights_m[0])))
+    around = np.pad(temper, (width // 2, (width - 1) // 2), "symmetric")
+    steady = np.convolve(around, np.full(width, 1.0 / width), "valid")
+    gain = 0.5 * n * np.log(sse / left) * steady
+    return np.where(own > 1e3 * _TINY, gain, 0.0), amplitude, sigma
+
+
+def tile_moments(
+    smooth: FloatArray, y: FloatArray, at_m: FloatArray, heights_m: FloatArray, cue: Cue
+) -> tuple[FloatArray, FloatArray]:
+    """Return the sums of one tile, shapes (h, 6) and (h,); zero at heights outside it.
+
+    The observations y, shape (n,), have the heights `at_m`; `smooth`, shape (n, p), has the columns
+    of the smooth part. A colour may also change with height in the same way above and below.
+    """
+    reached = np.arange(*np.searchsorted(heights_m, [at_m.min(), at_m.max()]))
+    depth = heights_m[reached, None] - at_m
+    weight = np.maximum(1.0 - (depth / cue.window_m) ** 2, 0.0) ** 2
+    total = weight.sum(axis=1)
+    below = (weight * (depth > 0.0)).sum(axis=1)
+    enough = np.minimum(below, total - below) >= LEAST_SIDE
+    sums, count = np.zeros((len(heights_m), 6)), np.zeros(len(heights_m))
+    if not enough.any():
+        return sums, count
+    rows, weight, p = reached[enough], weight[enough], smooth.shape[1]
+    below = np.maximum(depth[enough], 0.0)
+    f = below if np.isinf(cue.scale_m) else -cue.scale_m * np.expm1(-below / cue.scale_m)
+    x = (at_m - at_m.mean()) * float(cue.colour is not None)
+    # the products of all columns, f last, at each height
+    fixed = np.column_stack([smooth, y, x])
+    products = (fixed[:, :, None] * fixed[:, None, :]).reshape(len(y), -1)
+    normal = np.zeros((len(rows), p + 3, p + 3))
+    normal[:, :-1, :-1] = (weight @ products).reshape(-1, p + 2, p + 2)
+    normal[:, -1, :-1] = normal[:, :-1, -1] = (weight * f) @ fixed
+    normal[:, -1, -1] = (weight * f * f).sum(axis=1)
+    # without the smooth part: its normal equations are eliminated
+    inner, right = normal[:, :p, :p], normal[:, :p, p:]
+    ridge = 1e-9 * np.trace(inner, axis1=1, axis2=2)[:, None, None] * np.eye(p)
+    rest = normal[:, p:, p:] - np.swapaxes(right, 1, 2) @ np.linalg.solve(inner + ridge, right)
+    sums[rows] = rest[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    count[rows] = np.maximum(total[enough] ** 2 / (weight**2).sum(axis=1) - p, 1.0)
+    return sums, count
+
+
+LEAST_TILE_CELLS, LEAST_TILE_RELIEF_M = 40, 0.1
+
+
+def cue_moments(
+    samples: Samples, cue: Cue, heights_m: FloatArray, tilt: FloatArray
+) -> Moments | None:
+    """Return the sums of a cue over the tiles that show anything; None without any.
+
+    Heights, shape (h,), are evenly spaced above the plane of that tilt through the samples' origin.
+    """
+    xy, fall = samples.xyz[:, :2], samples.xyz[:, :2] @ tilt
+    tile = square_tiles(xy, cue.tile_cells * samples.cell_m)
+    order = np.argsort(tile, kind="stable")
+    found = []
+    for rows in np.split(order, np.flatnonzero(np.diff(tile[order])) + 1):
+        if len(rows) < LEAST_TILE_CELLS:
+            continue
+        if cue.colour is not None:
+            smooth = np.ones((len(rows), 1))
+            y = samples.colour[rows, cue.colour] - samples.colour[rows, 1]
+            at = samples.smooth_m[rows] - fall[rows]
+        else:
+            place = xy[rows] - xy[rows].mean(axis=0)
+            u, v = (place / max(float(np.ptp(xy[rows])), 1e-9)).T
+            smooth = np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v])
+            y = samples.xyz[rows, 2] - fall[rows]
+            if y.min() > heights_m[-1] or y.max() < heights_m[0]:
+                continue
+            # the smooth ground passes the height of the break: with the heights themselves, noise
+            # would be on both sides of the equation and hide the break
+            at = smooth @ np.linalg.lstsq(smooth, y, rcond=None)[0]
+            if np.ptp(at) < LEAST_TILE_RELIEF_M:
+                continue
+        tile_sums, tile_count = tile_moments(smooth, y, at, heights_m, cue)
+        if tile_count.any():
+            found.append((tile_sums, tile_count, xy[rows].mean(axis=0)))
+    if not found:
+        return None
+    sums, count, middle = map(np.array, zip(*found, strict=True))
+    variance = sums[..., 0].sum(axis=1) / count.sum(axis=1)
+    sums /= np.maximum(variance, 0.3 * np.median(variance) + _TINY)[:, None, None]
+    return Moments(sums, count, middle, heights_m, cue)
+
+
+MOST_CELLS = 100_000
+POINTS_PER_CELL = 4.0
+NEIGHBOURS = 8
+_TRIES = 4
+
+
+class Samples(NamedTuple):
+    """One row per cell that holds points; m of them."""
+
+    xyz: FloatArray  # (m, 3), mean x and y, median z, metres from `origin`
+    smooth_m: FloatArray  # (m,), height at x, y of a plane through the cells around it
+    colour: FloatArray  # (m, 3), mean natural logarithms of red, green, blue; (0, 3) for none
+    cell_m: float  # side of a cell
+    origin: FloatArray  # (3,), world frame
+
+
+def sample_cloud(xyz: FloatArray, rgb: npt.NDArray[Any] | None) -> Samples:
+    """Thin a cloud, shape (n, 3), metres, world frame, to cells.
+
+    Colours, shape (n, 3), are in any unit from zero up; equal ones count as none.
+    """
+    origin = xyz.min(axis=0)
+    local = xyz - origin
+    cell_m = _cell_m(local)
+    cell = square_tiles(local, cell_m)
+    _, of_point, count = np.unique(cell, return_inverse=True, return_counts=True)
+    of_point = of_point.reshape(-1)
+    mean = [np.bincount(of_point, local[:, i]) / count for i in (0, 1)]
+    ordered = local[np.lexsort((local[:, 2], of_point)), 2]
+    first = np.cumsum(count) - count
+    median = (ordered[first + (count - 1) // 2] + ordered[first + count // 2]) / 2.0
+    ground = np.column_stack([*mean, median])
+    colour = np.empty((0, 3))
+    if rgb is not None and (rgb != rgb[:1]).any():
+        light = rgb.astype(np.float64)
+        white = max(float(np.percentile(light, 99.0)), 1e-9)
+        logs = np.log(light + 0.004 * white)  # a small part of white keeps black finite
+        colour = np.column_stack([np.bincount(of_point, column) / count for column in logs.T])
+    return Samples(ground, _smoothed(ground), colour, cell_m, origin)
+
+
+def _cell_m(local: FloatArray) -> float:
+    """Return the side of cells of about `POINTS_PER_CELL`, at most `MOST_CELLS` of them."""
+    wanted = min(len(local) / POINTS_PER_CELL, MOST_CELLS)
+    side = float(np.sqrt(max(np.prod(np.ptp(local[:, :2], axis=0)), 1e-6) / wanted))
+    for _ in range(_TRIES):  # clouds seldom fill their bounding box
+        held = len(np.unique(square_tiles(local, side)))
+        side *= np.sqrt(held / wanted)
+    return side
+
+
+def square_tiles(local: FloatArray, side_m: float) -> IntArray:
+    """Return the number of the square of each place, x and y from zero up."""
+    column, row = (local[:, :2] / side_m).astype(np.int64).T
+    return np.asarray(row * (column.max(initial=0) + 1) + column)
+
+
+def _smoothed(ground: FloatArray) -> FloatArray:
+    """Return the height, at each place, of the plane through its neighbours."""
+    from scipy.spatial import cKDTree  # slow to import
+
+    k = min(NEIGHBOURS, len(ground) - 1)
+    _, near = cKDTree(ground[:, :2]).query(ground[:, :2], k=k + 1)
+    around = ground[np.asarray(near)[:, 1:]] - ground[:, None]
+    design = np.concatenate([np.ones((*around.shape[:2], 1)), around[..., :2]], axis=2)
+    normal = np.einsum("mki,mkj->mij", design, design)
+    scale = np.trace(normal, axis1=1, axis2=2)[:, None, None]
+    right = np.einsum("mki,mk->mi", design, around[..., 2])
+    plane = np.linalg.solve(normal + 1e-9 * scale * np.eye(3), right[..., None])[..., 0]
+    return np.asarray(ground[:, 2] + plane[:, 0])

@@ -29,8 +29,6 @@ MOST_TILT = 0.05
 DOUBTFUL_M, TOO_DEEP_M, DEEP_SHARE = 30.0, 60.0, 0.05
 """In clear water photographs show a bed down to the first depth; the second was never reported.
 A smaller share of deep points may be mismatches."""
-FOOT_M = 0.3048
-CLEARLY_OFF_M = 10.0
 _ENOUGH_HEIGHTS = 200_000
 
 
@@ -169,7 +167,6 @@ class WaterMeeting(Sums):
     too_deep: int
     low_m: float = field(metadata=LEAST)
     high_m: float = field(metadata=MOST)
-    lowest_water_m: float = field(metadata=LEAST)
     most_depth_m: float = field(metadata=MOST)
 
     @classmethod
@@ -186,7 +183,6 @@ class WaterMeeting(Sums):
             too_deep=int((depth > TOO_DEEP_M).sum()),
             low_m=float(z.min(initial=np.inf)),
             high_m=float(z.max(initial=-np.inf)),
-            lowest_water_m=correction.lowest_water_m,
             most_depth_m=float(depth.max(initial=0.0)),
         )
 
@@ -231,17 +227,10 @@ class WaterMeeting(Sums):
         return [str(one) for one in found]
 
     def heights(self) -> str:
-        """Return the range of the cloud's heights, and whether cloud or water may be in feet."""
-        low, high, level = self.low_m, self.high_m, self.lowest_water_m
-        if not np.isfinite([low, high]).all():
+        """Return the range of the cloud's heights as text; empty without points."""
+        if not self.points:
             return ""
-        text = f"; the cloud's heights are {low:.2f} to {high:.2f} m"
-        if low - CLEARLY_OFF_M <= level <= high + CLEARLY_OFF_M or not np.isfinite(level):
-            return text
-        for factor, whose in ((FOOT_M, "the water is"), (1.0 / FOOT_M, "the cloud's heights are")):
-            if low <= level * factor <= high:
-                return f"{text}, and the water would be within them if {whose} in feet"
-        return text
+        return f"; the cloud's heights are {self.low_m:.2f} to {self.high_m:.2f} m"
 
 
 def _heights_of(water: WaterSurface) -> FloatArray:

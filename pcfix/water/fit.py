@@ -23,12 +23,10 @@ from pcfix.water.surface import FoundSurface
 
 Model = Literal["auto", "level", "plane", "along"]
 MAX_TILT_PERCENT = 5.0
-SIGNIFICANCE = 0.05
-"""A tilt is significant if chance gives it more rarely."""
+SIGNIFICANCE = 0.05  # a tilt is significant if chance gives it more rarely
 LINE_RATIO = 0.1
 """Points are on one line if their spread across it is less than this share of that along it."""
-LONG_RATIO = 1.0 / 3.0
-"""Points are along a river or a coast, level across, below this ratio."""
+LONG_RATIO = 1.0 / 3.0  # points are along a river or a coast, level across, below this ratio
 WIDE_SCATTER_M = 0.1
 _SAME_PLACE_M = 1e-3
 _FEWEST_FOR_PLANE = 3
@@ -108,22 +106,12 @@ def fit_water(
 ) -> WaterFit:
     """Fit the water surface to shoreline points, nearly half of which may be wrong.
 
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Metres, world frame; rows that are not finite are ignored.
-    model : {"auto", "level", "plane", "along"}
-        ``along`` is tilted in the direction of the points and level across it. ``auto`` is tilted
-        only if that is significant, and only along the points if these are nearly on one line, or
-        along a river without tilt across it.
-    counts : array, shape (n,), optional
-        Number of independent observations that each point is worth: 1 by default, less if
-        neighbours share their errors. Standard errors and tests of tilts use their sum.
-
-    Returns
-    -------
-    WaterFit
-        One row per input point; the order of the points does not matter.
+    Of the points, shape (n, 3), world frame, those that are not finite are ignored; their order
+    does not matter. ``along`` is tilted in the direction of the points and level across it;
+    ``auto`` is tilted only if that is significant, and only along the points if these are nearly on
+    one line, or along a river without tilt across it. `counts`, shape (n,), are how many
+    independent observations each point is worth: 1 by default, less if neighbours share their
+    errors. Standard errors and tests of tilts use their sum.
     """
     known = usable_rows(xyz)
     if len(known) == 0:
@@ -232,13 +220,7 @@ def _regression(shore: _Shore, model: Model) -> Regression:
     """Fit level and tilt about the centre of the points; zero for what the model does not have."""
     p, n, (along, across) = _UNKNOWNS[model], len(shore.xyz), shore.spread_m
     on_line = (p > 1 and along < _SAME_PLACE_M) or (p > 2 and across < _ON_LINE * along)
-    found = None
-    if n >= p and not on_line:
-        # in units of the spread, so that all columns are of similar size
-        units = (shore.axes[: p - 1] / shore.spread_m[: p - 1, None]).T
-        local = shore.xyz[:, :2] - shore.centre
-        found = robust_regression(np.column_stack([np.ones(n), local @ units]), shore.xyz[:, 2])
-    if found is None:
+    if n < p or on_line:
         raise GeometryError(
             "water.on_line" if n >= p else "water.too_few_points",
             f"The water model '{model}' needs at least {p} shoreline points with heights, not at"
@@ -246,6 +228,10 @@ def _regression(shore: _Shore, model: Model) -> Regression:
             f" {across:.2g} m across). Fit a level, or a tilt along them.",
             points=n, least=p,
         )  # fmt: skip
+    # in units of the spread, so that all columns are of similar size
+    units = (shore.axes[: p - 1] / shore.spread_m[: p - 1, None]).T
+    local = shore.xyz[:, :2] - shore.centre
+    found = robust_regression(np.column_stack([np.ones(n), local @ units]), shore.xyz[:, 2])
     to_world = np.zeros((3, p))
     to_world[0, 0], to_world[1:, 1:] = 1.0, units
     grown = shared(found.weight, shore.worth, p) * found.covariance
@@ -266,8 +252,7 @@ def _chance_of_tilt(shore: _Shore, fit: Regression, unknowns: int) -> float:
     return float(f.sf(tilt @ np.linalg.solve(covariance, tilt) / tilts, tilts, spare))
 
 
-TUKEY = 4.685061
-"""Tukey's constant for 95 % efficiency."""
+TUKEY = 4.685061  # Tukey's constant for 95 % efficiency
 LEAST_SCALE_M = 0.005
 """Least scatter of residuals for their weights: the edge of water is no sharper."""
 SUBSETS, SAMPLE = 3000, 400
@@ -291,15 +276,13 @@ class Regression(NamedTuple):
     weight: FloatArray  # (n,), 0 (rejected) to 1
 
 
-def robust_regression(X: FloatArray, z: FloatArray) -> Regression | None:
-    """Fit z = X beta; None if no p observations determine beta.
+def robust_regression(X: FloatArray, z: FloatArray) -> Regression:
+    """Fit z = X beta, which some p of the observations determine.
 
     The columns of X, shape (n, p), are of similar size; z, shape (n,), is in metres.
     """
     rows = np.unique(np.linspace(0, len(z) - 1, min(len(z), SAMPLE)).astype(np.int64))
     beta = _least_median(X[rows], z[rows])
-    if beta is None:
-        return None
     # a few observations are fitted too well (Rousseeuw & Leroy 1987, p. 202)
     few = 1.0 + 5.0 / max(len(z) - X.shape[1], 1)
     scale = few * TO_SIGMA * float(np.median(np.abs(z - X @ beta)))
@@ -335,8 +318,8 @@ def tukey_weight(u: FloatArray) -> FloatArray:
     return np.asarray(np.where(np.abs(u) < 1.0, (1.0 - u * u) ** 2, 0.0))
 
 
-def _least_median(X: FloatArray, z: FloatArray) -> FloatArray | None:
-    """Return the exact fit to p observations with the least median residual, if there is one."""
+def _least_median(X: FloatArray, z: FloatArray) -> FloatArray:
+    """Return the exact fit to p observations with the least median residual."""
     n, p = X.shape
     if math.comb(n, p) <= SUBSETS:
         rows = np.array(list(combinations(range(n), p)), np.int64).reshape(-1, p)
@@ -345,8 +328,6 @@ def _least_median(X: FloatArray, z: FloatArray) -> FloatArray | None:
         ordered = np.sort(drawn, axis=1)
         rows = ordered[(np.diff(ordered, axis=1) > 0).all(axis=1)][:SUBSETS]
     good = rows[np.abs(np.linalg.det(X[rows])) > 1e-9]
-    if not len(good):
-        return None
     fits = np.linalg.solve(X[good], z[good][..., None])[..., 0]
     middle = min((n + p) // 2, n - 1)
     median = np.partition(np.abs(z[:, None] - X @ fits.T), middle, axis=0)[middle]
@@ -374,8 +355,7 @@ def _spread(X: FloatArray, residual: FloatArray, limit: float) -> tuple[FloatArr
     return np.asarray(k**2 * (psi**2).sum() / spare / slope**2 * inverse), sigma
 
 
-NEIGHBOURS, FEWEST = 25, 3
-"""Points whose median is the height of a place, at most and at least."""
+NEIGHBOURS, FEWEST = 25, 3  # points whose median is the height of a place, at most and at least
 
 
 class NearestPoints:

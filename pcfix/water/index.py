@@ -16,8 +16,7 @@ Options = TypeVar("Options", bound=MethodOptions)
 SALINITY_PSU, TEMPERATURE_C, WAVELENGTH_UM = (0.0, 40.0), (0.0, 30.0), (0.4, 0.7)
 """Ranges of the formulas (fitted up to 35 PSU; natural seas have a little more)."""
 
-GREEN_UM = 0.53
-"""Peak of the green pixels, where cameras see most through water."""
+GREEN_UM = 0.53  # peak of the green pixels, where cameras see most through water
 
 
 class Water(NamedTuple):
@@ -140,18 +139,9 @@ def with_index(options: Options) -> Options:
 def index_of(given: float | str | None, formula: IndexFormula = "skarlatos") -> tuple[float, str]:
     """Return a refractive index and a description of its water, empty if only a number is given.
 
-    Parameters
-    ----------
-    given : float, str or None
-        A number, by default `DEFAULT_REFRACTIVE_INDEX`; ``fresh`` or ``sea``; or ``S,T`` or
-        ``S,T,W``: salinity in PSU, temperature in degrees Celsius and wavelength in micrometres.
-    formula : {"skarlatos", "quan-fry"}
-        See `refractive_index`.
-
-    Raises
-    ------
-    SettingError
-        ``option.index`` if it is none of these, ``option.range`` if a value is outside its range.
+    It is given as a number, by default `DEFAULT_REFRACTIVE_INDEX`; as ``fresh`` or ``sea``; or as
+    ``S,T`` or ``S,T,W``: salinity in PSU, temperature in degrees Celsius and wavelength in
+    micrometres. Raises SettingError ``option.index`` if it is none of these.
     """
     if given is None:
         return DEFAULT_REFRACTIVE_INDEX, ""

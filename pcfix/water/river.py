@@ -72,19 +72,11 @@ def fit_river(
 ) -> RiverFit:
     """Fit the water surface along a river to shoreline points, some of which may be wrong.
 
-    The height at a place is that of the nearest place on the axis, constant upstream of the first
-    point and downstream of the last.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Metres, world frame, of both banks or one; rows that are not finite are ignored.
-    bounds : tuple of 4 float
-        Least x, least y, greatest x, greatest y of the cloud, which the raster has to cover.
-    name : str
-        Name of the raster.
-    counts : array, shape (n,), optional
-        See `pcfix.water.fit.fit_water`.
+    The points, shape (n, 3), world frame, are of both banks or one; those that are not finite are
+    ignored. `bounds` are least x, least y, greatest x, greatest y of the cloud, which the raster of
+    that name covers; `counts` are as of `pcfix.water.fit.fit_water`. The height at a place is that
+    of the nearest place on the axis, constant upstream of the first point and downstream of the
+    last.
     """
     points = np.asarray(xyz, np.float64)
     known = usable_rows(points)
@@ -151,8 +143,7 @@ def _raster(axis: Axis, profile: Profile, bounds: Bounds, name: str) -> WaterRas
     return WaterRaster(height, left - cell / 2.0, y[0] + cell / 2.0, (cell, cell), name)
 
 
-REACH = 2.0
-"""Longest edge of the network, relative to the longest that keeps it connected."""
+REACH = 2.0  # longest edge of the network, relative to the longest that keeps it connected
 _ROUNDS, _NODES = 10, 300
 
 
@@ -235,8 +226,7 @@ def _smoothed(xy: FloatArray, station: FloatArray, bandwidth: float) -> FloatArr
 FOLDS = 5
 PENALTIES = tuple(10.0 ** np.arange(-4.0, 3.5, 0.5))
 MOST_NODES, NODES_A_POINT = 400, 2
-STIFF_PENALTY = 1e3
-"""Penalty on rises, and on bends near the ends."""
+STIFF_PENALTY = 1e3  # penalty on rises, and on bends near the ends
 END_POINTS = 7
 """The outermost points are on one straight piece, so that a single one cannot bend it."""
 RISES_IF_WORSE = 1.25

@@ -169,8 +169,7 @@ class OwnWater(NamedTuple):
 
 EDGE_TOLERANCE = 1e-9  # of a barycentric coordinate: a point on an edge belongs to both sides
 MIN_FACET_AREA_M2 = 1e-12  # in plan; below this a facet is vertical or a sliver, and has no height
-FARTHEST_M = 1e9
-"""No coordinate on Earth is as large."""
+FARTHEST_M = 1e9  # no coordinate on Earth is as large
 
 
 class Tin(NamedTuple):
@@ -294,8 +293,7 @@ def _set_heights(
         height[i], slope[i, 0], slope[i, 1] = surface_at(tin, field, x[i], y[i])
 
 
-APART_M = 0.01
-"""Overlapping facets are harmless if their heights differ by less."""
+APART_M = 0.01  # overlapping facets are harmless if their heights differ by less
 
 
 def in_two_sheets(tin: Tin) -> tuple[BoolArray, FloatArray]:

@@ -7,7 +7,7 @@ import pytest
 
 import pcfix
 from pcfix.errors import GeometryError, SettingError
-from pcfix.refract.stereo_factor import NODES, ratios, stereo_factor
+from pcfix.refract.literature import NODES, ratios, stereo_factor
 from tests.utils.codes import refused
 from tests.utils.twins import light_path
 
