@@ -17,7 +17,7 @@ from pyogrio import raw
 import pcfix
 from pcfix.io.cameras import read_tie_points
 from pcfix.io.cameras.colmap import FILE as FILE_OF_PLACE
-from pcfix.io.cameras.colmap import place_text
+from pcfix.io.cameras.colmap import place_text, write_colmap
 from pcfix.io.clouds import read_cloud
 from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.ground_control import read_ground_control
@@ -46,7 +46,7 @@ from tests.io.cameras import test_pix4d as pix4d
 from tests.io.cameras import test_realitycapture as realitycapture
 from tests.io.cameras import test_table as table
 from tests.io.cameras import test_unsupported as unsupported
-from tests.io.cameras import test_writing as writing
+from tests.io.cameras.test_writing import COLMAP_LENSES
 from tests.utils import opf_files
 from tests.utils.blocks import small_block
 from tests.utils.clouds import random_cloud, write_cloud
@@ -166,11 +166,12 @@ def opensfm_tracks(folder: Path) -> Path:
     return opensfm.write(folder, opensfm.scene(shots=shots, points=points))
 
 
-def lenses(form: str, kinds: dict[str, Lens]) -> Seed:
-    """Return what writes a camera of every kind in the form of COLMAP or OpenSfM."""
-    return lambda folder: writing.write(
-        form, folder, small_block(tuple(kinds.values()), k=len(kinds))
+def colmap_lenses(folder: Path) -> Path:
+    """Write a camera of every kind that COLMAP has."""
+    write_colmap(
+        folder / "lenses", small_block(tuple(COLMAP_LENSES.values()), k=len(COLMAP_LENSES))
     )
+    return folder / "lenses"
 
 
 def colmap_text(folder: Path) -> Path:
@@ -397,13 +398,11 @@ READERS: dict[str, Reader] = {
     "pix4d": block(params=pix4d_params),
     "opf": block(tracks=opf_tracks),
     "odm": block(project=odm_project, shots=odm_shots),
-    "opensfm": block(
-        tracks=opensfm_tracks, lenses=lenses("opensfm", writing.OPENSFM_LENSES)
-    ),
+    "opensfm": block(tracks=opensfm_tracks),
     "colmap text": block(model=colmap_text),
     "colmap binary": block(
         model=lambda folder: colmap.binary_folder(folder / "sparse"),
-        lenses=lenses("colmap", writing.COLMAP_LENSES),
+        lenses=colmap_lenses,
     ),
     "micmac": block(
         one=text("Orientation-a.jpg.xml", micmac.embedded(micmac.RADIAL)), two=micmac.version_2
