@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 import pcfix
 from pcfix.compare.match import spacing_m
-from pcfix.compare.statistics import distances_of
+from pcfix.compare.statistics import distribution_of
 from pcfix.flow.compare import compare_clouds
 from pcfix.report.comparison import comparison_text, evaluation, gauss
 from tests.compare.test_files import LIDAR, SCENE, lifted, plane, write_las
@@ -124,13 +124,13 @@ def test_submerged(corrected):
 def test_classes_of_cloudcompare(count, classes):
     """1136 are those of Figure 18 of Skarlatos & Agrafiotis 2018, with so many points of LiDAR."""
     values = np.abs(np.random.default_rng(40).normal(0.5, 0.3, count))
-    found = distances_of(values, None, [])
+    found = distribution_of(values)
     assert len(found.histogram.counts) == classes
     assert sum(found.histogram.counts) == count
     assert found.histogram.edges_m[-1] >= found.statistics.max_m
-    assert len(distances_of(values, 20, []).histogram.counts) == 20
+    assert len(distribution_of(values, 20).histogram.counts) == 20
     touching = [(0.0, 0.5), (0.5, 1.0), (1.0, 3.0)]
-    shares = distances_of(np.array([0.0, 0.5, 0.5, 1.0, 2.0]), None, touching).shares
+    shares = distribution_of(np.array([0.0, 0.5, 0.5, 1.0, 2.0]), None, touching).shares
     assert [one.share for one in shares] == [0.2, 0.4, 0.4]
 
 
@@ -141,7 +141,7 @@ def test_gauss_as_in_cloudcompare(both):
     plain["c2c"]["after"]["histogram"]["counts"] = [1] * 1136
     said = "Gauss: mean = 2.234814 / std.dev. = 1.441840 [1136 classes]"  # of Figure 18a
     assert gauss(json.loads(json.dumps(plain))["c2c"]["after"]) == said
-    of = distances_of(values, None, []).statistics
+    of = distribution_of(values).statistics
     assert (of.mean_m, of.sd_m) == (2.0, 1.0)  # divided by n, as CloudCompare does
     text, before = comparison_text(both), both.c2c.before.statistics
     share = both.also[0].c2c_from_reference.shares[0].share
