@@ -42,7 +42,7 @@ def _pairs(xyz: np.ndarray, axes: int) -> np.ndarray:
 
 def _statistics(xyz: np.ndarray, points: int) -> np.ndarray:
     """Mean distance in space, lower and upper quartile of heights, of every point."""
-    cut = make_tiles(xyz, points=points)
+    cut = make_tiles(xyz, points)
     near, plan, out = Neighbours(cut, 3), Neighbours(cut, 2), np.empty((len(xyz), 3))
     for piece in cut.pieces(100):
         some = cut.xyz[piece]
@@ -70,14 +70,13 @@ def test_statistics_of_all_pairs(make) -> None:
 
 def test_tiles_hold_every_point(monkeypatch: pytest.MonkeyPatch) -> None:
     xyz = _clustered()
-    used = np.random.default_rng(1).random(len(xyz)) < 0.7
-    cut = make_tiles(xyz, used, 10)
+    cut = make_tiles(xyz, 10)
     assert len(cut) > 20
-    assert np.array_equal(np.sort(cut.row), np.flatnonzero(used))
+    assert np.array_equal(np.sort(cut.row), np.arange(len(xyz)))
     assert np.array_equal(cut.xyz, xyz[cut.row])
     assert (np.diff(cut.start) > 0).all()
     monkeypatch.setattr("pcfix.blocks.ROWS", 77)
-    assert np.array_equal(make_tiles(xyz, used, 10).row, cut.row)
+    assert np.array_equal(make_tiles(xyz, 10).row, cut.row)
 
 
 @pytest.mark.parametrize("points", mostly_nightly([100, 1000, 5000], 100))
