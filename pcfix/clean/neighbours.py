@@ -1,10 +1,10 @@
-"""Nearest neighbours of points, in memory that does not grow with the cloud.
+"""Nearest neighbours of points, by one tree of scipy over points in the order of small cells.
 
-The cloud is cut into square tiles of the plan. The neighbours of a point are searched in its own
-tile, then in every other tile whose bounding box is nearer than the farthest neighbour so far. So
-the result is that of one tree over the whole cloud, and an outlier far from everything costs a few
-queries. For 5 million points this takes a third of the time of scipy's cKDTree on unsorted points,
-and its memory does not grow.
+The cloud is sorted into square tiles of the plan, and each of these by cells. A tree over points in
+this order is built and searched in less than half the time (5 million points against 5 million, two
+threads: 7 s of processor time instead of 16), because each point finds in the processor's cache
+what its predecessor needed. A tree needs about 16 bytes of memory per point; the points themselves
+may be on disk.
 """
 
 from __future__ import annotations
@@ -12,9 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,16 +20,11 @@ from pcfix.blocks import bounds, empty, grouped, mapped, release, row_numbers
 from pcfix.model import FloatArray, IntArray
 from pcfix.running import current
 
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
-
 PIECE_ROWS = 65_536
-MOST_IN_A_TREE = 2_000_000
-"""Points of a cloud that is not cut into tiles to search the nearest of them."""
+LEAF_POINTS = 32
 SLACK = 1.0 + 1e-9
 """Distances whose ratio is smaller than this count as equal: more than rounding, less than any step
 of a LAS file at the distance of neighbours."""
-_TREES = 16
 _SPARE_COLUMNS, _MOST_COLUMNS = 8, 1024
 _ENTRIES = 4_000_000
 
@@ -40,17 +33,12 @@ class Neighbours:
     """Search neighbours among the points of tiles, in space (3 axes) or in plan (2 axes)."""
 
     def __init__(self, tiles: Tiles, axes: int) -> None:
-        self.tiles, self.axes = tiles, axes
-        self._low, self._high = tiles.low[:, :axes], tiles.high[:, :axes]
+        from scipy.spatial import cKDTree  # slow to import
 
-        @lru_cache(maxsize=_TREES)
-        def tree(tile: int) -> cKDTree:
-            from scipy.spatial import cKDTree  # slow to import
-
-            first, last = tiles.start[tile : tile + 2]
-            return cKDTree(np.array(tiles.xyz[first:last, :axes]), balanced_tree=False)
-
-        self._tree = tree
+        self.tiles, self.axes, points = tiles, axes, tiles.xyz
+        if points.shape[1] != axes:
+            points = mapped(lambda some: np.ascontiguousarray(some[:, :axes]), points)
+        self._tree = cKDTree(points, LEAF_POINTS, balanced_tree=False)
 
     def nearest(self, xyz: FloatArray, k: int) -> tuple[FloatArray, IntArray]:
         """Return the k nearest points of the tiles, which hold at least k.
@@ -60,42 +48,9 @@ class Neighbours:
         equally far points is not defined, nor which of them are returned if the last ones are
         equally far.
         """
-        points = np.ascontiguousarray(xyz[:, : self.axes])
-        distance = np.full((len(points), k), np.inf)
-        place = np.zeros((len(points), k), np.int64)
-        low, high = bounds(points)
-        gaps = _gap(low, high, self._low, self._high)
-        middle = (low + high - self._low - self._high) / 2.0
-        for tile in np.lexsort((np.hypot(*middle[:, :2].T), gaps)):
-            rows = np.flatnonzero(distance[:, -1] * SLACK >= gaps[tile])
-            if not rows.size:
-                break
-            some = points[rows]
-            gap = _gap(some, some, self._low[tile], self._high[tile])
-            rows = rows[distance[rows, -1] * SLACK >= gap]
-            if rows.size:
-                self._add(int(tile), points, rows, distance, place)
-        return distance, place
-
-    def _add(
-        self, tile: int, points: FloatArray, rows: IntArray, distance: FloatArray, place: IntArray
-    ) -> None:
-        """Merge the neighbours in one tile into those of the given rows."""
-        tree, k = self._tree(tile), distance.shape[1]
-        found = tree.query(
-            points[rows],
-            k=list(range(1, min(k, tree.n) + 1)),
-            distance_upper_bound=float(distance[rows, -1].max()) * SLACK,
-            workers=current().threads,
-        )
-        new, places = np.asarray(found[0]), np.asarray(found[1]) + self.tiles.start[tile]
-        if np.isinf(distance[rows, 0]).all():  # nothing to merge with
-            distance[rows, : new.shape[1]], place[rows, : new.shape[1]] = new, places
-            return
-        both, places = np.hstack([distance[rows], new]), np.hstack([place[rows], places])
-        order = np.argsort(both, axis=1, kind="stable")[:, :k]
-        distance[rows] = np.take_along_axis(both, order, axis=1)
-        place[rows] = np.take_along_axis(places, order, axis=1)
+        columns = list(range(1, k + 1))
+        found = self._tree.query(xyz[:, : self.axes], columns, workers=current().threads)
+        return np.asarray(found[0]), np.asarray(found[1])
 
     def with_ties(
         self, xyz: FloatArray, k: int, spare: int
@@ -141,8 +96,7 @@ def nearest_distance(places: FloatArray, points: FloatArray, axes: int = 2) -> F
     the two clouds sample a surface at different places it is at least about half the spacing of the
     points.
     """
-    few = len(points) <= MOST_IN_A_TREE
-    near = Neighbours(make_tiles(points, points=len(points) if few else None), axes)
+    near = Neighbours(make_tiles(points), axes)
     asked, distance = make_tiles(places), empty((len(places),))
     for piece in asked.pieces(PIECE_ROWS):
         distance[asked.row[piece]] = near.nearest(asked.xyz[piece], 1)[0][:, 0]
@@ -169,14 +123,6 @@ def height_quartiles(near: Neighbours, xyz: FloatArray, k: int) -> FloatArray:
         )
         quartiles[rows] = a + (position - left) * (b - a)
     return quartiles
-
-
-def _gap(
-    low: FloatArray, high: FloatArray, other_low: FloatArray, other_high: FloatArray
-) -> FloatArray:
-    """Return the distance between boxes, zero if they touch; the last axis is x, y(, z)."""
-    apart = np.maximum(np.maximum(other_low - high, low - other_high), 0.0)
-    return np.asarray(np.sqrt((apart * apart).sum(axis=-1)))
 
 
 POINTS_PER_TILE = 250_000
@@ -222,9 +168,7 @@ def make_tiles(xyz: FloatArray, points: int | None = None) -> Tiles:
 
     The tiles cover all but the outermost hundredth of the points, so that no outlier stretches
     them; points beyond belong to the tile at the edge. Points have the shape (n, 3), or (n, 2) in
-    plan, metres, world frame. The points of a tile are sorted by small cells, as a tree is queried
-    twice as fast in this order: each point finds in the processor's cache what its predecessor
-    needed.
+    plan, metres, world frame. The points of a tile are sorted by small cells.
     """
     sample = xyz[:: max(1, len(xyz) // _SAMPLE), :2]
     origin, high = np.percentile(sample, (1.0, 99.0), axis=0)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.blocks import bounds, empty, kept, mapped, release
+from pcfix.blocks import bounds, empty, release
 from pcfix.clean.neighbours import Tiles as PointTiles
 from pcfix.clean.neighbours import make_tiles
 from pcfix.errors import PcfixWarning, SettingError, bad_file
@@ -59,9 +59,6 @@ DIMENSIONS = {"depth": "WaterDepth", "uncertainty": SIGMA_Z}
 """Dimensions of these quantities; any other quantity is the dimension of its name."""
 POINTS_A_SQUARE, MOST_SQUARES = 6.0, 4_000_000
 """Points of a square, if these fill the area, and squares to measure the spacing of points."""
-SPARSE = 20.0
-"""Cells per point; if there are more, some points may lie far from all others."""
-BULK_SAMPLE, BEYOND_BULK = 1_000_000, 1e-3
 
 
 def grid_dsm(
@@ -136,11 +133,10 @@ def grid_dsm(
         with open_cloud(task.source) as source:
             crs, count = metric_crs(source), len(source)
             corrected = any(is_ours(vlr) for vlr in source.vlrs)
-            read = _points_of(source, rules, report)
+            used = _points_of(source, rules, report)
             if given.resolution is None:
-                cell_m = round_resolution(_spacing_m(source, read), 0.0)
+                cell_m = round_resolution(_spacing_m(source, used), 0.0)
                 rules = replace(rules, resolution=cell_m)
-            used = _without_stray(source, read, rules.cell_m)
             apart_m = _spacing_m(source, used, rules.cell_m)
         lattice = lattice_over(*bounds(used[:, :2]), rules.cell_m, str(task.source))
         if (density := (rules.cell_m / apart_m) ** 2 if apart_m else np.inf) < FEWEST_A_CELL:
@@ -188,7 +184,6 @@ def grid_dsm(
         seconds=task.seconds,
         resolution_is="given" if given.resolution else "chosen",
         part=part_report(task.source),
-        stray=len(read) - len(used),  # points ignored because they lie far from all others
     )
     write_summary(given, result.as_dict())
     return result
@@ -277,7 +272,10 @@ def point_spacing_m(cloud: CloudFiles, near: Path) -> float:
 def _spacing_m(source: LasSource, xyz: FloatArray, finest_m: float = MIN_RESOLUTION_M) -> float:
     """Return the spacing of points of a cloud by squares of at least a size; see `spacing_m`."""
     share = max(POINTS_A_SQUARE / len(source), 1.0 / MOST_SQUARES)
-    return spacing_m(xyz, max(np.sqrt(share * _stated_area(source, finest_m)), finest_m))
+    # as the header states it, which need not be right
+    area = float(np.prod(source.header.maxs[:2] - source.header.mins[:2]))
+    side = np.sqrt(share * area) if np.isfinite(area) and area > 0.0 else 0.0
+    return spacing_m(xyz, max(float(side), finest_m))
 
 
 def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], None]) -> FloatArray:
@@ -311,30 +309,6 @@ def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], Non
     return result[:count]
 
 
-def _without_stray(source: LasSource, xyz: FloatArray, resolution_m: float) -> FloatArray:
-    """Return the points without those far from all others, where the extent is too large for all.
-
-    The box of all but a thousandth of the points on each side grows by its own size, so that a
-    cloud of two places is inside it.
-    """
-    if _stated_area(source, resolution_m) <= SPARSE * len(source) * resolution_m**2:
-        return xyz
-    some = xyz[:: 1 + len(xyz) // BULK_SAMPLE, :2]
-    low, high = np.quantile(some, (BEYOND_BULK, 1.0 - BEYOND_BULK), axis=0)
-    size = np.maximum(high - low, resolution_m)
-    low, high = low - size, high + size
-    inside = mapped(lambda p: ((p[:, :2] >= low) & (p[:, :2] <= high)).all(axis=1), xyz)
-    if not inside.all():
-        stray = int((~inside).sum())
-        place = ", ".join(f"{value:,.2f}" for value in xyz[np.argmin(inside)])
-        sentence = (
-            f"{source.path}: {stray:,} points far from all others are not gridded, the first at"
-            f" {place}. Remove them, or grid their part of the cloud separately."
-        )
-        warnings.warn(PcfixWarning("dsm.stray", sentence, points=stray), stacklevel=3)
-    return kept(inside, xyz)
-
-
 def _dimension_of(source: LasSource, what: str) -> str | None:
     """Return the dimension whose values are gridded, None for heights."""
     name = None if what == "height" else DIMENSIONS.get(what, what)
@@ -350,9 +324,3 @@ def _dimension_of(source: LasSource, what: str) -> str | None:
     known = ", ".join(("height", *DIMENSIONS, *names))
     sentence = f"{source.path}: has no dimension {what}. --what is one of {known}."
     raise SettingError("option.choice", sentence, option="what", value=what)
-
-
-def _stated_area(source: LasSource, resolution_m: float) -> float:
-    """Return the area of a cloud as its header states it, which need not be right, m2."""
-    area = float(np.prod(source.header.maxs[:2] - source.header.mins[:2]))
-    return max(area, resolution_m**2) if np.isfinite(area) else resolution_m**2

@@ -161,7 +161,8 @@ def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float, name: s
         columns, rows = size(resolution_m)
         sentence = (
             f"{name}: a resolution of {resolution_m:g} m makes {columns:,.0f} x {rows:,.0f} cells,"
-            f" more than {MAX_CELLS:,}. Use {finest:g} m or more."
+            f" more than {MAX_CELLS:,}. Use {finest:g} m or more, or first remove points that are"
+            " far from all others (pcfix clean)."
         )
         raise SettingError("option.resolution", sentence, value=resolution_m, finest=finest)
     (west, south), (east, north) = cells_of(np.array([low, high]), resolution_m).tolist()
