@@ -96,44 +96,38 @@ def raw_of(compared: Plain) -> Plain:
 # Words
 
 
-_COMPARED: RowTable = (
-    ("Compared", "{compared:,} {what} ({compared_share})", "cloud"),
-    ("", "{cloud_left_out:,} ignored: withheld or noise", "cloud_left_out"),
-    ("", "{not_submerged:,} ignored: not submerged", "not_submerged"),
-    ("", "{outside_overlap:,} ignored: outside the overlap", "outside_overlap"),
-    ("No plane", "{by_nearest:,} points were compared with the nearest height", "by_nearest"),
-    ("C2C from", "{reference_compared:,} points of the reference ({reference_share})",
-     "reference_compared"),
-    ("{of}", "{errors}{noise}", "noise"),
-    ("M3C2", "{m3c2[statistics][count]:,} of {m3c2[core_points]:,} core points, normals"
-     " {m3c2[normal_radius_m]:.2f} m, cylinder {m3c2[cylinder_radius_m]:.2f} m; mean level of"
-     " detection {m3c2[mean_level_of_detection_m]:.3f} m, {beyond:.0f} % of the distances beyond"
-     " it", "m3c2"),
-)  # fmt: skip
-
-
 def comparison_text(c: Comparison) -> str:
     """Return the summary of a comparison; metres throughout."""
-    plain = c.as_dict()
-    n, own, m3c2 = plain["counts"], plain["own"], (plain["m3c2"] or {}).get("after")
+    plain, n = c.as_dict(), c.counts
     checks = c.measured_at == "reference"
-    in_reference = n["reference"] - n["reference_left_out"]
-    values = n | {
-        "what": "check points" if checks else "points",
-        "compared_share": share(n["compared"], in_reference if checks else n["cloud"]),
-        "reference_share": share(n["reference_compared"], in_reference),
-        "m3c2": m3c2,
-        "beyond": 100.0 * m3c2["significant_share"] if m3c2 else 0.0,
+    in_reference = n.reference - n.reference_left_out
+    compared = share(n.compared, in_reference if checks else n.cloud)
+    rows = [("Compared", f"{n.compared:,} {'check points' if checks else 'points'} ({compared})")]
+    ignored = {
+        "withheld or noise": n.cloud_left_out,
+        "not submerged": n.not_submerged,
+        "outside the overlap": n.outside_overlap,
     }
-    if own is not None:
-        values["of"] = "Bed" if own["of"] == "bed" else "Cloud"
-        values["noise"], values["errors"] = noise_sentence(own, raw_of(plain)["after"]), ""
+    rows += [("", f"{count:,} ignored: {why}") for why, count in ignored.items() if count]
+    if n.by_nearest:
+        rows.append(("No plane", f"{n.by_nearest:,} points were compared with the nearest height"))
+    if n.reference_compared:
+        of = share(n.reference_compared, in_reference)
+        rows.append(("C2C from", f"{n.reference_compared:,} points of the reference ({of})"))
+    if c.own is not None:
+        own, noise = plain["own"], noise_sentence(plain["own"], raw_of(plain)["after"])
         if own["rmse_m"] is not None:
-            values["errors"] = "RMSE {rmse_m:.3f} m, 95 % {within_95_m:.3f} m, ".format(**own)
+            noise = f"RMSE {own['rmse_m']:.3f} m, 95 % {own['within_95_m']:.3f} m, {noise}"
+        rows.append(("Bed" if own["of"] == "bed" else "Cloud", noise))
+    if c.m3c2 is not None:
+        m = c.m3c2.after
+        rows.append(("M3C2", f"{m.statistics.count:,} of {m.core_points:,} core points, normals"
+                     f" {m.normal_radius_m:.2f} m, cylinder {m.cylinder_radius_m:.2f} m; mean level"
+                     f" of detection {m.mean_level_of_detection_m:.3f} m,"
+                     f" {100 * m.significant_share:.0f} % of the distances beyond it"))  # fmt: skip
     head = f"Compared {c.cloud} with {c.reference} in {c.seconds:.1f} s"
     tables = [line for table in _tables(plain) for line in table.lines()]
-    notes = [f"Note: {note}" for note in c.notes]
-    return "\n".join([aligned(head, filled(_COMPARED, values)), *tables, *notes])
+    return "\n".join([aligned(head, rows), *tables, *(f"Note: {note}" for note in c.notes)])
 
 
 def noise_sentence(own: Plain, raw: Plain) -> str:
@@ -186,48 +180,52 @@ def gauss(of: Plain) -> str:
 
 def _tables(compared: Plain) -> list[Table]:
     """Return the tables for terminal and page; those without rows are omitted."""
+    names = {when: name for when, name, _ in TIMES}
     c2c = c2c_rows(compared)
     found = [(title, s) for _, title, s in signed_statistics(compared)]
     found += [(f"C2C {way}, {name}", of["statistics"]) for way, name, _, of in c2c]
-    columns = {"points": "{count:,}", **{name: f"{{{key}:.3f}}" for name, key in MOMENTS.items()}}
-    columns |= {f"{p} %": f"{{percentiles_m[p{p}]:.3f}}" for p in (5, 95)}
-    against = f"Against {name_of(compared['reference'])} (m)"
-    tables = [_table(against, columns | {"max": "{max_m:.3f}"}, found)]
-
-    columns = {
-        "mean (m)": "{statistics[mean_m]:.6f}", "std.dev. (m)": "{statistics[sd_m]:.6f}",
-        "classes": "{classes}",
-    }  # fmt: skip
-    for number, one in enumerate(c2c[0][-1].get("shares", ()) if c2c else ()):
-        columns[f"{one['low_m']:g} to {one['high_m']:g} m"] = f"{{shares[{number}][share]:.1%}}"
-    found = [
-        (f"{way}, {name}", {**of, "classes": len(of["histogram"]["counts"])})
-        for way, name, _, of in c2c
-    ]
-    tables.append(_table("C2C: Gauss as CloudCompare fits it", columns, found))
-
-    columns = {"slope": "{slope:.4f}", "intercept (m)": "{intercept_m:+.3f}", "r²": "{r2:.4f}"}
-    fits = compared["depth"] or {}
-    found = [(name, fits[when]) for when, name, _ in TIMES if fits.get(when)]
-    tables.append(_table("Depth against reference depth", columns, found))
-
-    columns = {"points": "{after[count]:,}"}
-    for when, name, _ in TIMES:
-        moments = {"bias": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m"}
-        columns |= {f"{one}, {name}": f"{{{when}[{key}]:.3f}}" for one, key in moments.items()}
-    for key, (title, _, _) in BINS.items():
-        found = [(f"{one['from_m']:g} to {one['to_m']:g}", one) for one in compared[key]]
-        tables.append(_table(title, columns, found))
-    return [table for table in tables if table.rows]
-
-
-def _table(title: str, columns: dict[str, str], found: list[tuple[str, Plain]]) -> Table:
-    """Return a table whose rows have a name, and values to format; unknown ones stay empty."""
     rows = []
-    for name, values in found:
-        known = values | {when: values.get(when) or _Unknown() for when, _, _ in TIMES}
-        rows.append([name, *(text.format(**known) for text in columns.values())])
-    return Table(title, ["", *columns], rows)
+    for title, s in found:
+        marks = s["percentiles_m"]
+        values = [*(s[key] for key in MOMENTS.values()), marks["p5"], marks["p95"], s["max_m"]]
+        rows.append([title, f"{s['count']:,}", *(f"{value:.3f}" for value in values)])
+    title = f"Against {name_of(compared['reference'])} (m)"
+    tables = [Table(title, ["", "points", *MOMENTS, "5 %", "95 %", "max"], rows)]
+
+    bands = c2c[0][-1].get("shares", ()) if c2c else ()
+    header = ["", "mean (m)", "std.dev. (m)", "classes"]
+    header += [f"{one['low_m']:g} to {one['high_m']:g} m" for one in bands]
+    rows = [
+        [
+            f"{way}, {name}", f"{of['statistics']['mean_m']:.6f}",
+            f"{of['statistics']['sd_m']:.6f}", str(len(of["histogram"]["counts"])),
+            *(f"{100 * one['share']:.1f} %" for one in of.get("shares", ())),
+        ]
+        for way, name, _, of in c2c
+    ]  # fmt: skip
+    tables.append(Table("C2C: Gauss as CloudCompare fits it", header, rows))
+
+    lines = [(name, (compared["depth"] or {}).get(when)) for when, name, _ in TIMES]
+    rows = [
+        [name, f"{fit['slope']:.4f}", f"{fit['intercept_m']:+.3f}", f"{fit['r2']:.4f}"]
+        for name, fit in lines
+        if fit is not None
+    ]
+    header = ["", "slope", "intercept (m)", "r²"]
+    tables.append(Table("Depth against reference depth", header, rows))
+
+    # of each class of depth or of distance from the shore
+    figures = {"bias": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m"}
+    header = ["", "points", *(f"{one}, {name}" for name in names.values() for one in figures)]
+    for key, (title, _, _) in BINS.items():
+        rows = []
+        for one in compared[key]:
+            both = [one[when] for when in names]
+            cells = ["" if s is None else f"{s[of]:.3f}" for s in both for of in figures.values()]
+            name = f"{one['from_m']:g} to {one['to_m']:g}"
+            rows.append([name, f"{one['after']['count']:,}", *cells])
+        tables.append(Table(title, header, rows))
+    return [table for table in tables if table.rows]
 
 
 # Pictures
