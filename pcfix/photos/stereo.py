@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.errors import GeometryError
+from pcfix.grid.heights import cell_statistics
 from pcfix.lens.imaging import project, unproject
-from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.model import BoolArray, FloatArray
 from pcfix.photos.mapping import Ground, Photo
 from pcfix.photos.ortho import Picture
 
@@ -65,26 +66,37 @@ def stereo_cloud(
     low, high = np.nanquantile(ground.height_m, [0.001, 0.999])
     heights = float(low - SPARE_RELIEF * (high - low) - 1.0), float(high + 1.0)
     middle = float(np.nanmedian(ground.height_m))
-    pairs, cells, z = pairs_of(photos, middle), [], []
+    pairs, cells, means = pairs_of(photos, middle), [], []
     for done, (one, other) in enumerate(pairs, start=1):
         xyz = pair_points(photos[one], photos[other], picture(one), picture(other), heights)
-        own, mean = _means(xyz, cell_m)
-        cells.append(own)
-        z.append(mean)
+        column, row = np.floor(xyz[:, :2] / cell_m).astype(np.int64).T
+        own, cell = np.unique((row << 32) + column + HALF, return_inverse=True)
+        if len(own):
+            cells.append(own)
+            means.append(cell_statistics(cell, xyz[:, 2], len(own))["mean"])
         if progress is not None:
             progress(done, len(pairs))
-    if not sum(map(len, z)):
+    if not cells:
         raise GeometryError(
             "photos.no_pairs",
             "Stereo found no pairs of images that overlap and match. Rebuild with the command of a"
             " photogrammetry package.",
             pairs=len(pairs),
         )
+    # the median height of each cell, where most pairs agree to a pixel of parallax
     parallax = [
         (photo.centre[2] - middle) / (BASE_SHARES[1] * min(photo.lens.width, photo.lens.height))
         for photo in photos
     ]
-    return _fused(np.concatenate(cells), np.concatenate(z), cell_m, float(np.median(parallax)))
+    own, cell = np.unique(np.concatenate(cells), return_inverse=True)
+    z = np.concatenate(means)
+    fused = cell_statistics(cell, z, len(own))
+    agrees = np.abs(z - fused["median"][cell]) <= float(np.median(parallax))
+    agreeing = np.bincount(cell[agrees], minlength=len(own))
+    row = own >> 32
+    centre = cell_m * (np.column_stack([own - (row << 32) - HALF, row]) + 0.5)
+    fine = agreeing >= np.maximum(FEWEST_PAIRS, 0.5 * fused["points"])
+    return np.column_stack([centre, fused["median"]])[fine]
 
 
 def pairs_of(photos: Sequence[Photo], ground_m: float) -> list[tuple[int, int]]:
@@ -190,25 +202,3 @@ def _turned(
         borderMode=cv2.BORDER_CONSTANT, borderValue=1,
     )  # fmt: skip
     return turned, np.asarray(blank > 0)
-
-
-def _means(xyz: FloatArray, cell_m: float) -> tuple[IntArray, FloatArray]:
-    """Return the cells with points, as one number each, and their mean heights."""
-    column, row = np.floor(xyz[:, :2] / cell_m).astype(np.int64).T
-    number = (row << 32) + column + HALF
-    cells, inverse, counts = np.unique(number, return_inverse=True, return_counts=True)
-    return cells, np.bincount(inverse, xyz[:, 2], len(cells)) / counts
-
-
-def _fused(cells: IntArray, z: FloatArray, cell_m: float, parallax_m: float) -> FloatArray:
-    """Return the median height of each cell, at its centre, where most pairs agree."""
-    order = np.lexsort((z, cells))
-    z = z[order]
-    own, first, counts = np.unique(cells[order], return_index=True, return_counts=True)
-    height = 0.5 * (z[first + (counts - 1) // 2] + z[first + counts // 2])
-    agrees = np.abs(z - np.repeat(height, counts)) <= parallax_m
-    agreeing = np.add.reduceat(agrees, first, dtype=int)
-    row = own >> 32
-    column = own - (row << 32) - HALF
-    xyz = np.column_stack([(column + 0.5) * cell_m, (row + 0.5) * cell_m, height])
-    return np.asarray(xyz[agreeing >= np.maximum(FEWEST_PAIRS, 0.5 * counts)])
