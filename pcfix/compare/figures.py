@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -81,11 +80,6 @@ def bins_table(bins: Iterable[Figures]) -> str:
 
 SPARSER = 2.0
 """Ratio of the spacings of two clouds from which one is called sparse."""
-AS_DEEP, TOO_DEEP = 0.10, 0.15
-"""Relative to the depth: a cloud whose apparent depths differ from the reference by at most the
-first, and whose corrected ones by more than the second, was corrected twice. Refraction makes
-apparent depths a quarter too small.
-"""
 MIN_REACH_M, REACH_FACTOR = 1.0, 1.5
 """M3C2 searches along the normal as far as 1.5 times the 99th percentile of the differences."""
 
@@ -258,15 +252,6 @@ def _by_depth(match: Match, pairs: Figures, notes: list[PcfixWarning]) -> dict[s
 
     found = both(submerged, pairs)
     (depth, error), error_before = found.after, found.before and found.before[1]
-    if found.before is not None:
-        corrected, apparent = _ratio(*found.after), _ratio(*found.before)
-        if abs(apparent - 1.0) <= AS_DEEP and corrected > 1.0 + TOO_DEEP:
-            text = (
-                "The input cloud had the depths of the reference already: it was likely corrected"
-                " before."
-            )
-            ratios = {"apparent_ratio": apparent, "corrected_ratio": corrected}
-            notes.append(PcfixWarning("cloud.corrected_twice", text, **ratios))
     figures = {
         "depth": both(lambda f: fit_line(f[0], mapped(np.subtract, *f)), found),
         "depth_bins": binned(depth, error, error_before, rules.bin_width),
@@ -280,15 +265,6 @@ def _by_depth(match: Match, pairs: Figures, notes: list[PcfixWarning]) -> dict[s
         shore = nearest_distance(kept(wet, after.xy), dry)
         figures["shore_bins"] = binned(shore, error, error_before, rules.shore_bin_width)
     return figures
-
-
-def _ratio(depth_m: FloatArray, error_m: FloatArray) -> float:
-    """Return the median of depth over reference depth, where that is positive; NaN if nowhere."""
-    some = mapped(lambda depth: depth > 0.0, depth_m)
-    if not some.any():
-        return math.nan
-    depth, error = kept(some, depth_m), kept(some, error_m)
-    return float(np.median(mapped(lambda d, e: 1.0 - e / d, depth, error)))
 
 
 def _m3c2(match: Match, pairs: Figures | None) -> Figures:

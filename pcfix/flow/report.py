@@ -23,7 +23,7 @@ from pcfix.io.rasters import preview
 from pcfix.io.tiles import Tiles, open_cloud
 from pcfix.model import NOISE_CLASSES
 from pcfix.report.adjustment import adjustment_tables
-from pcfix.report.comparison import evaluation, in_a_sentence
+from pcfix.report.comparison import evaluation
 from pcfix.report.page import Picture, Report, Table, render
 from pcfix.report.run import RunResults, in_short, run_report
 from pcfix.report.summary import Summary
@@ -69,7 +69,6 @@ def report_run(
     if compared:
         dod = preview(run.dod, MOST_CELLS) if request.has_surface else None
         pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
-        verdict += in_a_sentence(compared["figures"])
     if first["adjusted"]:
         figures = read_json(run.folder / FOLDER / SUMMARY)
         tables += adjustment_tables(figures, f"{FOLDER}/report.html")
@@ -95,26 +94,22 @@ def write_report(run: RunResults, inputs: Sequence[Path], out_dir: Path) -> Repo
     """
     rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in inputs]
     table = Table("Input files", ["file", "bytes", "SHA-256"], rows)
-    report = run_report(run, table, _results_in(out_dir))
+    files = []
+    for name, words in RESULTS.items():
+        tiles = out_dir / name.removesuffix(".laz")
+        if (out_dir / name).is_file():
+            files.append((name, words))
+        elif tiles.is_dir():  # of many files
+            files.append((f"{tiles.name}/", words))
+    sections = sorted(out_dir.glob("compare/section_*.csv"))
+    files += [(f"compare/{one.name}", "a cross-section") for one in sections]
+    report = run_report(run, table, files)
     figures = out_dir / "figures"
     figures.mkdir(exist_ok=True)
     for picture in report.pictures:
         write_bytes(figures / f"{picture.name}.png", picture.png, overwrite=True)
     write_text(out_dir / PAGE, render(report), overwrite=True)
     return report
-
-
-def _results_in(folder: Path) -> list[tuple[str, str]]:
-    """Return the files of a run, or the folders of tiles, and their contents."""
-    found = []
-    for name, words in RESULTS.items():
-        tiles = folder / name.removesuffix(".laz")
-        if (folder / name).is_file():
-            found.append((name, words))
-        elif tiles.is_dir():
-            found.append((f"{tiles.name}/", words))
-    sections = sorted(folder.glob("compare/section_*.csv"))
-    return [*found, *((f"compare/{one.name}", "a cross-section") for one in sections)]
 
 
 def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> Plain:

@@ -139,31 +139,6 @@ def noise_sentence(own: Plain, raw: Plain) -> str:
     return f"without {noise}; with it RMSE {raw['rmse_m']:.3f} m, 95 % {raw['within_95_m']:.3f} m."
 
 
-def in_a_sentence(compared: Plain) -> str:
-    """Return what the correction changed against the reference; empty where it is not known."""
-    pair = compared["vertical"]
-    if pair is None or pair["before"] is None:
-        return ""
-    bed, land = compared.get("bed"), compared.get("land")
-    before, after = (raw_of(compared)[when] for when, _, _ in TIMES)
-    way = "fell" if after["rmse_m"] <= before["rmse_m"] else "grew"
-    of_land = "" if not bed or land is None else (
-        f" Land: {land['before']['rmse_m']:.3f} to {land['after']['rmse_m']:.3f} m."
-    )  # fmt: skip
-    return (
-        f" Against {name_of(compared['reference'])} the vertical error"
-        f"{' of the bed' if bed else ''} {way} from {before['rmse_m']:.3f} to"
-        f" {after['rmse_m']:.3f} m (RMSE of {after['count']:,}"
-        f" points, the reference's noise included). The remaining bias is"
-        f" {signed(after['mean_m'])}.{of_land}{_noted(compared, 'cloud.corrected_twice')}"
-    )
-
-
-def _noted(compared: Plain, *codes: str) -> str:
-    """Return the messages of some warnings, each after a blank."""
-    return "".join(f" {one['message']}" for one in compared["notes"] if one["code"] in codes)
-
-
 def signed(value_m: float) -> str:
     """Return metres with their sign, which is plus for what rounds to zero."""
     return f"{round(value_m, 3) + 0.0:+.3f} m"
@@ -254,7 +229,8 @@ def evaluation(
         pictures.append(Picture("histogram_vertical", "Vertical error", alt, figure))
     title = "Distance to the nearest point (C2C)"
     alt = f"{title}: histograms with fitted Gaussians; the table has their figures."
-    alt += _noted(compared, "cloud.sparse", "reference.sparse")
+    sparse = ("cloud.sparse", "reference.sparse")
+    alt += "".join(f" {one['message']}" for one in compared["notes"] if one["code"] in sparse)
     pictures.append(Picture("histogram_c2c", title, alt, c2c_figure(compared)))
     if dod is not None:
         reach = float(np.nanpercentile(np.abs(dod[0]), 98.0))
