@@ -238,7 +238,7 @@ def _water(
     view: View, nodes: Nodes, shifts: FloatArray, weights: FloatArray, interval: float | None
 ) -> tuple[list[tuple[FloatArray, FloatArray]], Figures]:
     """Fit the water of each frame; return heights and standard errors, and a summary."""
-    times, seen = np.arange(len(shifts)) * (interval or 0.0), nodes.seen
+    times, seen = np.arange(len(shifts), dtype=np.float64) * (interval or 0.0), nodes.seen
     depth = float(np.nanmedian(view.level_m - view.bed(nodes.xy[seen])))
     heights = np.full(shifts.shape[:2], view.level_m)
     for _ in range(PASSES):

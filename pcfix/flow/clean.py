@@ -129,8 +129,8 @@ def find_noise(
         first = rows.stop
         release()
         current().report(len(withheld))
-    used, submerged = int(cloud.used.sum()), int(cloud.submerged.sum())
-    if not used:
+    tested, submerged = int(cloud.used.sum()), int(cloud.submerged.sum())
+    if not tested:
         sentence = (
             f"all {n:,} points are withheld or noise (class 7 or 18). There is nothing left to"
             " clean."
@@ -148,7 +148,7 @@ def find_noise(
         output="",
         pcfix=__version__,
         points=n,
-        set_aside=n - used,  # withheld or noise before: not tested, not neighbours
+        set_aside=n - tested,  # withheld or noise before: not tested, not neighbours
         submerged=submerged,  # tested against the bed
         noise=count,
         reasons={

@@ -25,7 +25,7 @@ from pcfix.errors import PcfixWarning, SettingError, bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.colours import NO_LIGHT, hillshade
 from pcfix.grid.delaunay import fill_holes, margin_cells
-from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
+from pcfix.grid.heights import Gridding, grid_window
 from pcfix.grid.lattice import lattice_over, round_resolution, spacing_m
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
@@ -52,6 +52,8 @@ BLOCK_CELLS = 1024
 """Longest side of a window."""
 BIN_POINTS = 200_000
 """Points of a tile by which they are sorted, on average."""
+TO_95 = 1.959964
+"""Half-width of 95 % of a normal distribution, in standard deviations."""
 SIGMA_Z = "SigmaZ"
 FEWEST_A_CELL = 0.9
 """Points per cell, on average where there are any; fewer give a warning."""
@@ -74,8 +76,9 @@ def grid_dsm(
     The file has one band of float32, -9999 (nodata) if a cell has no value. Heights keep the
     vertical datum of the cloud; other quantities have the horizontal CRS only, as programs would
     take their values for heights. Depth is `WaterDepth`, and uncertainty the vertical one at 95 %,
-    of the bed (class 40), as `pcfix.correct_file` writes them; see
-    `pcfix.grid.heights.as_uncertainty`.
+    of the bed (class 40), as `pcfix.correct_file` writes them. The uncertainty of a cell is not
+    divided by the square root of the number of its points: errors of level, index and tilt of the
+    water and of poses are common to them. To treat all errors as common is conservative.
 
     With `counts` a second file has two bands: count (points in the cell) and spread (population
     standard deviation of their values). A cell with a value and count 0 was interpolated.
@@ -223,13 +226,13 @@ def _write_rasters(
             around = window.grown(margin).clipped(lattice.window)
             xyz = tiles.xyz[tiles.within(*lattice.box(around.grown(how.margin_cells)))]
             release()
-            gridded = grid_window(xyz, around, how)
-            if rules.what == "uncertainty":
-                gridded = as_uncertainty(gridded)
-            height, number, spread = (band[window.within(around)] for band in gridded)
+            whole, *counted = grid_window(xyz, around, how)
+            if rules.what == "uncertainty":  # the root mean square of the standard errors of a cell
+                whole = TO_95 * np.hypot(whole, counted[1])
+            height, number, spread = (band[window.within(around)] for band in (whole, *counted))
             values = height[~np.isnan(height)]
             if widest:
-                height = fill_holes(gridded.height, window, around, widest)
+                height = fill_holes(whole, window, around, widest)
             rasters.write_part(dsm, height, window, 1)
             if "counts" in paths:
                 rasters.write_part(counts, number, window, 1)

@@ -157,8 +157,8 @@ def contours_layer(folder: Path, interval: float | None = None) -> Layer:
         sigma = rasters.preview(path)[0] if path.exists() else np.zeros(0)
         interval = depth_interval(depth, sigma)
     found = contours(depth, interval)
-    lines = [shapely.linestrings(rasters.centres(one.place, depth, bounds)) for one in found]
-    level = np.array([one.level for one in found])
+    lines = [shapely.linestrings(rasters.centres(place, depth, bounds)) for _, place in found]
+    level = np.array([level for level, _ in found])
     values = {"depth_m": level, "interval_m": np.full(len(found), interval)}
     style = vector_style({"line": Symbol("line", DARK, 0.25)}, label='"depth_m"')
     return Layer("depth_contours", "LineString", lines, values, style)

@@ -11,9 +11,6 @@ from pcfix.grid.lattice import Lattice, Window
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.steps import DsmMethod
 
-TO_95 = 1.959964
-"""Half-width of 95 % of a normal distribution, in standard deviations."""
-
 
 class Gridding(NamedTuple):
     """The raster and the method of its heights."""
@@ -30,18 +27,13 @@ class Gridding(NamedTuple):
         return {"tin": reach, "idw": 1}.get(self.method, 0)
 
 
-class Gridded(NamedTuple):
-    """The bands of a window, each of its shape; NaN if unknown."""
+def grid_window(
+    points: FloatArray, window: Window, how: Gridding
+) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Return height, number of points and spread of the cells of a part of a raster.
 
-    height: FloatArray
-    points: IntArray
-    spread: FloatArray
-
-
-def grid_window(points: FloatArray, window: Window, how: Gridding) -> Gridded:
-    """Return the bands of a part of a raster, from all points that decide on it, or more.
-
-    Points, shape (n, 3), are x and y, world frame, metres, and the height or another quantity.
+    Points, shape (n, 3), are all that decide on it, or more: x and y, world frame, metres, and the
+    height or another quantity. The bands have the shape of the window, NaN if unknown.
     """
     cell = how.lattice.cells(points)
     inner, shape = window.holds(cell), (window.height, window.width)
@@ -57,9 +49,8 @@ def grid_window(points: FloatArray, window: Window, how: Gridding) -> Gridded:
             height[cells["points"] == 0] = np.nan
         case method:
             height = cells[method]
-    return Gridded(
-        height.reshape(shape), cells["points"].reshape(shape), cells["spread"].reshape(shape)
-    )
+    counts, spread = cells["points"].reshape(shape), cells["spread"].reshape(shape)
+    return height.reshape(shape), counts, spread
 
 
 def cell_statistics(cell: IntArray, z: FloatArray, size: int) -> dict[str, Any]:
@@ -84,16 +75,6 @@ def cell_statistics(cell: IntArray, z: FloatArray, size: int) -> dict[str, Any]:
     whole[:, filled] = low + offset, median, low, z[first + n - 1], scatter
     names = ("mean", "median", "min", "max", "spread")
     return {"points": count, **dict(zip(names, whole, strict=True))}
-
-
-def as_uncertainty(bands: Gridded) -> Gridded:
-    """Return the vertical uncertainty (m) at 95 % from bands of standard errors.
-
-    It is the root mean square over the points of a cell, not divided by the square root of their
-    number: errors of level, index and tilt of the water and of poses are common to them and do not
-    average out. To treat all errors as common is conservative.
-    """
-    return bands._replace(height=TO_95 * np.hypot(bands.height, bands.spread))
 
 
 REACH_CELLS = 2.0**0.5

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -150,13 +149,6 @@ LEAST_CELLS = 12.0
 """Shorter lines are dropped."""
 
 
-class Contour(NamedTuple):
-    """A line, shape (n, 2): columns and rows from the centre of the first cell; and its level."""
-
-    level: float
-    place: FloatArray
-
-
 def depth_interval(depth_m: FloatArray, uncertainty_m: FloatArray) -> float:
     """Return the interval for a map of depths: few levels, and not finer than the uncertainty.
 
@@ -168,10 +160,11 @@ def depth_interval(depth_m: FloatArray, uncertainty_m: FloatArray) -> float:
     return nice_step(max(float(deepest) / MOST_LEVELS, sigma, LEAST_INTERVAL_M))
 
 
-def contours(values: FloatArray, interval: float) -> list[Contour]:
-    """Return the contours of cells (rows, columns), NaN if unknown, at whole intervals.
+def contours(values: FloatArray, interval: float) -> list[tuple[float, FloatArray]]:
+    """Return levels and lines of the contours of cells (rows, columns), NaN if unknown.
 
-    The lowest and the highest value have no contour.
+    The levels are whole intervals; the lowest and the highest value have no contour. A line, shape
+    (n, 2), has columns and rows from the centre of the first cell.
     """
     from contourpy import contour_generator
 
@@ -180,11 +173,9 @@ def contours(values: FloatArray, interval: float) -> list[Contour]:
     maker = contour_generator(z=np.ma.masked_invalid(smoothed(values, SMOOTH_CELLS)))
     first = math.floor(float(np.nanmin(values)) / interval) + 1
     last = math.ceil(float(np.nanmax(values)) / interval)
-    lines = [
-        Contour(round(step * interval, 6), np.asarray(line))
-        for step in range(first, last)
-        for line in maker.lines(step * interval)
-    ]
     return [
-        one for one in lines if float(np.hypot(*np.diff(one.place, axis=0).T).sum()) >= LEAST_CELLS
+        (round(step * interval, 6), line)
+        for step in range(first, last)
+        for line in map(np.asarray, maker.lines(step * interval))
+        if np.hypot(*np.diff(line, axis=0).T).sum() >= LEAST_CELLS
     ]
