@@ -114,24 +114,11 @@ def file_points(
         yield from read_ahead(points_of(one, source, water) for one in source.chunks())
 
 
-def joined_points(parts: Iterable[Points]) -> Points:
-    """Return consecutive points as one, with what all of them have, but no weights of views."""
-    *columns, views = [
-        None if any(v is None for v in one) else one for one in zip(*parts, strict=True)
-    ]
-    joined: list[Any] = [None if one is None else np.concatenate(one) for one in columns]
-    if views is None:
-        return Points(*joined)
-    start = np.cumsum(np.concatenate([[0], *(np.diff(one.start) for one in views)]))
-    camera = np.concatenate([one.camera for one in views])
-    return Points._make([*joined, Views(start, camera, kind=views[0].kind)])
-
-
 def sample_of(
     view: CloudView, rows: IntArray | int, water: WaterSurface | None = None,
     match: ViewMatch | None = None,
 ) -> Points:  # fmt: skip
-    """Return some points of a cloud, with their views if there is a view list.
+    """Return some points of a cloud, with their views (without weights) if there is a view list.
 
     `rows` are theirs, ascending, or about how many there are, evenly spread.
     """
@@ -147,7 +134,15 @@ def sample_of(
         first += len(one.xyz)
         if high == len(rows):
             break
-    return joined_points(parts)
+    *columns, listed = zip(*parts, strict=True)
+    joined: list[Any] = [
+        None if any(v is None for v in one) else np.concatenate(one) for one in columns
+    ]
+    if listed[0] is None:
+        return Points(*joined)
+    start = np.cumsum(np.concatenate([[0], *(np.diff(one.start) for one in listed)]))
+    camera = np.concatenate([one.camera for one in listed])
+    return Points._make([*joined, Views(start, camera, kind=listed[0].kind)])
 
 
 def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Points:

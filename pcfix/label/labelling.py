@@ -112,11 +112,30 @@ class Labelling:
         below = is_submerged(xyz[:, 2], surface)
         if self.is_plain:
             return below, LabelCounts()
-        height = xyz[:, 2] - surface.height_m
-        wet = below | _within(height, self.settings.dead_band)
-        rows = np.flatnonzero(wet)
-        wet[rows], counts = self._decided(xyz[rows], height[rows], classes[rows])
-        return wet, counts
+        height, dead_m = xyz[:, 2] - surface.height_m, self.settings.dead_band
+        rows = np.flatnonzero(below | _within(height, dead_m))
+        xy, height, in_pool = xyz[rows, :2], height[rows], None
+        x, y = np.ascontiguousarray(xy.T)
+        below, inside = height < 0.0, self._is_inside(x, y)
+        respected = self._is_respected(classes[rows])
+        wet = inside & ~respected
+        if self.around is not None:
+            cells = self.around.frame.cells(x, y)
+            wet &= ~_within(height, dead_m) | self.around.is_wet[cells]
+            if self.around.pool is not None and self.around.stays is not None:
+                pool, stays = self.around.pool[cells], self.around.stays
+                in_pool = np.bincount(pool[wet & ~stays[pool]], minlength=len(stays))
+                wet &= stays[pool]
+        submerged = np.zeros(len(xyz), np.bool_)
+        submerged[rows] = wet
+        return submerged, LabelCounts(
+            below=int(below.sum()),
+            outside_mask=int((below & ~inside).sum()),
+            respected=int((below & inside & respected).sum()),
+            low=xy[below].min(axis=0, initial=np.inf),
+            high=xy[below].max(axis=0, initial=-np.inf),
+            in_pool=in_pool,
+        )
 
     def labels(self, part: Part) -> tuple[Classes, LabelCounts]:
         """Return the new classes of points, and their counts; those of land do not change."""
@@ -150,31 +169,6 @@ class Labelling:
 
     def _is_inside(self, x: FloatArray, y: FloatArray) -> BoolArray:
         return np.ones(len(x), np.bool_) if self.mask is None else self.mask.inside(x, y)
-
-    def _decided(
-        self, xyz: FloatArray, height: FloatArray, classes: Classes
-    ) -> tuple[BoolArray, LabelCounts]:
-        """Decide on points that are below or within the dead band."""
-        x, y, _ = np.ascontiguousarray(xyz.T)
-        below, inside, respected = height < 0.0, self._is_inside(x, y), self._is_respected(classes)
-        wet, in_pool = inside & ~respected, None
-        if self.around is not None:
-            cells = self.around.frame.cells(x, y)
-            unsure = _within(height, self.settings.dead_band)
-            if unsure.any():
-                wet &= ~unsure | self.around.is_wet[cells]
-            if self.around.pool is not None and self.around.stays is not None:
-                pool, stays = self.around.pool[cells], self.around.stays
-                in_pool = np.bincount(pool[wet & ~stays[pool]], minlength=len(stays))
-                wet &= stays[pool]
-        return wet, LabelCounts(
-            below=int(below.sum()),
-            outside_mask=int((below & ~inside).sum()),
-            respected=int((below & inside & respected).sum()),
-            low=xyz[below, :2].min(axis=0, initial=np.inf),
-            high=xyz[below, :2].max(axis=0, initial=-np.inf),
-            in_pool=in_pool,
-        )
 
     def check(self, name: str, counts: LabelCounts, submerged: int | None = None) -> None:
         """Check that mask, respected classes and dead band leave points below the water."""
