@@ -11,7 +11,7 @@ negative number.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +28,7 @@ from pcfix.model import (
     IntArray,
 )
 from pcfix.options.correct import LabelRules
-from pcfix.sums import LEAST, MOST, Sums
+from pcfix.sums import Sums
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
 Classes = npt.NDArray[np.uint8]
@@ -51,12 +51,10 @@ class LabelCounts(Sums):
     water_surface: int = 0  # of class 41 now because they are in the band
     stale: int = 0  # class 40 or 41 in the input and neither now; set to 1 with `reset`
     water_unknown: int = 0  # without a known height of the water
-    # points below the water, how many of them are excluded, and their corners
+    # points below the water, and how many of them are excluded
     below: int = 0
     outside_mask: int = 0
     respected: int = 0
-    low: FloatArray = field(default_factory=lambda: np.full(2, np.inf), metadata=LEAST)
-    high: FloatArray = field(default_factory=lambda: np.full(2, -np.inf), metadata=MOST)
     in_pool: IntArray | None = None  # points of each separate pool
 
     def of_classes(self) -> dict[str, int]:
@@ -114,8 +112,8 @@ class Labelling:
             return below, LabelCounts()
         height, dead_m = xyz[:, 2] - surface.height_m, self.settings.dead_band
         rows = np.flatnonzero(below | _within(height, dead_m))
-        xy, height, in_pool = xyz[rows, :2], height[rows], None
-        x, y = np.ascontiguousarray(xy.T)
+        x, y = np.ascontiguousarray(xyz[rows, :2].T)
+        height, in_pool = height[rows], None
         below, inside = height < 0.0, self._is_inside(x, y)
         respected = self._is_respected(classes[rows])
         wet = inside & ~respected
@@ -132,8 +130,6 @@ class Labelling:
             below=int(below.sum()),
             outside_mask=int((below & ~inside).sum()),
             respected=int((below & inside & respected).sum()),
-            low=xy[below].min(axis=0, initial=np.inf),
-            high=xy[below].max(axis=0, initial=-np.inf),
             in_pool=in_pool,
         )
 
@@ -192,12 +188,11 @@ class Labelling:
         if self.mask is None or counts.outside_mask < max(counts.below, 1):
             return
         west, south, east, north = bounds = self.mask.area.bounds
-        (x0, y0), (x1, y1) = counts.low, counts.high
         raise GeometryError(
             "mask.no_points",
             f"{self.mask.name} (x {west:.1f} to {east:.1f}, y {south:.1f} to {north:.1f}) contains"
-            f" none of the points of {name} below the water (x {x0:.1f} to {x1:.1f}, y {y0:.1f} to"
-            f" {y1:.1f}). Check the CRS of both, and that the polygons are of water.",
+            f" none of the {counts.below:,} points of {name} below the water. Check the CRS of"
+            " both, and that the polygons are of water.",
             path=self.mask.name, points=counts.below, bounds=bounds,
         )  # fmt: skip
 
