@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import shapely
 
-from pcfix.compare.sections import SectionLine
 from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
 from pcfix.flow.request import SURFACE, RunFolder
 from pcfix.flow.runner import Progress
@@ -182,12 +181,11 @@ def _waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Laye
 
 def _sections(sections: Sequence[Mapping[str, float]]) -> Layer:
     """Return the cross-sections of the comparison."""
-    lines = [SectionLine(s["x1"], s["y1"], s["x2"], s["y2"]) for s in sections]
+    lines = [shapely.linestrings([(s["x1"], s["y1"]), (s["x2"], s["y2"])]) for s in sections]
     names = np.array([f"Cross-section {n}" for n, _ in enumerate(lines, start=1)], object)
-    values = {"name": names, "length_m": np.array([one.length_m for one in lines])}
-    ends = [shapely.linestrings([(one.x1, one.y1), (one.x2, one.y2)]) for one in lines]
+    values = {"name": names, "length_m": shapely.length(lines)}
     style = vector_style({"line": Symbol("line", GREY, 0.4)}, label='"name"')
-    return Layer("cross_sections", "LineString", ends, values, style)
+    return Layer("cross_sections", "LineString", lines, values, style)
 
 
 def _cameras(cameras: Cameras, unused: Sequence[str]) -> Layer:
