@@ -10,7 +10,7 @@ negative number.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import GeometryError
-from pcfix.label.areas import Grid, Surroundings, WaterMask
+from pcfix.label.areas import Surroundings, WaterMask, surroundings_of
 from pcfix.model import (
     BATHYMETRIC_POINT,
     UNCLASSIFIED,
@@ -87,20 +87,25 @@ class Labelling:
 
         `parts` are the whole cloud in chunks, and `low` and `high` its corners, if they are known.
         """
-        settings = self.settings
-        if not (settings.connected or settings.dead_band > 0.0):
+        rules = self.settings
+        if not (rules.connected or rules.dead_band > 0.0):
             return self
-        grid = Grid(low, high, settings.dead_band)
-        for part in parts:
-            x, y, z = np.ascontiguousarray(part.xyz.T)
-            height = z - part.surface.height_m
-            # high points have no vote without a dead band
-            counts = np.ones(len(x), np.bool_) if settings.dead_band else height < 0.0
-            counts &= ~self._is_respected(part.classes)
-            rows = np.flatnonzero(counts)
-            counts[rows] = self._is_inside(x[rows], y[rows])
-            grid.add(x, y, height, counts)
-        around = grid.surroundings(connected=settings.connected, least_pool_m2=settings.least_pool)
+
+        def counted() -> Iterator[tuple[FloatArray, FloatArray, FloatArray, BoolArray]]:
+            for part in parts:
+                x, y, z = np.ascontiguousarray(part.xyz.T)
+                height = z - part.surface.height_m
+                # high points have no vote without a dead band
+                counts = np.ones(len(x), np.bool_) if rules.dead_band else height < 0.0
+                counts &= ~self._is_respected(part.classes)
+                rows = np.flatnonzero(counts)
+                counts[rows] = self._is_inside(x[rows], y[rows])
+                yield x, y, height, counts
+
+        around = surroundings_of(
+            counted(), low, high, rules.dead_band,
+            connected=rules.connected, least_pool_m2=rules.least_pool,
+        )  # fmt: skip
         return replace(self, around=around)
 
     def submerged(
