@@ -138,7 +138,7 @@ def grid_dsm(
             corrected = any(is_ours(vlr) for vlr in source.vlrs)
             used = _points_of(source, rules, report)
             if given.resolution is None:
-                cell_m = round_resolution(_spacing_m(source, used), 0.0)
+                cell_m = round_resolution(_spacing_m(source, used))
                 rules = replace(rules, resolution=cell_m)
             apart_m = _spacing_m(source, used, rules.cell_m)
         lattice = lattice_over(*bounds(used[:, :2]), rules.cell_m, str(task.source))

@@ -55,19 +55,11 @@ def raster_files(folder: Path, *, errors: bool) -> list[Path]:
 def write_rasters(run: RunFolder, *, errors: bool, progress: Progress | None = None) -> Plain:
     """Write all rasters of a corrected cloud as cloud optimised GeoTIFF, with styles for QGIS.
 
-    By default the cells have 2 to 4 points, and are no smaller than a pixel on the ground. Returns
-    their side for ``run.json``.
+    By default the cells have 2 to 4 points. Returns their side for ``run.json``.
     """
-    folder, cloud, cameras = run.folder, run.cleaned_cloud, run.cameras
-    gsd_m = 0.0  # a pixel on the ground at nadir, median
-    if cameras.lenses:
-        with open_cloud(cloud) as source:
-            middle = float(source.header.mins[2] + source.header.maxs[2]) / 2.0
-        focal = np.array([lens.focal_px for lens in cameras.lenses])
-        gsd_m = float(np.median((cameras.centres[:, 2] - middle) / focal))
-    cell_m = run.request.resolution
+    folder, cloud, cell_m = run.folder, run.cleaned_cloud, run.request.resolution
     if cell_m is None:
-        cell_m = round_resolution(point_spacing_m(cloud, folder / SURFACE), gsd_m)
+        cell_m = round_resolution(point_spacing_m(cloud, folder / SURFACE))
     plain = DsmOptions(resolution=cell_m, cog=True, style=True, overwrite=True)
     filled = replace(plain, fill=HOLE_CELLS * cell_m)
     asked = {

@@ -330,9 +330,4 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
         found = fit_water(xyz, model=options.water_model, counts=shore.counts)
     for note in coded("water.points", notes):
         warnings.warn(note, stacklevel=2)
-    if (shore.counts < 1.0).any():
-        notes.append(
-            f"{shore.name}: {len(xyz):,} points along drawn lines count as"
-            f" {shore.counts.sum():.0f} independent ones."
-        )
     return replace(found, notes=(*map(str, notes), *found.notes))
