@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple, TypeVar
@@ -85,13 +84,12 @@ MIN_REACH_M, REACH_FACTOR = 1.0, 1.5
 
 
 def figures_of(
-    match: Match, lines: Sequence[SectionLine], started: float, others: Mapping[str, Match]
+    match: Match, lines: Sequence[SectionLine], others: Mapping[str, Match]
 ) -> Comparison:
     """Return all figures that the settings ask for.
 
-    The cross-sections along `lines` come with the automatic ones; the comparison `started` at a
-    time of `time.perf_counter`; `others` are further clouds by name. Raises GeometryError if there
-    are too few points for planes, or M3C2 finds nothing.
+    The cross-sections along `lines` come with the automatic ones; `others` are further clouds by
+    name. Raises GeometryError if there are too few points for planes, or M3C2 finds nothing.
     """
     whole, reference, rules = match.whole, match.reference, match.settings
     c2c, c2c_from_reference = found = c2c_of(match)
@@ -147,7 +145,7 @@ def figures_of(
         sections=_sections(match, lines, others),
         settings=rules,
         notes=notes,
-        seconds=round(time.perf_counter() - started, 3),
+        seconds=0.0,
         check_points=residuals,  # (p, 4): x, y, z of check points, and the error
     )
 

@@ -97,7 +97,8 @@ def compare_clouds(
         matched, others = matched_to(whole), {}
         for name, further in also.items():  # at the places of the first
             others[name] = replace(matched_to(read_cloud(further, water)), places=matched.places)
-        result = figures_of(matched, lines, started, others)
+        result = figures_of(matched, lines, others)
+    result.seconds = round(time.perf_counter() - started, 3)
     _write(result, given)
     return result
 

@@ -25,8 +25,8 @@ from pcfix.errors import PcfixWarning, SettingError, bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.colours import NO_LIGHT, hillshade
 from pcfix.grid.delaunay import fill_holes, margin_cells
-from pcfix.grid.heights import Gridding, grid_window
-from pcfix.grid.lattice import lattice_over, round_resolution, spacing_m
+from pcfix.grid.heights import grid_window
+from pcfix.grid.lattice import Lattice, lattice_over, round_resolution, spacing_m
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.crs import crs_words, parts
@@ -153,11 +153,10 @@ def grid_dsm(
         reach_m = max(
             TIN_REACH_SPACINGS * apart_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
         )
-        how = Gridding(lattice, rules.method, reach_m, apart_m)
         # a cloud optimised file is a copy, with overviews of its own
         paths = {name: folder / f"{name}.tif" if given.cog else drafts[name] for name in drafts}
         tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
-        counted = _write_rasters(tiles, how, rules, paths, crs, tags, report)
+        counted = _write_rasters(tiles, lattice, reach_m, apart_m, rules, paths, crs, tags, report)
         for name, path in paths.items():
             if given.cog:
                 rasters.copy_as_cog(path, drafts[name])
@@ -194,7 +193,9 @@ def grid_dsm(
 
 def _write_rasters(
     tiles: PointTiles,
-    how: Gridding,
+    lattice: Lattice,
+    reach_m: float,
+    apart_m: float,
     rules: DsmRules,
     paths: dict[str, Path],
     crs: Any,
@@ -205,15 +206,18 @@ def _write_rasters(
 
     Returns the numbers of cells and the statistics of their values, by their names in the summary.
     """
-    lattice, size_m = how.lattice, rules.cell_m
+    size_m, method = rules.cell_m, rules.method
+    reach, spacing = reach_m / size_m, apart_m / size_m
+    # the number of cells around a window whose points decide on it
+    beyond = {"tin": int(np.ceil(reach)) + 1, "idw": 1}.get(method, 0)
     plan = None if crs is None else parts(crs)[0]
     unit = METRE if rules.what == "height" or rules.what in DIMENSIONS else ""
     new = partial(rasters.new_raster, lattice=lattice, tags={"PCFIX": json.dumps(tags)})
     # the width of holes to fill, in cells; a TIN has filled its own
-    widest = 0.0 if how.method == "tin" else (rules.fill or 0.0) / size_m
+    widest = 0.0 if method == "tin" else (rules.fill or 0.0) / size_m
     margin = margin_cells(widest) if widest else 0
     # windows have about this number of points if points are everywhere, and are wide for a margin
-    side = np.sqrt(WINDOW_POINTS) * how.spacing_m / size_m or BLOCK_CELLS
+    side = np.sqrt(WINDOW_POINTS) * spacing or BLOCK_CELLS
     cells, filled, known, count, total, low, high, done = 0, 0, 0, 0, 0.0, np.inf, -np.inf, 0
     with ExitStack() as files:
         bands = {rules.what: unit}
@@ -224,9 +228,9 @@ def _write_rasters(
             counts = files.enter_context(new(paths["counts"], crs=plan, bands=bands))
         for window in lattice.window.parts(int(np.clip(side, 4 * margin + 1, BLOCK_CELLS))):
             around = window.grown(margin).clipped(lattice.window)
-            xyz = tiles.xyz[tiles.within(*lattice.box(around.grown(how.margin_cells)))]
+            xyz = tiles.xyz[tiles.within(*lattice.box(around.grown(beyond)))]
             release()
-            whole, *counted = grid_window(xyz, around, how)
+            whole, *counted = grid_window(xyz, around, lattice, method, reach, spacing)
             if rules.what == "uncertainty":  # the root mean square of the standard errors of a cell
                 whole = TO_95 * np.hypot(whole, counted[1])
             height, number, spread = (band[window.within(around)] for band in (whole, *counted))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -12,42 +12,28 @@ from pcfix.model import FloatArray, IntArray
 from pcfix.options.steps import DsmMethod
 
 
-class Gridding(NamedTuple):
-    """The raster and the method of its heights."""
-
-    lattice: Lattice
-    method: DsmMethod
-    reach_m: float  # diameter of the widest circle around a triangle of the TIN
-    spacing_m: float  # of the points; see `pcfix.grid.lattice.spacing_m`
-
-    @property
-    def margin_cells(self) -> int:
-        """The number of cells around a window whose points decide on it."""
-        reach = int(np.ceil(self.reach_m / self.lattice.resolution_m)) + 1
-        return {"tin": reach, "idw": 1}.get(self.method, 0)
-
-
 def grid_window(
-    points: FloatArray, window: Window, how: Gridding
-) -> tuple[FloatArray, IntArray, FloatArray]:
+    points: FloatArray, window: Window, lattice: Lattice, method: DsmMethod, reach: float,
+    spacing: float,
+) -> tuple[FloatArray, IntArray, FloatArray]:  # fmt: skip
     """Return height, number of points and spread of the cells of a part of a raster.
 
     Points, shape (n, 3), are all that decide on it, or more: x and y, world frame, metres, and the
-    height or another quantity. The bands have the shape of the window, NaN if unknown.
+    height or another quantity. `reach`, the diameter of the widest circle around a triangle of the
+    TIN, and `spacing` of the points (see `pcfix.grid.lattice.spacing_m`) are in cells. The bands
+    have the shape of the window, NaN if unknown.
     """
-    cell = how.lattice.cells(points)
+    cell, position = lattice.cells(points), lattice.positions(points)
     inner, shape = window.holds(cell), (window.height, window.width)
     code = (cell[inner, 1] - window.row) * window.width + cell[inner, 0] - window.column
     cells = cell_statistics(code, points[inner, 2], window.height * window.width)
-    size, position = how.lattice.resolution_m, how.lattice.positions(points)
-    match how.method:
+    match method:
         case "tin":
-            reach, spacing = how.reach_m / size, how.spacing_m / size
             height = triangulated(position, points[:, 2], window, reach, spacing)
         case "idw":
             height = inverse_distance(position, cell, points[:, 2], window)
             height[cells["points"] == 0] = np.nan
-        case method:
+        case _:
             height = cells[method]
     counts, spread = cells["points"].reshape(shape), cells["spread"].reshape(shape)
     return height.reshape(shape), counts, spread
