@@ -24,8 +24,7 @@ from pcfix.clean.neighbours import make_tiles
 from pcfix.errors import PcfixWarning, SettingError, bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.colours import NO_LIGHT, hillshade
-from pcfix.grid.delaunay import fill_holes, margin_cells
-from pcfix.grid.heights import grid_window
+from pcfix.grid.heights import fill_holes, grid_window, margin_cells
 from pcfix.grid.lattice import Lattice, lattice_over, round_resolution, spacing_m
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output

@@ -28,8 +28,7 @@ from pcfix.flow.surfaces import CloudView, find_surface
 from pcfix.io.cameras import read_cameras, read_tie_points, takes_sensor
 from pcfix.io.labels import match_labels
 from pcfix.io.vectors import LAYER_MARK
-from pcfix.label.areas import WaterMask
-from pcfix.label.labelling import Labelling
+from pcfix.label.labelling import Labelling, WaterMask
 from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints, ViewKind
 from pcfix.options.correct import LabelRules
 from pcfix.options.declare import File, OptionSet, options_of

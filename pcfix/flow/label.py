@@ -25,8 +25,7 @@ from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource, part_report
 from pcfix.io.las.writing import labelling_vlr, noted_header
 from pcfix.io.tiles import Clouds
-from pcfix.label.areas import WaterMask
-from pcfix.label.labelling import LabelCounts, Labelling, Part
+from pcfix.label.labelling import LabelCounts, Labelling, Part, WaterMask
 from pcfix.model import WaterPlane, WaterSurface
 from pcfix.options.correct import LabelOptions, LabelRules, StageLabelOptions
 from pcfix.options.declare import File, taken

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from pcfix.errors import SettingError
-from pcfix.label.areas import WaterMask
-from pcfix.label.labelling import Labelling, Part
+from pcfix.label.labelling import Labelling, Part, WaterMask
 from pcfix.options.correct import LabelRules
 from pcfix.water.surface import SurfaceAbove
 from tests.utils.codes import refused

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pcfix.label.areas import WaterMask
+from pcfix.label.labelling import WaterMask
 
 shapely = pytest.importorskip("shapely")
 
