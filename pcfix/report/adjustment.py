@@ -15,8 +15,17 @@ from pcfix.adjust.result import Adjusted, Plain, adjustment_dict, rms
 from pcfix.grid.colours import DEPTH, DIFFERENCE, RAYS, UNCERTAINTY
 from pcfix.grid.maps import Maps, MapsBuilder
 from pcfix.model import BoolArray, FloatArray
-from pcfix.report.map_data import Layer
-from pcfix.report.page import AFTER, BEFORE, Picture, Report, Table, label_plan, new_figure, render
+from pcfix.report.page import (
+    AFTER,
+    BEFORE,
+    Layer,
+    Picture,
+    Report,
+    Table,
+    label_plan,
+    new_figure,
+    render,
+)
 from pcfix.report.text import Rows, RowTable, filled, share
 from pcfix.sums import nice_step
 from pcfix.water.surface import surface_above

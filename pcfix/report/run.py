@@ -16,12 +16,12 @@ from pcfix.grid.maps import Extent, Maps, contours, depth_interval
 from pcfix.model import Cameras, FloatArray
 from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
 from pcfix.report.comparison import noise_sentence, raw_of, signed
-from pcfix.report.map_data import Layer, relief
 from pcfix.report.page import (
     AFTER,
     BEFORE,
     REFERENCE,
     WATER,
+    Layer,
     Picture,
     Report,
     Table,
@@ -30,9 +30,9 @@ from pcfix.report.page import (
     map_figure,
     name_of,
     new_figure,
+    relief,
 )
-from pcfix.report.summary import Summary
-from pcfix.report.text import FEWEST, formal_words, summary_rows, uncertainty_sentence
+from pcfix.report.text import FEWEST, Summary, formal_words, summary_rows, uncertainty_sentence
 from pcfix.version import __version__
 
 if TYPE_CHECKING:

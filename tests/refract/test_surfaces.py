@@ -8,7 +8,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 import pcfix
 from pcfix.model import WaterRaster
-from pcfix.simulate.block import fly_block
+from pcfix.simulate.scene import fly_block
 from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.tracing import project, triangulate
 from pcfix.water.surface import surface_above
