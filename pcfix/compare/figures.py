@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -48,7 +47,7 @@ class Comparison(Figures):
         """Return plain values, ready for JSON; a section by its line, its heights are CSV."""
         values = {name: value for name, value in vars(self).items() if name != "check_points"}
         sections = [
-            {**asdict(s.line), "half_width_m": s.half_width_m, "stations": len(s.distance_m)}
+            {**s.line._asdict(), "half_width_m": s.half_width_m, "stations": len(s.distance_m)}
             for s in self.sections
         ]
         return dict(plain(values | {"sections": sections}))
