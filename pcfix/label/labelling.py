@@ -71,7 +71,6 @@ class Surroundings(NamedTuple):
     frame: CellFrame
     is_wet: BoolArray  # (rows, columns), whether an undecided point in the cell is submerged
     pool: npt.NDArray[np.int32] | None = None  # (rows, columns), 0 for none, else an index below
-    area_m2: FloatArray | None = None  # of the cells with submerged points of each pool
     stays: BoolArray | None = None  # whether a pool counts as water
     joined: BoolArray | None = None  # (rows, columns), a pool of water is in or next to the cell
 
@@ -131,7 +130,7 @@ def surroundings_of(
     stays = (area >= least) | (area == area.max())
     stays[0] = False
     joined = binary_dilation(stays[pool], _AROUND)
-    return Surroundings(frame, is_wet, pool, area, stays, joined)
+    return Surroundings(frame, is_wet, pool, stays, joined)
 
 
 class Part(NamedTuple):
@@ -306,21 +305,9 @@ class Labelling:
         if self.is_plain:
             return None
         around, separate = self.around, None
-        if around is not None and around.area_m2 is not None:  # pools that are excluded
-            in_pool = np.zeros_like(around.area_m2) if counts.in_pool is None else counts.in_pool
-            area, largest = np.where(in_pool > 0, around.area_m2, 0.0), None
-            if area.any():
-                pool, side = int(np.argmax(area)), around.frame.side_m
-                cells = np.argwhere(around.pool == pool)
-                row, column = cells[len(cells) // 2]  # a place inside it
-                largest = {
-                    "area_m2": round(float(area[pool]), 2),
-                    "points": int(in_pool[pool]),
-                    "x": float((around.frame.first_column + column + 0.5) * side),
-                    "y": float((around.frame.first_row + row + 0.5) * side),
-                }
-            pools, points = int((area > 0.0).sum()), int(in_pool.sum())
-            separate = {"pools": pools, "points": points, "largest": largest}
+        if around is not None and around.pool is not None:  # pools that are excluded
+            in_pool = np.zeros(1, np.int64) if counts.in_pool is None else counts.in_pool
+            separate = {"pools": int((in_pool > 0).sum()), "points": int(in_pool.sum())}
         return {
             "settings": asdict(self.settings),
             "water_mask": None if self.mask is None else self.mask.name,

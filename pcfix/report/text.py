@@ -75,9 +75,7 @@ _SHORELINE: RowTable = (
 _LABELLING: RowTable = (
     ("Mask", "{outside_mask:,} points below the surface lie outside and stay land", "water_mask"),
     ("Kept class", "{respected:,} points below the surface keep their class", "respected"),
-    ("Pools", "{pools[points]:,} points in {pools[pools]:,} separate pools stay land; the largest,"
-     " {pools[largest][area_m2]:,.1f} m2 with {pools[largest][points]:,} points, is at"
-     " {pools[largest][x]:.1f}, {pools[largest][y]:.1f}", "pools"),
+    ("Pools", "{pools[points]:,} points in {pools[pools]:,} separate pools stay land", "pools"),
     ("Pools", "none separate from the water", "no_pools"),
 )  # fmt: skip
 _CORRECTED: RowTable = (
