@@ -21,7 +21,7 @@ from pcfix.compare.statistics import (
     tvu_of,
 )
 from pcfix.errors import GeometryError, PcfixWarning, plain
-from pcfix.model import BoolArray, FloatArray
+from pcfix.model import FloatArray
 from pcfix.sums import Figures
 
 Given = TypeVar("Given")
@@ -33,7 +33,6 @@ class Pairs(NamedTuple):
     xy: FloatArray  # (n, 2), world frame
     reference_m: FloatArray  # (n,)
     error_m: FloatArray  # (n,), cloud minus reference: positive where the cloud is too high
-    by_nearest: BoolArray  # (n,), one of the two heights is that of a single point
 
 
 class Comparison(Figures):
@@ -123,7 +122,6 @@ def figures_of(
         outside_overlap=match.outside,
         not_submerged=match.not_submerged,
         compared=len(match.places) if reference.sparse else len(match.cloud),
-        by_nearest=0 if pairs is None else int(pairs.after.by_nearest.sum()),
         # with C2C from the reference
         reference_compared=len(match.places) if rules.from_reference else 0,
     )
@@ -219,9 +217,9 @@ def _pairs(match: Match) -> Figures:
 
     def pairs(xyz: FloatArray) -> Pairs:
         places, surface = match.facing(xyz)
-        height, by_nearest = heights_at(places, surface, k)
+        height = heights_at(places, surface, k)
         measured, known = (height, places[:, 2]) if sparse else (places[:, 2], height)
-        return Pairs(places[:, :2], known, mapped(np.subtract, measured, known), by_nearest)
+        return Pairs(places[:, :2], known, mapped(np.subtract, measured, known))
 
     return both(pairs, match.cloud)
 

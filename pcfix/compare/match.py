@@ -247,16 +247,14 @@ def near_in_plan(xy: FloatArray, other_xy: FloatArray, limit_m: float) -> BoolAr
     return mapped(lambda some: np.isin(squares(some), near), xy)
 
 
-def heights_at(
-    xy: FloatArray, surface: FloatArray, neighbours: int
-) -> tuple[FloatArray, BoolArray]:
-    """Return the height of a surface at places in plan, (n,), and where it is that of one point.
+def heights_at(xy: FloatArray, surface: FloatArray, neighbours: int) -> FloatArray:
+    """Return the height of a surface at places in plan, (n, 2) or (n, 3).
 
-    At each place, (n, 2) or (n, 3), a plane is fitted by least squares in Z to the `neighbours`
-    points of the surface, (m, 3), that are nearest in plan, and evaluated; metres, world frame. If
-    these points lie on a line, or the place far outside them, the height of the nearest is used.
+    At each place a plane is fitted by least squares in Z to the `neighbours` points of the surface,
+    (m, 3), that are nearest in plan, and evaluated; metres, world frame. If these points are on a
+    line, or the place is far outside them, the height of the nearest is used.
     """
-    height, by_nearest = empty((len(xy),)), empty((len(xy),), np.bool_)
+    height = empty((len(xy),))
     for rows, here, near in nearest_of(xy, surface, neighbours):
         near[:, :, :2] -= here[:, np.newaxis, :2]
         middle = near.mean(axis=1)
@@ -273,5 +271,5 @@ def heights_at(
         reach = (vv * mu * mu - 2.0 * uv * mu * mv + uu * mv * mv) / safe
         fitted = flat & (reach <= MAX_REACH**2)
         plane = middle[:, 2] - slope_u * mu - slope_v * mv
-        height[rows], by_nearest[rows] = np.where(fitted, plane, near[:, 0, 2]), ~fitted
-    return height, by_nearest
+        height[rows] = np.where(fitted, plane, near[:, 0, 2])
+    return height

@@ -179,7 +179,7 @@ def _values(
         near = near_in_plan(xyz, reference, gap_m(reference))
         if xyz is not reference and near.any():
             k = min(CompareRules().neighbours, len(reference))
-            found[near] = xyz[near, 2] - heights_at(xyz[near], reference, k)[0]
+            found[near] = xyz[near, 2] - heights_at(xyz[near], reference, k)
         return found
     name, factor = {
         "depth": ("WaterDepth", 1.0),

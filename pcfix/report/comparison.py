@@ -109,8 +109,6 @@ def comparison_text(c: Comparison) -> str:
         "outside the overlap": n.outside_overlap,
     }
     rows += [("", f"{count:,} ignored: {why}") for why, count in ignored.items() if count]
-    if n.by_nearest:
-        rows.append(("No plane", f"{n.by_nearest:,} points were compared with the nearest height"))
     if n.reference_compared:
         of = share(n.reference_compared, in_reference)
         rows.append(("C2C from", f"{n.reference_compared:,} points of the reference ({of})"))
