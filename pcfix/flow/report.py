@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import bad_file
 from pcfix.flow.adjust import SUMMARY
 from pcfix.flow.next_steps import FOLDER
 from pcfix.flow.request import RunFolder
@@ -17,7 +16,6 @@ from pcfix.flow.water import found_picture
 from pcfix.grid.maps import MOST_CELLS, MapsBuilder
 from pcfix.io.crs import crs_words
 from pcfix.io.files import read_json, sha256, write_bytes, write_text
-from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import coordinates, stated_crs
 from pcfix.io.rasters import preview
 from pcfix.io.tiles import Tiles, open_cloud
@@ -29,7 +27,6 @@ from pcfix.report.run import RunResults, in_short, run_report
 from pcfix.report.text import Summary, uncertainty_sentence
 
 Plain = dict[str, Any]
-NEEDED = (*SHIFTS, "WaterDepth", "RayCount")
 SIGMA_Z = "SigmaZ"
 SAMPLE_POINTS = 200_000
 """Points in histogram and uncertainty figure, evenly spread over the file."""
@@ -119,11 +116,6 @@ def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> Plain:
     """
     with open_cloud(path) as source:
         dimensions = set(source.header.point_format.dimension_names)
-        if missing := set(NEEDED) - dimensions:
-            sentence = (
-                f"has no dimensions {', '.join(sorted(missing))}. Correct it with --dimensions all."
-            )
-            raise bad_file(path, "cloud.dimension_missing", sentence, dimensions=sorted(missing))
         builder = MapsBuilder(
             source.header.mins[:2], source.header.maxs[:2], len(source), resolution_m
         )
