@@ -27,7 +27,7 @@ from pcfix.report.run import RunResults, in_short, run_report
 from pcfix.report.text import Summary, uncertainty_sentence
 
 Plain = dict[str, Any]
-SIGMA_Z = "SigmaZ"
+COLUMNS = ("WaterDepth", "ShiftZ", "RayCount", "SigmaZ")
 SAMPLE_POINTS = 200_000
 """Points in histogram and uncertainty figure, evenly spread over the file."""
 PAGE = "report.html"
@@ -115,7 +115,6 @@ def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> Plain:
     `RunResults`; `resolution_m` is that of the rasters.
     """
     with open_cloud(path) as source:
-        dimensions = set(source.header.point_format.dimension_names)
         builder = MapsBuilder(
             source.header.mins[:2], source.header.maxs[:2], len(source), resolution_m
         )
@@ -125,10 +124,7 @@ def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> Plain:
             good = ~np.isin(np.asarray(points["classification"]), NOISE_CLASSES)
             points = points[good & ~np.asarray(points["withheld"]).astype(bool)]
             moved = np.asarray(points["RayCount"]) > 0
-            columns = ["WaterDepth", "ShiftZ", "RayCount"] + [SIGMA_Z] * (SIGMA_Z in dimensions)
-            values = np.zeros((int(moved.sum()), 4))
-            for i, name in enumerate(columns):
-                values[:, i] = np.asarray(points[name])[moved]
+            values = np.column_stack([np.asarray(points[name])[moved] for name in COLUMNS])
             builder.add(coordinates(points), moved, values)
             sample.append(values[-count % every :: every, [0, 3]])
             depth = values[:, 0]
