@@ -75,6 +75,8 @@ def bins_table(bins: Iterable[Figures]) -> str:
     return "\n".join(lines) + "\n"
 
 
+BINS, TAIL_PERCENT = 64, 0.5
+"""Of the histogram of vertical errors: its classes, and what it leaves out on either side."""
 SPARSER = 2.0
 """Ratio of the spacings of two clouds from which one is called sparse."""
 MIN_REACH_M, REACH_FACTOR = 1.0, 1.5
@@ -145,10 +147,6 @@ def figures_of(
         seconds=0.0,
         check_points=residuals,  # (p, 4): x, y, z of check points, and the error
     )
-
-
-BINS, TAIL_PERCENT = 64, 0.5
-"""Of the histogram of vertical errors: its classes, and what it leaves out on either side."""
 
 
 def both(figure: Callable[[Any], Any], cloud: Any) -> Figures:
