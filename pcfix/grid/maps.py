@@ -105,16 +105,14 @@ class MapsBuilder:
             np.add.at(sums, cells, summands)  # one by one: the same bits for any chunks
 
     def maps(self) -> Maps:
-        """Return the means."""
+        """Return the means; there is at least one point."""
         shape = self._rows, self._columns
         with np.errstate(invalid="ignore"):
             means = [self._sums[1] / self._sums[0], *(self._sums[3:] / self._sums[2])]
         heights, depth, shift, rays, variance = (_filled(one.reshape(shape)) for one in means)
         uncertainty = np.where(variance > 0.0, 1.96 * np.sqrt(variance), np.nan)
         known = np.argwhere(np.isfinite(heights))
-        (top, left), (last, right) = (
-            (known.min(axis=0), known.max(axis=0)) if len(known) else ((0, 0), np.array(shape) - 1)
-        )
+        (top, left), (last, right) = known.min(axis=0), known.max(axis=0)
         part = np.s_[top : last + 1, left : right + 1]  # the bounds include noise
         north = float(self._low[1]) + (self._rows - top) * self._cell_m
         place = float(self._low[0]) + left * self._cell_m, float(north), self._cell_m
