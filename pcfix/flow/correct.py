@@ -60,7 +60,7 @@ from pcfix.options.declare import File, taken
 from pcfix.refract.batch import UNLISTED
 from pcfix.refract.reconstructions import CAUSES
 from pcfix.refract.tally import Tally
-from pcfix.report.text import Summary
+from pcfix.report.summary import Summary
 from pcfix.version import __version__
 from pcfix.water.checks import as_surface, check_submerged, checked_points, refuse_under_water
 from pcfix.water.index import with_index

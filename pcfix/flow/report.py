@@ -24,7 +24,8 @@ from pcfix.report.adjustment import adjustment_tables
 from pcfix.report.comparison import evaluation
 from pcfix.report.page import Picture, Report, Table, render
 from pcfix.report.run import RunResults, in_short, run_report
-from pcfix.report.text import Summary, uncertainty_sentence
+from pcfix.report.summary import Summary
+from pcfix.report.text import uncertainty_sentence
 
 Plain = dict[str, Any]
 COLUMNS = ("WaterDepth", "ShiftZ", "RayCount", "SigmaZ")

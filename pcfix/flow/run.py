@@ -55,7 +55,7 @@ from pcfix.options.steps import CleanOptions, DistanceOptions
 from pcfix.options.survey import AdjustOptions, RunOptions
 from pcfix.report.adjustment import adjustment_sentence, all_notes
 from pcfix.report.comparison import signed_statistics
-from pcfix.report.text import Summary
+from pcfix.report.summary import Summary
 from pcfix.running import threads
 from pcfix.water.index import with_index
 

@@ -32,7 +32,8 @@ from pcfix.report.page import (
     new_figure,
     relief,
 )
-from pcfix.report.text import FEWEST, Summary, formal_words, summary_rows, uncertainty_sentence
+from pcfix.report.summary import Summary
+from pcfix.report.text import FEWEST, formal_words, summary_rows, uncertainty_sentence
 from pcfix.version import __version__
 
 if TYPE_CHECKING:

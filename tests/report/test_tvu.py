@@ -15,9 +15,9 @@ import pcfix
 from pcfix.compare.statistics import tvu_of
 from pcfix.options.correct import BudgetOptions
 from pcfix.refract.tally import UncertaintyTally
+from pcfix.report.summary import Summary
 from pcfix.report.text import (
     FEWEST,
-    Summary,
     budget_words,
     formal_words,
     summary_rows,

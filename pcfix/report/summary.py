@@ -1,0 +1,42 @@
+"""What a correction did, in numbers: the summary that ``--summary`` writes and the report shows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pcfix.sums import Figures
+
+
+class Summary(Figures):
+    """The results of a correction by name; `as_dict` is what ``--summary`` writes."""
+
+    @property
+    def absorbed(self) -> bool | None:
+        """Whether the poses have absorbed the refraction; None if that is unknown."""
+        return None if self.poses is None else self.poses["absorbed"]
+
+    @property
+    def why_no_order(self) -> str:
+        """Why no order of S-44 is claimed, as the whole bed may be off; empty if one is."""
+        made = self.made or {}
+        if self.settings["method"] == "regression":  # measured depths hold the bed
+            return "the line is of another cloud" if "regression" in self.settings else ""
+        if made.get("method") != "consistent" or not made.get("sure", bool(made.get("views_are"))):
+            return "the reconstruction type is not certain, or the method is for another one"
+        return {
+            True: "the poses absorbed the refraction",
+            None: "the poses were not checked for absorbed refraction",
+            False: "",
+        }[self.absorbed]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON; optional parts only if there are any."""
+        optional = ("labelling", "carried", "unsure", "poses", "shoreline", "fit", "part")
+        values = {
+            name: value for name, value in vars(self).items()
+            if name != "told" and not (name in optional and value is None)
+        }  # fmt: skip
+        if self.uncertainty is not None and self.why_no_order:
+            no_order = {"s44": None, "why_no_order": self.why_no_order}
+            values["uncertainty"] = {**self.uncertainty, **no_order}
+        return values
