@@ -11,7 +11,6 @@ import numpy as np
 from pcfix.blocks import blocks, bounds, empty, kept, mapped
 from pcfix.clean.neighbours import nearest_of
 from pcfix.errors import GeometryError, SettingError, bad_file
-from pcfix.grid import lattice
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import CompareRules
 
@@ -220,8 +219,14 @@ def spacing_m(xyz: FloatArray) -> float:
 
     That is the area of the squares with points, which are as large as to hold about three each.
     """
-    side = np.sqrt(POINTS_PER_SQUARE) * _mean_spacing_m(xyz)
-    return lattice.spacing_m(xyz, max(side, 1e-9))
+    low, high = bounds(xyz[:, :2])
+    side = max(np.sqrt(POINTS_PER_SQUARE) * _mean_spacing_m(xyz), 1e-9)
+    columns, rows = ((high - low) / side).astype(np.int64) + 1
+    taken = np.zeros(columns * rows, np.bool_)
+    for some in blocks(len(xyz)):
+        column, row = ((xyz[some, :2] - low) / side).astype(np.int64).T
+        taken[row * columns + column] = True
+    return float(side * np.sqrt(np.count_nonzero(taken) / len(xyz)))
 
 
 def near_in_plan(xy: FloatArray, other_xy: FloatArray, limit_m: float) -> BoolArray:
