@@ -89,8 +89,6 @@ class Lens:
     in_turn : bool
         The tangential and thin prism terms use x, y and r after the radial terms (COLMAP's
         RAD_TAN_THIN_PRISM_FISHEYE).
-    pixel_size_mm : float or None
-        Physical size, if the source has it and the other numbers are pixels.
     sensor : str
         Its name in the source.
     unit : {"px", "mm"}
@@ -113,23 +111,18 @@ class Lens:
     distortion_centre: tuple[float, float] = (0.0, 0.0)
     inverse: bool = False
     in_turn: bool = False
-    pixel_size_mm: float | None = None
     sensor: str = ""
     unit: Literal["px", "mm"] = "px"
 
     @property
     def pixel_size(self) -> float:
-        """Size of a pixel in the unit of the lens; nominal if it is not known."""
-        if self.unit == "px":
-            return 1.0
-        return self.pixel_size_mm or max(self.width, self.height) / NOMINAL_WIDTH_PX
+        """Size of a pixel in the unit of the lens; nominal for a lens in millimetres."""
+        return 1.0 if self.unit == "px" else max(self.width, self.height) / NOMINAL_WIDTH_PX
 
     @property
     def focal_px(self) -> float:
-        """Focal length in pixels; nominal if their size is not known."""
-        if self.unit == "px" or self.pixel_size_mm is not None:
-            return self.focal / self.pixel_size
-        return self.focal / max(self.width, self.height) * NOMINAL_WIDTH_PX
+        """Focal length in pixels, of nominal size for a lens in millimetres."""
+        return self.focal / self.pixel_size
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,22 +1,17 @@
 """How much is tried, in which order, and what a quick test may not do (tests/README.md)."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import tempfile
 import threading
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 from unittest import mock
 
 import pytest
 from hypothesis import settings
 from numba.core import event
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 # By day each run has the same examples, so that a change fails and not luck; at night others.
 settings.register_profile("default", max_examples=20, deadline=None, derandomize=True)

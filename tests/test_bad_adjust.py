@@ -1,7 +1,5 @@
 """A user's mistake with an adjustment gives one line, exit code 1, and nothing left behind."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 
@@ -177,11 +175,11 @@ def test_start_poses(refuse, model, code):
         if model == "upside down":
             turn = np.broadcast_to(np.eye(3), turn.shape)
         wild = replace(
-            made.cameras, rotations=np.ascontiguousarray(turn),
+            made.cameras, rotations=np.ascontiguousarray(turn), crs=EPSG,
             centres=made.cameras.centres + rng.normal(0.0, 0.2, made.cameras.centres.shape),
         )  # fmt: skip
         shutil.rmtree(folder / "model")
-        write_colmap(folder / "model", wild, made.ties, crs=EPSG)
+        write_colmap(folder / "model", wild, made.ties)
 
     refuse(code, change=change)
 

@@ -1,7 +1,5 @@
 """A user's mistake gives one line with a code, exit code 1, and nothing is written."""
 
-from __future__ import annotations
-
 import os
 import struct
 
@@ -33,7 +31,6 @@ TABLES = {
     "empty_field": "label,x,y,z\n" + ROWS + "d,456060,,90\n",
     "nan": "label,x,y,z\n" + ROWS + "d,456060,5432060,nan\n",
     "inf": "label,x,y,z\n" + ROWS + "d,-inf,5432060,90\n",
-    "decimal_comma": "label;x;y;z\na;456010,5;5432010;90\n",
     "empty_lines": "label,x,y,z\n\n\n" + ROWS + "\nd,1,2,east\n",
     "header_only": "label,x,y,z\n",
     "empty": "",
@@ -92,7 +89,8 @@ RECORDS = {"brace": b"{", "list": b"[]", "text": b'"no"', "object": b"{}", "bina
 
 def correct(*more: str, cloud: str = "cloud.las", output: str = "out.las") -> list[str]:
     """Return the words of a correction; those in `more` come last and win."""
-    return ["correct", cloud, output, "--cameras", "cameras.csv", "--water", str(WATER_M), *more]
+    given = ["--cameras", "cameras.csv", "--water", str(WATER_M), "--max-angle", "80"]
+    return ["correct", cloud, output, *given, *more]
 
 
 @pytest.fixture(scope="module")
@@ -250,9 +248,10 @@ CAMERAS = {
         "t_no_z.csv", "t_no_label.csv", "t_two_angles.csv", "angles.csv --sensor s_no_column.csv",
         "angles.csv --sensor s_empty.csv",
     ],
+    "cameras.no_frames": ["cameras.csv --max-angle auto"],
     "table.empty": ["t_header_only.csv", "angles.csv --sensor s_no_rows.csv"],
     "table.number": [
-        *(f"t_{name}.csv" for name in ("word", "empty_field", "nan", "inf", "decimal_comma",
+        *(f"t_{name}.csv" for name in ("word", "empty_field", "nan", "inf",
                                        "empty_lines", "nan_angle")),
         "angles.csv --sensor s_nan.csv",
     ],

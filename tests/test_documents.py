@@ -1,7 +1,5 @@
 """What the documents promise: tables made from the code, a short README, pictures of a size."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

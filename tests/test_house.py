@@ -1,20 +1,16 @@
 """The import rules: which room may import which, and who opens files."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys
+from collections.abc import Iterator
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
 from pcfix.kernels import KERNEL_SOURCES
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 HOUSE = Path(__file__).parents[1] / "pcfix"
 
@@ -131,33 +127,14 @@ def arrows() -> list[tuple[str, str]]:
     ]
 
 
-def circles() -> list[list[str]]:
-    """Return the groups of files that reach each other (Tarjan 1972)."""
+def circle() -> list[str]:
+    """Return files that import each other in a circle, or none."""
     graph = {one: others & trees().keys() for one, others in imports().items()}
-    number: dict[str, int] = {}
-    lowest: dict[str, int] = {}
-    stack: list[str] = []
-    found = []
-
-    def visit(name: str) -> None:
-        number[name] = lowest[name] = len(number)
-        stack.append(name)
-        for other in graph[name]:
-            if other not in number:
-                visit(other)
-                lowest[name] = min(lowest[name], lowest[other])
-            elif other in stack:
-                lowest[name] = min(lowest[name], number[other])
-        if lowest[name] == number[name]:
-            at = stack.index(name)
-            if len(stack) - at > 1:
-                found.append(sorted(stack[at:]))
-            del stack[at:]
-
-    for name in graph:
-        if name not in number:
-            visit(name)
-    return found
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as found:
+        return found.args[1]
+    return []
 
 
 def opened(node: ast.AST) -> str:
@@ -193,7 +170,7 @@ def test_simulator_is_independent(room: str) -> None:
 
 
 def test_no_circle() -> None:
-    assert not circles(), "\n".join(" ".join(circle) for circle in circles())
+    assert not circle()
 
 
 def test_only_io_opens_files() -> None:

@@ -1,7 +1,5 @@
 """Compiled kernels are cached, and compiled again when any of their sources changes."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

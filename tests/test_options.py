@@ -1,7 +1,5 @@
 """Options are declared once; every door takes them under the same names, by the same rules."""
 
-from __future__ import annotations
-
 import pytest
 
 import pcfix

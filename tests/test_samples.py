@@ -1,7 +1,5 @@
 """The scripts in samples/ run, the first before the others, as a reader would run them."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

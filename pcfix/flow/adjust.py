@@ -36,7 +36,6 @@ from pcfix.flow.runner import check_folder
 from pcfix.flow.surfaces import sample_of, view_of
 from pcfix.io.atomic import temporary_folder
 from pcfix.io.cameras.colmap import write_colmap
-from pcfix.io.cameras.opensfm import write_opensfm
 from pcfix.io.cameras.sensor import read_sensor, write_table
 from pcfix.io.crs import is_topocentric, parse_crs
 from pcfix.io.files import write_text
@@ -92,8 +91,8 @@ def adjust_cameras(
     model : path or Cameras
         See `pcfix.read_cameras`; with tie points, or together with the cloud that it made.
     out_dir : path, optional
-        A new folder for the adjusted model as ``colmap/`` and ``opensfm/``, for blocks with one
-        simple lens as ``cameras.csv``, ``ensemble.npz`` (see `pcfix.adjust.precision.Members`),
+        A new folder for the adjusted model as ``colmap/``, for blocks with one simple lens as
+        ``cameras.csv`` too, ``ensemble.npz`` (see `pcfix.adjust.precision.Members`),
         ``adjustment.json`` and ``report.html``, and for free water that is no plane ``water.tif``.
         Nothing is written without it.
     options : AdjustOptions, optional
@@ -293,7 +292,7 @@ def _write(folder: Path, found: Adjusted, model: str) -> None:
 
 def _write_models(folder: Path, found: Adjusted) -> None:
     """Write the model in each format that holds its lenses exactly."""
-    ties, cameras, opensfm = None, found.cameras, folder / "opensfm"
+    ties, cameras = None, found.cameras
     if found.source != "cloud":  # the adjusted tie points without outliers
         block, m = found.block, found.block.tie_points
         used = found.used & (block.owner < m)
@@ -302,12 +301,10 @@ def _write_models(folder: Path, found: Adjusted) -> None:
         ties = TiePoints(found.xyz[:m], Views(start, block.camera[used]), block.image_xy[used])
         ties = taken_ties(ties, np.flatnonzero(counts >= LEAST_VIEWS))
     writers = {
-        "colmap": partial(write_colmap, folder / "colmap", cameras, ties, crs=cameras.crs),
-        "opensfm": partial(write_opensfm, opensfm / "reconstruction.json", cameras, ties),
+        "colmap": partial(write_colmap, folder / "colmap", cameras, ties),
         "cameras.csv": partial(write_table, folder, cameras),
     }
     failed = []
-    opensfm.mkdir()
     for name, write in writers.items():
         try:
             write()
@@ -316,8 +313,6 @@ def _write_models(folder: Path, found: Adjusted) -> None:
             if name != "cameras.csv":  # which is for blocks with one simple lens
                 words = f"{name} was not written: {failed[-1]}"
                 found.notes.append(PcfixWarning("output.format", words, name=name))
-    if not any(opensfm.iterdir()):
-        opensfm.rmdir()
     if len(failed) == len(writers):
         raise InputError(
             "output.format", "No camera format can hold these lenses: " + " ".join(failed)

@@ -174,8 +174,6 @@ def _sensor(lenses: list[Lens], above_m: float) -> Plain:
     ``folded`` is the share of the frame beyond the fold of the distortion.
     """
     lens, alike = lenses[0], list(dict.fromkeys(lenses))
-    pixel = lens.pixel_size_mm
-    focal_px = lens.focal if lens.unit == "px" else None if pixel is None else lens.focal / pixel
     return {
         "name": lens.sensor if all(one.sensor == lens.sensor for one in alike) else "several",
         "images": len(lenses),
@@ -184,11 +182,9 @@ def _sensor(lenses: list[Lens], above_m: float) -> Plain:
         "focal": min(one.focal for one in alike),
         "focal_most": max(one.focal for one in alike),
         "unit": lens.unit,
-        "focal_mm": lens.focal if lens.unit == "mm" else pixel and lens.focal * pixel,
-        "pixel_size_um": pixel and 1000.0 * pixel,
         "projection": lens.projection,
         "distorted": _is_distorted(lens),
-        "gsd_m": above_m / focal_px if above_m > 0.0 and focal_px else None,
+        "gsd_m": above_m / lens.focal if above_m > 0.0 and lens.unit == "px" else None,
         "lenses": len(alike),
         "frames": len({(one.width, one.height) for one in alike}),
         "folded": max(_folded(one) for one in alike[:: 1 + len(alike) // 20]),
@@ -328,9 +324,6 @@ def _sensor_rows(s: Plain) -> Rows:
         f", {s['frames']} sizes as {frame}" if s["frames"] > 1 else f", {frame}",
         f", focal length {low if low == high else f'{low} to {high}'} {s['unit']}",
     ]
-    if s["pixel_size_um"] is not None:
-        words.append("" if s["lenses"] > 1 else f" = {s['focal_mm']:.3f} mm")
-        words.append(f", pixel {s['pixel_size_um']:.2f} um")
     words.append(f", {s['projection']}{', distorted' * s['distorted']}")
     if s["gsd_m"] is not None:
         words.append(f", GSD {100.0 * s['gsd_m']:.2f} cm at the water")

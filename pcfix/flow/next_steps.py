@@ -21,7 +21,7 @@ from pcfix.port.shapes import spec_of
 if TYPE_CHECKING:
     from pcfix.adjust.result import Adjusted
 
-MODELS = ("colmap", "opensfm/reconstruction.json", "cameras.csv")
+MODELS = ("colmap", "cameras.csv")
 """The models that an adjustment writes, the preferred one first."""
 FOLDER = "adjusted"
 """The folder of an adjustment in that of a run."""

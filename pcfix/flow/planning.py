@@ -25,7 +25,7 @@ from pcfix.flow.inputs import (
 )
 from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
 from pcfix.io.las.source import CHUNK_POINTS
-from pcfix.model import NOISE_CLASSES, FloatArray, Views, WaterPlane
+from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, Views, WaterPlane
 from pcfix.options.correct import CorrectOptions
 from pcfix.refract.batch import (
     FLAT_DEG,
@@ -101,6 +101,8 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
         reads = paths_in(options)
         check_shoreline(options.shoreline, overwrite=options.overwrite, inputs=reads)
     found = inputs.surface(view)
+    if match is None and not isinstance(options.cameras, Cameras):
+        _check_frames(blocks.cameras, options)
     offset = inputs.level_offset_m(blocks.cameras)
     plan = plan_of(options, inputs, view, blocks, found, match, offset)
     check_tilt(found.surface)
@@ -140,6 +142,21 @@ def plan_of(
         blocks.transfer, own_notes=notes,
         settings={} if folder is None else {"water_per_image": str(folder)},
     )  # fmt: skip
+
+
+def _check_frames(cameras: Cameras, options: CorrectOptions) -> None:
+    """Refuse cameras without angles or lens, as it is not known which of them saw a point.
+
+    On the sample scene the bed is 0.9 m off with all 40 cameras, 0.02 m with those in whose frame
+    the points are. A method or a limit of the rays that the user gives is used.
+    """
+    is_open = options.method == "auto" and options.max_angle == "auto"
+    if is_open and len(cameras) and cameras.lenses is None:
+        missing = "angles" if cameras.rotations is None else "lens"
+        sentence = f"The cameras have no {missing}, so the images of a point are not known. Export"
+        sentence += " poses with angles and give the lens (--sensor), or limit the rays"
+        sentence += " (--max-angle 35)."
+        raise SettingError("cameras.no_frames", sentence, missing=missing)
 
 
 def _check_port(options: CorrectOptions) -> None:

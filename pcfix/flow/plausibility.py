@@ -242,7 +242,7 @@ def _above(cameras: Cameras, xyz: FloatArray) -> float:
 def _pixel_m(cameras: Cameras, xyz: FloatArray) -> float | None:
     """Return the size of a pixel on the ground, None if the lenses do not state it."""
     lenses = cameras.lenses or ()
-    if not lenses or any(one.unit == "mm" and one.pixel_size_mm is None for one in lenses):
+    if not lenses or any(one.unit == "mm" for one in lenses):
         return None
     return _above(cameras, xyz) / float(np.median([one.focal_px for one in lenses]))
 
@@ -320,15 +320,18 @@ def _heights(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Res
         sized = "" if pixel is None else f", {100.0 * pixel:.3g} cm a pixel"
         by_them = f"by them {_above(cameras, cloud):.0f} m above the cloud{sized}"
         return Result(unchecked=f"heights (no tie points; {by_them})")
-    residual = _median_residual(cameras, ties)
-    if residual is None:
+    found = _worst_residual(cameras, ties)
+    if found is None:
         return Result(unchecked="heights (no tie points in the frames)")
+    residual, image = found
     if residual > MOST_RESIDUAL:
         return _doubt(
             "cameras.residuals",
-            f"Tie points have residuals of {100.0 * residual:.0f} % of the frame's width (median)."
-            " Poses, lens and points of the camera file do not belong together; export them again.",
+            f"Tie points have residuals of {100.0 * residual:.0f} % of the frame's width in image"
+            f" {image} (median). Poses, lens and points of the camera file do not belong together;"
+            " export them again.",
             share=residual,
+            image=image,
         )
     from scipy.spatial import cKDTree  # not quick to load
 
@@ -352,8 +355,11 @@ def _heights(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Res
     return Result(f"tie points in their image places and {abs(off):.2f} m from the cloud's heights")
 
 
-def _median_residual(cameras: Cameras, ties: TiePoints) -> float | None:
-    """Return the median image residual of tie points, relative to the frame's width."""
+def _worst_residual(cameras: Cameras, ties: TiePoints) -> tuple[float, str] | None:
+    """Return the largest median residual of an image, relative to its width, and its name.
+
+    The median of the block would hide a third of the images, such as all obliques.
+    """
     point = np.repeat(np.arange(len(ties.xyz)), np.diff(ties.views.start))
     rows = np.flatnonzero(np.isfinite(ties.xyz[point]).all(axis=1))
     rows = rows[:: 1 + len(rows) // (5 * TIES)]
@@ -363,7 +369,11 @@ def _median_residual(cameras: Cameras, ties: TiePoints) -> float | None:
     width = np.array([lens.width for lens in cameras.lenses or ()])[camera]
     image_xy = straight_images(ties.xyz[point[rows]], camera, cameras)
     residual = np.hypot(*(image_xy - ties.image_xy[rows]).T) / width
-    return float(np.median(np.where(np.isfinite(residual), residual, np.inf)))
+    residual = np.where(np.isfinite(residual), residual, np.inf)
+    counts = np.bincount(camera)
+    images = np.flatnonzero(counts >= min(LEAST_STEPS, counts.max()))
+    medians = [float(np.median(residual[camera == i])) for i in images]
+    return max(zip(medians, (cameras.labels[i] for i in images), strict=True))
 
 
 # Cameras against what was recorded in flight: GNSS positions, heights above take-off

@@ -109,7 +109,8 @@ class Table:
         if role not in self.place:
             return np.full(len(self.rows), np.nan)
         name, texts = self.name(role), self.column(role)
-        values = np.array([(exif_number if name in EXIF else number)(text) for text in texts])
+        points = [text if "." in text else text.replace(",", ".") for text in texts]
+        values = np.array([(exif_number if name in EXIF else number)(text) for text in points])
         for i in np.flatnonzero(~(np.abs(values) < TOO_LARGE)):
             if needed or texts[i].lower() not in UNKNOWN:
                 why = "too large" if math.isfinite(values[i]) else "not a finite number"

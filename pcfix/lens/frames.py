@@ -153,9 +153,14 @@ def listed_frames_of(cameras: Cameras) -> Frames:
     """
     if cameras.rotations is None or cameras.lenses is None:
         return no_frames(len(cameras))
-    sides = {one: BESIDE * max(one.width, one.height) for one in set(cameras.lenses)}
-    wider = {one: with_border(one, -side) for one, side in sides.items()}
-    return frames_of(replace(cameras, lenses=tuple(wider[one] for one in cameras.lenses)))
+    return frames_of(narrower(cameras, -BESIDE))
+
+
+def narrower(cameras: Cameras, share: float) -> Cameras:
+    """Return cameras with frames narrower on each side by a share of their longer side."""
+    lenses = cameras.lenses or ()
+    narrow = {one: with_border(one, share * max(one.width, one.height)) for one in set(lenses)}
+    return replace(cameras, lenses=tuple(narrow[one] for one in lenses))
 
 
 def with_border(lens: Lens, border: float) -> Lens:

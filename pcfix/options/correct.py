@@ -65,7 +65,7 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     )
     """Maximum incidence angle of a ray, from the surface normal; none for no limit. auto: no limit,
     but 35 for snell and the formulas if the cloud shows clearly that flatter rays were not used to
-    reconstruct it. [deg] [default: auto; 80 without lenses]"""
+    reconstruct it. [deg] [default: auto; must be given for poses without a lens]"""
     max_cameras: int | None = option(None, with_cameras=True, least=1)
     """Maximum number of rays per point; those closest to nadir are used. [default: no limit]"""
     occlusion: Literal["auto", "on", "off"] = option("auto", with_cameras=True)

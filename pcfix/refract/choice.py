@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.kernels import Span, device, in_tiles, kernel
-from pcfix.lens.algebra import dot, minus, row_of
-from pcfix.lens.frames import Frames, frames_of, holds, listed_frames_of, mark
-from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterMesh, WaterPlane, WaterRaster
+from pcfix.lens.algebra import dot, minus, row_of, scaled
+from pcfix.lens.frames import Frames, frames_of, holds, listed_frames_of, mark, narrower
+from pcfix.model import (
+    BoolArray,
+    Cameras,
+    FloatArray,
+    IntArray,
+    Views,
+    WaterMesh,
+    WaterPlane,
+    WaterRaster,
+)
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract import tiling
-from pcfix.refract.batch import Batch, Chosen, Survey
-from pcfix.refract.rays import pierce
+from pcfix.refract.batch import Batch, Chosen, Survey, normal_above
+from pcfix.refract.rays import light_near, pierce
 from pcfix.refract.tiling import TILE
 from pcfix.water.surface import Field, SurfaceAbove, Tin, build_fields, build_tin
 
@@ -27,6 +37,11 @@ block in another CRS is recognised by it."""
 
 ANY_NUMBER = 2**31
 """More rays than a point can have; a view list may name a camera twice."""
+
+
+REACH = 0.03
+"""Largest distance of the image of a true point from that of its apparent point, by the longer side
+of the frame: the residuals of refraction, which straight rays cannot fit."""
 
 
 class Rig(NamedTuple):
@@ -125,6 +140,32 @@ def views_in_frame(xyz: FloatArray, cameras: Cameras) -> Views:
     )
 
 
+def near_borders(batch: Batch, shift_m: FloatArray) -> IntArray:
+    """Return the points that are imaged in other frames than their apparent points would be.
+
+    The true points are the apparent ones plus `shift_m`, shape (m, 3).
+    """
+    survey, found = batch.survey, np.zeros(len(batch), np.bool_)
+    in_tiles(
+        _find_near_borders, tiling.tiles_of(batch), tiling.spatial_order(batch.xyz), batch.chosen(),
+        rig_of(survey), frames_of(survey.cameras), frames_of(narrower(survey.cameras, -REACH)),
+        frames_of(narrower(survey.cameras, REACH)), shift_m, found, points=len(batch),
+    )  # fmt: skip
+    return np.flatnonzero(found)
+
+
+def views_of_images(batch: Batch, shift_m: FloatArray) -> Views:
+    """Return the cameras whose frames hold the images of the true points, see `near_borders`."""
+    survey = batch.survey
+    wider = replace(survey, cameras=narrower(survey.cameras, -REACH))
+    views = chosen_views(replace(batch, survey=wider))
+    held = np.zeros(len(views.camera), np.bool_)
+    points = replace(batch, views=views).chosen()
+    in_tiles(_hold, len(batch), points, rig_of(survey), frames_of(survey.cameras), shift_m, held)
+    start = np.concatenate([[0], np.cumsum(held)])[views.start]
+    return Views(start, views.camera[held])
+
+
 def cameras_of_pairs(pairs: Views) -> Views:
     """Return the cameras in each point's pairs, each once, in the order of the list."""
     camera = np.asarray(pairs.camera, np.int64)
@@ -192,6 +233,63 @@ def _choose_all(
                     place[free + k] = near[kept[k]]
                 free += kept.size
             count[i + 1] = kept.size
+
+
+@kernel(allocates=True)
+def _find_near_borders(
+    span: Span, order: IntArray, points: Chosen, rig: Rig, frames: Frames, wide: Frames,
+    inner: Frames, shift: FloatArray, found: BoolArray,
+) -> None:  # fmt: skip
+    """Set which points have an image in other frames than their apparent points."""
+    low, high = tiling.corners_of(order[span[0] * TILE : span[1] * TILE], points.xyz)
+    around = tiling.near_cameras(np.arange(len(rig.centres)), wide, rig.centres, low, high)
+    for t in range(*span):
+        rows = order[t * TILE : (t + 1) * TILE]
+        low, high = tiling.corners_of(rows, points.xyz)
+        for c in tiling.near_cameras(around, wide, rig.centres, low, high):
+            # most frames hold a tile with all its images: only their borders cost time
+            if _encloses(inner, c, rig.centres[c], low, high):
+                continue
+            for i in rows:
+                e = minus(row_of(rig.centres, c), row_of(points.xyz, i))
+                if holds(frames, c, e) != _images(points, rig, frames, c, i, shift):
+                    found[i] = True
+
+
+@device
+def _encloses(
+    frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: FloatArray
+) -> bool:
+    """Whether the frame of camera c holds all corners of an upright box."""
+    for corner in range(8):
+        x = high[0] if corner & 1 else low[0]
+        y = high[1] if corner & 2 else low[1]
+        z = high[2] if corner & 4 else low[2]
+        if not holds(frames, c, (centre[0] - x, centre[1] - y, centre[2] - z)):
+            return False
+    return True
+
+
+@device
+def _images(points: Chosen, rig: Rig, frames: Frames, c: int, i: int, shift: FloatArray) -> bool:
+    """Whether camera c images a true point, whose light it sees in the direction w = k s - N."""
+    e, normal = minus(row_of(rig.centres, c), row_of(points.xyz, i)), normal_above(points, i)
+    # water that stood higher for this image: the point is lowered instead
+    h = normal[2] * (points.height[i] - (points.xyz[i, 2] - rig.offset[c]))
+    if not dot(normal, e) > h:
+        return holds(frames, c, e)
+    k, _, _, _, s = light_near(row_of(shift, i), e, normal, h, points.n)
+    return holds(frames, c, minus(normal, scaled(k, s)))
+
+
+@kernel
+def _hold(
+    span: Span, points: Chosen, rig: Rig, frames: Frames, shift: FloatArray, held: BoolArray
+) -> None:
+    """Set which cameras of the lists of some points image their true points."""
+    for i in range(*span):
+        for at in range(points.start[i], points.start[i + 1]):
+            held[at] = _images(points, rig, frames, points.camera[at], i, shift)
 
 
 @device(allocates=True)

@@ -13,9 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.model import FloatArray, IntArray, Outcome, WaterPlane
+from pcfix.model import FloatArray, IntArray, Outcome, Views, WaterPlane
 from pcfix.refract.batch import Batch, Intersection, Survey
-from pcfix.refract.choice import cameras_of_pairs, chosen_views, is_bent
+from pcfix.refract.choice import (
+    cameras_of_pairs,
+    chosen_views,
+    is_bent,
+    near_borders,
+    views_of_images,
+)
 from pcfix.refract.tiling import spatial_order
 from pcfix.refract.uncertainty import with_uncertainty
 from pcfix.water.surface import SurfaceAbove
@@ -83,20 +89,34 @@ def _corrected(batch: Batch) -> Intersection:
     method = getattr(import_module(f"pcfix.refract.{module}"), function)
     if views is not None and views.kind == "pairs":
         pairs, batch = views, replace(batch, views=cameras_of_pairs(views))
+
+    def solved(part: Batch, *listed: Views) -> Intersection:
+        known = with_uncertainty(method(part, *listed), part)
+        if survey.settings.unsure == "keep":
+            return known
+        unsure = (known.outcome == Outcome.CORRECTED) & part.seen_flat() & (batch.views is None)
+        return known._replace(unsure=unsure)
+
     if name in _IN_FRAME and _takes_all_in_frame(batch):
-        return with_uncertainty(method(batch), batch)
-    order = spatial_order(batch.xyz)
-    parts = []
-    for rows in batches(order):
-        part = with_rays(batch.take(rows))
-        listed = () if name != _PAIRS or pairs is None else (pairs.take(rows),)
-        found = method(part, *listed)
-        known = with_uncertainty(found, part)
-        if survey.settings.unsure != "keep":
-            unsure = (found.outcome == Outcome.CORRECTED) & part.seen_flat() & (batch.views is None)
-            known = known._replace(unsure=unsure)
-        parts.append(known)
-    return joined(parts, order, len(survey.cameras))
+        found = solved(batch)
+    else:
+        order = spatial_order(batch.xyz)
+        parts = []
+        for rows in batches(order):
+            listed = () if name != _PAIRS or pairs is None else (pairs.take(rows),)
+            parts.append(solved(with_rays(batch.take(rows)), *listed))
+        found = joined(parts, order, len(survey.cameras))
+    if name != METHODS["consistent"] or batch.views is not None:
+        return found
+    # an image shows the true point, near its border sometimes without the apparent one
+    again = near_borders(batch, found.shift_m)
+    again = again[found.outcome[again] == Outcome.CORRECTED]
+    if not len(again):
+        return found
+    rest = np.setdiff1d(np.arange(len(batch)), again, assume_unique=True)
+    part = with_rays(batch.take(again), found.shift_m[again])
+    both = [found.take(rest), solved(part)]
+    return joined(both, np.concatenate([rest, again]), len(survey.cameras))
 
 
 def _takes_all_in_frame(batch: Batch) -> bool:
@@ -153,12 +173,13 @@ def _method(batch: Batch) -> str:
     return _PAIRS if kind in ("pairs", "pair-images") else METHODS["consistent"]
 
 
-def with_rays(batch: Batch) -> Batch:
+def with_rays(batch: Batch, shift_m: FloatArray | None = None) -> Batch:
     """Return the batch with its cameras chosen, without occluded ones.
 
     They are those of its view list, of the model of a matcher, or all in frame. With the model,
     `consistent` takes all images that may have a depth of the point, and weights them; the other
-    methods get the steepest image and those it was matched with.
+    methods get the steepest image and those it was matched with. With `shift_m`, shape (m, 3), the
+    frames hold the images of the true points instead of the apparent points.
     """
     survey, learned = batch.survey, batch.survey.learned
     any_number = replace(survey, settings=replace(survey.settings, max_cameras=None))
@@ -170,7 +191,11 @@ def with_rays(batch: Batch) -> Batch:
         from pcfix.refract.matcher import steepest_and_partners, without_border
 
         whole = replace(whole, cameras=without_border(survey.cameras))
-    views, is_final = chosen_views(replace(batch, survey=whole)), whole.settings == survey.settings
+    if shift_m is not None:
+        views = views_of_images(replace(batch, survey=any_number), shift_m)
+    else:
+        views = chosen_views(replace(batch, survey=whole))
+    is_final = (any_number if shift_m is not None else whole).settings == survey.settings
     if learned.occluder is not None:
         from pcfix.refract.occlusion import visible_cameras
 

@@ -34,6 +34,10 @@ PATCH_WIDTH, WIDEST_PATCH = 0.04, 0.055
 """In flying heights: so wide that image borders cross many patches. In wider ones relief hides the
 discontinuities."""
 
+BORDER_SHARE = 0.08
+"""Share of the points, nearest to where the nearest image changes, that the patches of dense clouds
+lie around: only there the maps of nearest images leave discontinuities."""
+
 GRID_SHARE = 0.9
 """Share of neighbours whole steps apart from which a cloud is a grid."""
 
@@ -82,7 +86,11 @@ def _patches_of(batch: Batch, points: int) -> Patches | None:
     step = max(1, int(len(usable) / max(FEWEST_POINTS, points * covered)))
     usable = usable[::step]
     xy = batch.xyz[usable, :2]
-    seeds = np.unique(np.linspace(0, len(xy) - 1, PATCHES).astype(int))
+    close = np.arange(len(xy))
+    if points == PATCH_POINTS[0] and batch.views is None:
+        apart = _border_distance_m(xy, batch.survey.cameras.centres[:, :2])
+        close = np.sort(np.argsort(apart)[: max(PATCHES, int(BORDER_SHARE * len(xy)))])
+    seeds = np.unique(close[np.linspace(0, len(close) - 1, PATCHES).astype(int)])
     tree = cKDTree(xy, balanced_tree=False, compact_nodes=False)
     patch = usable[tree.query(xy[seeds], k=points)[1]]
     across = np.ptp(batch.xyz[patch, :2], axis=1).prod(axis=1)
@@ -91,6 +99,18 @@ def _patches_of(batch: Batch, points: int) -> Patches | None:
         return None
     rows, place = np.unique(patch, return_inverse=True)
     return Patches(rows, place.reshape(patch.shape), step)
+
+
+def _border_distance_m(xy: FloatArray, centres: FloatArray) -> FloatArray:
+    """Return how far points are, in plan, from where the nearest image changes, metres."""
+    from scipy.spatial import cKDTree
+
+    if len(centres) < 2:
+        return np.zeros(len(xy))
+    distance, near = map(np.asarray, cKDTree(centres).query(xy, k=2))
+    base = np.linalg.norm(centres[near[:, 0]] - centres[near[:, 1]], axis=1)
+    # of the bisector of the two centres: (d2^2 - d1^2) / 2 b
+    return np.asarray(np.diff(distance**2)[:, 0] / (2.0 * np.maximum(base, 1e-9)))
 
 
 class Squares:

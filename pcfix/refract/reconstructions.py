@@ -26,13 +26,16 @@ SURE = 2.3264
 SPACING_GSD, PRIOR_SPARSE = (8.0, 14.0), 8.0
 """What a large spacing of the points counts against single maps, in standard errors: their clouds
 are dense, and neighbours that are far apart show little of their scatter."""
-PRIOR_TRACKS, PRIOR_SOFTWARE = 0.7, 1.0
-"""What a large spacing counts for tracks, which are sparse, and what the software counts."""
-SHARE_ERROR, SHARE_WEIGHT = 0.08, 0.2
+PRIOR_TRACKS, PRIOR_SOFTWARE = (-0.5, 0.7), 1.0
+"""What a small and a large spacing count for tracks, as tie points are tens of pixels apart, and
+what the software counts."""
+SHARE_ERROR, SHARE_WEIGHT = 0.08, 0.1
 """Standard error of a share from what the models neglect, and the weight of shares where
 likelihoods are compared: it is small, as the maps of a point are chosen by a smooth bed."""
 WEAK = 3.0
 """Divisor of the evidence of clouds that were smoothed."""
+MOST_CONFIDENCE = 0.99
+"""Larger ones were not tested (`tests.benchmarks.detection`)."""
 LEAST_PATCHES = 100
 """With all their points corrected for each type; with fewer nothing is decided."""
 OPEN_ODDS = (20.0, 100.0)
@@ -147,6 +150,7 @@ class Verdict(NamedTuple):
     sigma: float  # standard error of both
     deeper_m: float  # mean depth of the runner-up's bed below the chosen one
     patches: int  # 0 without evidence
+    confidence: float  # probability that the type is right, and none of the others
     model_uncertainty: ModelUncertainty
     by: str = ""  # other evidence that decided; empty if the discontinuities did
     is_given: bool = False  # whether the user set the type
@@ -154,14 +158,6 @@ class Verdict(NamedTuple):
     of: str = ""  # the points it is about; empty for all
     straight: tuple[float, float] | None = None
     candidates: tuple[tuple[str, float], ...] = ()
-
-    @property
-    def confidence(self) -> float:
-        """Probability that the chosen type is right and not the runner-up.
-
-        At most 0.99, as no larger ones were tested (`tests.benchmarks.detection`).
-        """
-        return min(0.5 * (1.0 + math.erf(self.errors / math.sqrt(2.0))), 0.99)
 
     @property
     def is_fused(self) -> bool:
@@ -306,7 +302,11 @@ def weigh(
     part = batch.take(sample.rows)
     survey = replace(part.survey, level_offset_m=None)
     part = replace(part, survey=survey, level_sigma_m=None)
-    beds = _beds(part, replace(batch, survey=part.survey), sample, types)
+    sparse = 1.0
+    if part.survey.cameras.lenses is not None:
+        spacing = patches.spacing_gsd(part, sample.place, step * sample.step)
+        sparse = float(np.interp(np.log(spacing), np.log(SPACING_GSD), (0.0, 1.0)))
+    beds = _beds(part, replace(batch, survey=part.survey), sample, types, sparse)
     if beds is None or (given is not None and given not in beds.types):
         return None
     remarks, among, by = _remarks(part, sample.place), list(range(len(beds.types))), ""
@@ -314,7 +314,7 @@ def weigh(
         beds = beds._replace(errors=beds.errors / WEAK)
     if given is None:
         if part.views is None and reconstructions is not LIMITS:
-            beds, by = _with_prior(part, beds, sample, step, hint)
+            beds, by = _with_prior(beds, sparse, hint)
         best, other = beds.rank(among)
     else:
         best = beds.types.index(given)
@@ -322,6 +322,8 @@ def weigh(
         first, second = beds.rank(among)
         other = second if first == best else first
     deeper_m = float(np.nanmean((beds.z[best] - beds.z[other])[beds.place]))
+    better = beds.errors[best, among] if beds.patches else np.zeros(2)
+    confidence = math.prod(0.5 * math.erfc(-one / math.sqrt(2.0)) for one in better)
     straight = None
     if beds.patches and not remarks and part.original_model is None:
         share, sigma = shares(part, beds.place, np.array([beds.z[best], part.xyz[:, 2]]))
@@ -335,6 +337,7 @@ def weigh(
         sigma=float(beds.sigma[best, other]),
         deeper_m=deeper_m,
         patches=beds.patches,
+        confidence=min(confidence, MOST_CONFIDENCE),
         model_uncertainty=_model_uncertainty(part, beds, best, among),
         by=by,
         is_given=given is not None,
@@ -347,9 +350,12 @@ def weigh(
 
 
 def _beds(
-    part: Batch, batch: Batch, sample: Patches, types: tuple[Reconstruction, ...]
+    part: Batch, batch: Batch, sample: Patches, types: tuple[Reconstruction, ...], sparse: float
 ) -> _Beds | None:
-    """Correct the points of the patches for each type; None if fewer than two can."""
+    """Correct the points of the patches for each type; None if fewer than two can.
+
+    The cloud is dense (0) or `sparse` (1), or in between.
+    """
     around = patches.others_around(batch, sample.rows)
     z = np.array([_heights(part, around, one) for one in types])
     covered = np.isfinite(z).sum(axis=1)
@@ -366,10 +372,12 @@ def _beds(
     if part.views is None and LIMITS[0] not in types:
         errors = (0.5 - share) / np.hypot(sigma, SHARE_ERROR)
         likely = [_log_likelihood(part, place, one, z[i]) for i, one in enumerate(types)]
-        single = _is_single(types)
-        for a, b in zip(*np.nonzero(single[:, None] | single), strict=True):
-            errors[a, b] *= SHARE_WEIGHT
-            errors[a, b] += standard_errors(likely[a], likely[b])
+        from_maps = np.array([one.words not in (_TRACKS, _PAIRS) for one in types])
+        # the maps of a point are chosen by a smooth bed: their likelihood allows for that, the
+        # discontinuities do not; but neighbours that are far apart show little of their scatter
+        for a, b in zip(*np.nonzero(from_maps[:, None] | from_maps), strict=True):
+            errors[a, b] *= SHARE_WEIGHT + sparse * (1.0 - SHARE_WEIGHT)
+            errors[a, b] += (1.0 - sparse) * standard_errors(likely[a], likely[b])
     np.fill_diagonal(share, -np.inf)
     np.fill_diagonal(errors, np.inf)
     return _Beds(types, z, place, len(place), share, sigma, errors)
@@ -378,9 +386,7 @@ def _beds(
 def _is_single(types: tuple[Reconstruction, ...]) -> BoolArray:
     """Return which types are single maps.
 
-    They are compared with the others by likelihood: they predict little but the scatter of
-    neighbours, or discontinuities at few places. The others are compared with each other by the
-    discontinuities only, which do not depend on the noise.
+    They predict little but the scatter of neighbours, or discontinuities at few places.
     """
     return np.array([one.words in (_SINGLE, _NEAREST) for one in types])
 
@@ -398,15 +404,11 @@ def _log_likelihood(part: Batch, place: IntArray, one: Reconstruction, z: FloatA
     return log_likelihood(terms, part.xyz[place, 2], level, each, patches.gsd_m(part))
 
 
-def _with_prior(
-    part: Batch, beds: _Beds, sample: Patches, step: float, hint: Hint | None
-) -> tuple[_Beds, str]:
+def _with_prior(beds: _Beds, sparse: float, hint: Hint | None) -> tuple[_Beds, str]:
     """Add what is known of the types by spacing and software; return what decided, if these did."""
     words = [one.words for one in beds.types]
-    spacing = patches.spacing_gsd(part, sample.place, step * sample.step)
-    sparse = float(np.interp(np.log(spacing), np.log(SPACING_GSD), (0.0, 1.0)))
     is_single, tracks = _is_single(beds.types), np.array([one == _TRACKS for one in words])
-    prior = sparse * (PRIOR_TRACKS * tracks - PRIOR_SPARSE * is_single)
+    prior = np.interp(sparse, (0.0, 1.0), PRIOR_TRACKS) * tracks - sparse * PRIOR_SPARSE * is_single
     errors = beds.errors + prior[:, None] - prior
     if hint is not None:
         likely = np.array([PRIOR_SOFTWARE * (one in hint.words) for one in words])

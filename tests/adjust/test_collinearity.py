@@ -1,7 +1,5 @@
 """Analytic derivatives of one observation against central differences."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,9 +17,8 @@ from pcfix.adjust.collinearity import (
 )
 from pcfix.adjust.problem import port_of, port_row, prepare
 from pcfix.lens.imaging import coefficients
-from pcfix.model import Cameras, Lens, TiePoints, Views, WaterPlane, WaterRaster
+from pcfix.model import Cameras, Lens, TiePoints, Views, WaterPlane
 from pcfix.port.shapes import DomePort, FlatPort
-from pcfix.water.surface import build_field
 from tests.utils.compiled import compiled
 
 image_and_all_gradients = compiled(image_and_all_gradients)
@@ -57,14 +54,6 @@ def given_of(**changes):
     ties = TiePoints(np.zeros((1, 3)), Views(np.array([0, 1]), np.array([0])), np.zeros((1, 2)))
     block = plain_block(cameras, ties, WaterPlane(-60.0), 1.34, np.array([True]))
     return prepare(block, Unknowns(lens=()), np.zeros(3))[0].given._replace(**changes)
-
-
-def planar_raster(b: float, c: float):
-    """Return a raster that is the plane z = b x + c y - 60, with one slope everywhere."""
-    x = -200.0 + 5.0 * (np.arange(80) + 0.5)
-    y = 200.0 - 5.0 * (np.arange(80) + 0.5)
-    raster = WaterRaster(b * x[None, :] + c * y[:, None] - 60.0, -200.0, 200.0, (5.0, 5.0))
-    return given_of(field=build_field(raster))
 
 
 def pose(seed: int):
@@ -135,23 +124,6 @@ def test_gradients(name, water, z):
         assert not out[:, SURFACE:].any()  # above the water nothing depends on it
 
 
-def test_nadir():
-    q, centre, given = np.array([0.0, 0.0, -66.0]), np.zeros(3), given_of()
-    _, out, _ = gradients(q, centre, DOWN, coefficients(PLAIN), WATERS["level"], given)
-    close(out, differences(q, centre, DOWN, coefficients(PLAIN), WATERS["level"], given))
-
-
-@pytest.mark.parametrize("bend", [(0.0, 0.0, 0.0), (4e-4, -3e-4, 6e-4)], ids=["flat", "bent"])
-def test_curved_water(bend):
-    """A curvature of 4e-4 / m is 4 cm in 10 m, which no water has."""
-    given, water = given_of(curved=True), (-60.0, 0.01, -0.02, 1.34, *bend)
-    for seed in range(3):
-        centre, rotation = pose(seed)
-        q = np.array([*np.random.default_rng(seed + 50).uniform(-12.0, 12.0, 2), -68.0])
-        _, out, _ = gradients(q, centre, rotation, coefficients(BROWN), water, given)
-        close(out, differences(q, centre, rotation, coefficients(BROWN), water, given))
-
-
 @pytest.mark.parametrize("port", [
     FlatPort(0.02, 0.008), FlatPort(0.02, 0.0, 1.49, (0.05, -0.03, 1.0)),
     DomePort(0.05, 0.004, 1.49, (0.003, -0.002, 0.006)),
@@ -168,21 +140,6 @@ def test_port(port):
     wanted = differences(q, centre, rotation, lens, water, surface, port)
     close(out[:, known], wanted[:, known])
     close(out[:, SURFACE + 3], wanted[:, SURFACE + 3])
-
-
-@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.02, -0.03)])
-def test_raster(slope):
-    """Of a raster that is a plane: its slope does not change with the place."""
-    surface, water, lens = planar_raster(*slope), (0.2, 0.0, 0.0, 1.34), coefficients(BROWN)
-    centre, rotation = pose(4)
-    q = np.array([7.0, -9.0, -66.0])
-    uv, out, _ = gradients(q, centre, rotation, lens, water, surface)
-    wanted = differences(q, centre, rotation, lens, water, surface)
-    known = [*range(10), 12]  # slopes cannot be free over a raster
-    close(out[:, known], wanted[:, known])
-    plane = (-60.0 + water[0], *slope, 1.34)
-    # px: the raster's corners are the plane's to rounding
-    np.testing.assert_allclose(uv, at(q, centre, rotation, lens, plane, given_of()), atol=1e-6)
 
 
 @pytest.mark.parametrize("name", LENSES)

@@ -1,7 +1,5 @@
 """Points that lie on the water or on planes, and planes that are parallel."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -11,11 +9,10 @@ from pcfix.adjust.block import NO_CONDITIONS, PLANES, Conditions, Unknowns
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import prepare
 from pcfix.adjust.result import redundancy_of
-from pcfix.model import WaterMesh, WaterPlane, WaterRaster
+from pcfix.model import WaterPlane
 from tests.utils import tie_blocks
 from tests.utils.adjust_twin import Twin
 from tests.utils.curved_water import under_bent_water
-from tests.utils.nightly import mostly_nightly
 from tests.utils.tie_blocks import block_of
 from tests.utils.tie_points import simulate_tie_points
 
@@ -168,20 +165,3 @@ def test_same_as_scipy():
         for name, value in added.items():
             row = next(row for row in precision.shared if row.name == name)
             assert abs(row.added - value) < 1e-3 * row.sigma
-
-
-@pytest.mark.parametrize("kind", mostly_nightly(["raster", "mesh"], "raster"))
-def test_level_surface(kind):
-    made = scene(90)
-    made, conditions = put(made, {"water": (np.arange(8), at_level(made))})
-    (x, y, _), level = np.round(made.cameras.centres.mean(axis=0)), made.water.a + 0.2
-    corners = [[x + i, y + j, level] for i, j in ((-99, -99), (99, -99), (99, 99), (-99, 99))]
-    water = {
-        "raster": WaterRaster(np.full((40, 40), level), x - 100.0, y + 100.0, (5.0, 5.0)),
-        "mesh": WaterMesh(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]])),
-    }[kind]
-    _, found, precision = adjusted(block_with(made, conditions, water=water), LEVEL)
-    plane = block_with(made, conditions, water=WaterPlane(level))
-    _, wanted, as_plane = adjusted(plane, LEVEL)
-    assert found.shared[0] == pytest.approx(wanted.shared[0], abs=1e-6)  # m
-    assert precision.sigma_of("level") == pytest.approx(as_plane.sigma_of("level"), rel=1e-6)

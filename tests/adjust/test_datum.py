@@ -1,7 +1,5 @@
 """GNSS positions with an offset, too few of them, or on a line."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -5,23 +5,32 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcfix.adjust.block import true_start
+from pcfix.adjust.block import Unknowns, true_start
 from pcfix.adjust.diagnosis import bed_sign, gnss_sign, tie_point_sign
 from pcfix.adjust.from_cloud import mended
 from pcfix.adjust.problem import intersect_fixed
 from pcfix.model import WaterPlane
-from tests.utils.bent_blocks import GNSS_M, LEVEL_M, N, TrueBlock
+from tests.utils.block_kinds import GNSS_M, KindBlock, N
 
-WATER = WaterPlane(LEVEL_M)
+WATER = WaterPlane(0.0)
+LENS = Unknowns(lens=("f", "cx", "cy"))
+
+
+def block(seed):
+    return KindBlock("20 % land", seed)
+
+
+def with_gnss(made, cameras):
+    return replace(cameras, gnss=made.cameras.gnss)
 
 
 def tie_sign(true, cameras, n=N):
     straight = intersect_fixed(true.block(cameras, None))
-    depth = LEVEL_M - straight.xyz[:, 2]
+    depth = -straight.xyz[:, 2]
     wet = depth > 0
     begin = true_start(straight.xyz, WATER, n, wet)
-    block = replace(true.block(cameras, WATER, wet), xyz=begin, refractive_index=n)
-    return tie_point_sign(straight, intersect_fixed(block), depth), straight.xyz
+    bent = replace(true.block(cameras, WATER, wet), xyz=begin, refractive_index=n)
+    return tie_point_sign(straight, intersect_fixed(bent), depth), straight.xyz
 
 
 def gnss_signs(cameras, apparent):
@@ -34,8 +43,10 @@ def gnss_signs(cameras, apparent):
 
 @pytest.mark.parametrize("poses", ["true", "adjusted with water"])
 def test_right_poses(poses):
-    true = TrueBlock(1)
-    cameras = true.cameras if poses == "true" else true.adjusted(WATER)
+    true = block(1)
+    cameras = true.cameras
+    if poses != "true":
+        cameras = with_gnss(true, true.adjusted(cameras, LENS, WATER))
     sign, apparent = tie_sign(true, cameras)
     assert sign.speaks is False
     # 50 blocks with true poses gave 0.01 to 0.07
@@ -46,8 +57,8 @@ def test_right_poses(poses):
 
 
 def test_absorbed():
-    true = TrueBlock(1)
-    bent = true.adjusted()
+    true = block(1)
+    bent = with_gnss(true, true.adjusted(true.cameras, LENS))
     sign, apparent = tie_sign(true, bent)
     assert sign.speaks is True
     figures = sign.figures
@@ -63,7 +74,7 @@ def test_absorbed():
 
 
 def test_random_errors():
-    true = TrueBlock(4)
+    true = block(4)
     rng = np.random.default_rng(4)
     centres = true.cameras.centres + rng.normal(0.0, 0.1, true.cameras.centres.shape)
     moved = replace(true.cameras, centres=centres)

@@ -1,7 +1,5 @@
 """Adjustment by tie points: noise, outliers, datum, check points and lens parameters."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -10,8 +8,6 @@ import pytest
 
 from pcfix.adjust.block import Material, Unknowns, block_of, check_datum
 from pcfix.adjust.from_ties import adjust_ties, default_lens
-from pcfix.adjust.problem import prepare
-from pcfix.adjust.solve import solve
 from tests.utils.codes import refused
 from tests.utils.nightly import mostly_nightly
 from tests.utils.tie_blocks import block_of as simple_block
@@ -119,18 +115,6 @@ def test_marks_are_no_outliers():
     assert worst.rms_px > 10.0
 
 
-@pytest.mark.parametrize(
-    ("gnss", "unknowns"),
-    [(0, FOCAL), (2, FOCAL), (0, replace(FOCAL, fixed_images=("IMG_0001.JPG",)))],
-)
-def test_no_datum(gnss, unknowns):
-    whole = block(scene())
-    few = whole.gnss_xyz.copy()
-    few[gnss:] = np.nan
-    with refused("adjust.no_datum", gnss=gnss, control=0):
-        check_datum(replace(whole, gnss_xyz=few), unknowns)
-
-
 def test_datum():
     made = scene()
     labels = made.cameras.labels
@@ -158,17 +142,6 @@ def test_weak_lens():
     named = adjust_ties(block(made), replace(FOCAL, lens=lens), choose_lens=False)
     assert named.unknowns.lens == lens
     assert not named.notes
-
-
-def test_least_squares():
-    made = scene()
-    whole = simple_block(made)
-    found = adjust_ties(whole, FOCAL, sigma_px=0.5, outliers=False)
-    problem, start = prepare(whole, FOCAL)
-    once = solve(problem, start)
-    # m: both stop where the cost no longer changes
-    centres = found.cameras.centres - problem.origin
-    np.testing.assert_allclose(centres, once.state.centres, atol=1e-6)
 
 
 def test_noise_differs():

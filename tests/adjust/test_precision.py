@@ -1,7 +1,5 @@
 """Covariances against the slow twin and against repeats; members of the ensemble."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -15,13 +13,12 @@ from pcfix.adjust.problem import solved_cameras, water_of
 from pcfix.adjust.solve import moved_by
 from tests.utils.adjust_twin import Twin
 from tests.utils.codes import refused
-from tests.utils.tie_blocks import adjusted, block_of, clear_of_the_waterline
+from tests.utils.tie_blocks import adjusted, block_of
 from tests.utils.tie_points import simulate_tie_points
 
 FREE = np.inf
 
 
-REPEATS = 120
 TINY = {
     "area_m": (25, 20), "greatest_depth_m": 6, "forward_overlap": 0.6, "side_overlap": 0.5,
     "obliques_deg": 25, "oblique_directions": 2, "oblique_share": 0.3, "position_noise_m": 0.05,
@@ -83,46 +80,6 @@ def test_same_as_twin(poses, tilt):
     unit = unit[:, :, None] * unit[:, None, :]
     assert np.abs((ours - theirs) / unit).max() < 2e-3
     assert precision.centre_sigma_m == pytest.approx(np.sqrt(ours[:, [3, 4, 5], [3, 4, 5]]))
-
-
-@cache
-def repeats():
-    """Return errors over standard errors of many draws of all noise, by kind of unknown."""
-    made = simulate_tie_points(
-        60, seed=5, area_m=(25, 20), greatest_depth_m=6, forward_overlap=0.6, side_overlap=0.5,
-        obliques_deg=30, oblique_directions=2, oblique_share=0.4,
-    )  # fmt: skip
-    made = clear_of_the_waterline(made, 0.3)
-    unknowns = Unknowns(lens=("f",), surface={"level": FREE, "index": FREE})
-    rng, rows, m = np.random.default_rng(11), [], len(made.truth)
-    for _ in range(REPEATS):
-        problem, found = adjusted(block_of(made.measured(rng), control=True), unknowns)
-        precision = precision_of(problem, found)
-        state = found.state
-        turn = state.rotations @ made.true_cameras.rotations.transpose(0, 2, 1)
-        centres = state.centres + problem.origin - made.true_cameras.centres
-        off = np.column_stack([Rotation.from_matrix(turn).as_rotvec(), centres])
-        off = off / np.sqrt(np.einsum("kii->ki", precision.pose_covariance))
-        xyz = (state.xyz[:m] + problem.origin - made.truth) / precision.point_sigma_m[:m]
-        by = np.array([row.added / row.sigma for row in precision.shared])
-        together = by @ np.linalg.solve(precision.correlation, by) / len(by)
-        rows.append({
-            "angles": off[:, :3], "centres": off[:, 3:], "land": xyz[~made.is_wet],
-            "bed": xyz[made.is_wet], "f, level and index": np.sqrt(together), "cost": found.cost,
-        } | dict(zip(problem.names, by, strict=True)))  # fmt: skip
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}, problem
-
-
-@pytest.mark.parametrize("kind", ["angles", "centres", "land", "bed", "f, level and index"])
-def test_normalised_errors(kind):
-    """Three numbers over so many repeats, with their correlations: 4 percent, others less."""
-    assert 0.9 < np.sqrt((repeats()[0][kind] ** 2).mean()) < 1.1
-
-
-@pytest.mark.parametrize("kind", ["f", "level", "index"])
-def test_normalised_error_of_unknown(kind):
-    """Of a standard deviation from so many repeats the standard error is 6 percent."""
-    assert 0.82 < np.sqrt((repeats()[0][kind] ** 2).mean()) < 1.18
 
 
 def test_similarity():

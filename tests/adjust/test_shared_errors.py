@@ -1,7 +1,5 @@
 """Standard errors hold where observations share errors, and are no larger where they do not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The adjustment on simulated blocks: it comes home, and it is what scipy makes of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -8,8 +8,6 @@ below and land above the water by 10 cm in the truth; errors of the projection c
 against the true model, in the frame of the map.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import tempfile

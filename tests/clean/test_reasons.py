@@ -1,7 +1,5 @@
 """Noise that is found, terrain that is spared, and input that is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

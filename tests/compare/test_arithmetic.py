@@ -4,14 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
-from pcfix.clean.neighbours import nearest_distance
 from pcfix.compare.match import heights_at
 from pcfix.compare.sections import parse_line, section_along
 from pcfix.compare.statistics import binned, fit_line, statistics_of
 
-pytestmark = pytest.mark.quick_but("test_c2c")
+pytestmark = pytest.mark.quick
 
 EAST_M, NORTH_M = 456_000.0, 5_432_000.0
 
@@ -32,41 +30,6 @@ def tilted_grid(side=30, step_m=0.5):
     """Return a grid on the plane z = 2 + 0.1 x - 0.2 y (x, y from the grid's corner)."""
     x, y = (a.ravel() * step_m for a in np.meshgrid(np.arange(side), np.arange(side)))
     return np.column_stack([x + EAST_M, y + NORTH_M, 2.0 + 0.1 * x - 0.2 * y])
-
-
-def on_the_plane(xy):
-    return 2.0 + 0.1 * (xy[:, 0] - EAST_M) - 0.2 * (xy[:, 1] - NORTH_M)
-
-
-def test_c2c():
-    """All pairs; clouds of any distribution, far from each other too, against scipy's tree."""
-    rng = np.random.default_rng(30)
-    clouds = [
-        scattered(300, 1),
-        lifted(scattered(400, 2), 2.0),
-        lifted(scattered(400, 3), 90.0),
-        rng.uniform(0.0, 1.0, (900, 3)),
-        rng.normal(0.0, 1.0, (900, 3)) ** 5,  # dense in the middle, thin outside
-        np.column_stack([np.arange(900.0), np.zeros(900), rng.uniform(0, 5, 900)]),
-        np.repeat(rng.uniform(0.0, 9.0, (30, 3)), 30, axis=0),
-        np.column_stack([np.arange(900.0), np.arange(900.0), np.zeros(900)]),
-        np.array([[1.0, 2.0, 3.0]]),
-    ]
-    slow = [min(math.dist(p, q) for q in clouds[1].tolist()) for p in clouds[0].tolist()]
-    np.testing.assert_allclose(nearest_distance(clouds[0], clouds[1], 3), slow, rtol=0, atol=5e-9)
-    for reference in clouds:
-        for cloud in clouds:
-            tree, _ = cKDTree(reference).query(cloud)
-            # coordinates of 5e6 m are known to 1e-9 m in float64
-            np.testing.assert_allclose(nearest_distance(cloud, reference, 3), tree, atol=5e-9)
-
-
-def test_plane_exact():
-    rng = np.random.default_rng(5)
-    xy = np.array([EAST_M, NORTH_M]) + rng.uniform(1.0, 13.0, (500, 2))
-    height = heights_at(xy, tilted_grid(), 8)
-    # the plane is exact; only rounding is left
-    np.testing.assert_allclose(height, on_the_plane(xy), atol=1e-9)
 
 
 def test_nearest_height_without_plane():

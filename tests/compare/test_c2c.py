@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-import re
 
 import laspy
 import numpy as np
@@ -14,7 +13,7 @@ import pcfix
 from pcfix.compare.match import spacing_m
 from pcfix.compare.statistics import distribution_of
 from pcfix.flow.compare import compare_clouds
-from pcfix.report.comparison import comparison_text, evaluation, gauss
+from pcfix.report.comparison import evaluation
 from tests.compare.test_files import LIDAR, SCENE, lifted, plane, write_las
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
@@ -126,24 +125,6 @@ def test_classes_of_cloudcompare(count, classes):
     touching = [(0.0, 0.5), (0.5, 1.0), (1.0, 3.0)]
     shares = distribution_of(np.array([0.0, 0.5, 0.5, 1.0, 2.0]), None, touching).shares
     assert [one.share for one in shares] == [0.2, 0.4, 0.4]
-
-
-def test_gauss_as_in_cloudcompare(both):
-    values = np.concatenate([np.full(500, 1.0), np.full(500, 3.0)])
-    plain = compare_clouds(LIDAR, LIDAR, c2c_only=True).as_dict()
-    plain["c2c"]["after"]["statistics"] |= {"mean_m": 2.234814, "sd_m": 1.441840}
-    plain["c2c"]["after"]["histogram"]["counts"] = [1] * 1136
-    said = "Gauss: mean = 2.234814 / std.dev. = 1.441840 [1136 classes]"  # of Figure 18a
-    assert gauss(json.loads(json.dumps(plain))["c2c"]["after"]) == said
-    of = distribution_of(values).statistics
-    assert (of.mean_m, of.sd_m) == (2.0, 1.0)  # divided by n, as CloudCompare does
-    text, before = comparison_text(both), both.c2c.before.statistics
-    share = both.also[0].c2c_from_reference.shares[0].share
-    for name, cells in (
-        ("to reference, uncorrected", f"{before.mean_m:.6f}"),
-        ("from reference, Dietrich", f"{100 * share:.1f} %"),
-    ):
-        assert re.search(rf"  {name} .* {re.escape(cells)}", text)
 
 
 def test_sparse_reference(tmp_path, corrected):

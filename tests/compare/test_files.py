@@ -16,34 +16,15 @@ from pyproj import CRS
 import pcfix
 from pcfix.compare.statistics import own_of, statistics_of
 from pcfix.flow.compare import compare_clouds
+from tests.utils.clouds import write_las
 from tests.utils.codes import refused
-from tests.utils.program import run_pcfix
-from tests.utils.shared import ROOT
+from tests.utils.shared import SCENE
 
-SCENE = ROOT / "samples" / "scene"
 LIDAR = SCENE / "lidar.laz"
 EAST_M, NORTH_M = 410_000.0, 4_650_000.0
 py4dgeo = pytest.mark.skipif(
     importlib.util.find_spec("py4dgeo") is None, reason="needs the extra m3c2"
 )
-
-
-def write_las(path, xyz, classes=0, crs=32633, withheld=0, **extra):
-    """Write a cloud of mm steps and return its path."""
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    header.scales, header.offsets = np.full(3, 0.001), np.floor(np.min(xyz, axis=0))
-    for name in extra:
-        header.add_extra_dim(laspy.ExtraBytesParams(name, "float64"))
-    if crs is not None:
-        header.add_crs(CRS.from_user_input(crs))
-    las = laspy.LasData(header)
-    las.xyz = np.asarray(xyz)
-    las.classification = np.broadcast_to(classes, len(xyz))
-    las.withheld = np.broadcast_to(withheld, len(xyz))
-    for name, values in extra.items():
-        las[name] = values
-    las.write(path)
-    return path
 
 
 def plane(count, seed, side_m=60.0, noise_m=0.01):
@@ -307,15 +288,6 @@ def test_output_files(tmp_path, corrected):
         compare_clouds(corrected, LIDAR, **options)
     compare_clouds(corrected, LIDAR, overwrite=True, **options)  # fewer sections
     assert [p.name for p in sorted(out.glob("section_*"))] == ["section_01.csv", "section_02.csv"]
-
-
-def test_command(tmp_path, corrected, sample):
-    words = [corrected, LIDAR, "--out-dir", tmp_path / "o", "--sections", "1"]
-    done = run_pcfix("compare", *words)
-    assert done.returncode == 0, done.stderr
-    assert f"{sample.vertical.after.statistics.mean_m:.3f}" in done.stdout
-    said = json.loads((tmp_path / "o" / "compare.json").read_text())
-    assert said["c2c"]["after"]["statistics"] == sample.as_dict()["c2c"]["after"]["statistics"]
 
 
 @pytest.mark.parametrize(

@@ -1,20 +1,15 @@
 """Damaged clouds: one sentence each, no traceback, no end of the process, nothing left behind."""
 
-from __future__ import annotations
-
-import random
 import struct
-from pathlib import Path
 
 import laspy
 import pytest
 
 import pcfix
+from tests.utils.shared import SCENE
 
-SCENE = Path(__file__).parents[2] / "samples" / "scene"
 # Places in the header (LAS 1.4 R15, table 3).
-VERSION, HEADER_SIZE, POINTS_START, VLRS, FORMAT = 24, 94, 96, 100, 104
-RECORD, SCALE_X, OFFSET_X, EVLRS, COUNT = 105, 131, 155, 235, 247
+VERSION, POINTS_START, SCALE_X, OFFSET_X, EVLRS, COUNT = 24, 96, 131, 155, 235, 247
 
 
 @pytest.fixture(scope="module")
@@ -67,20 +62,11 @@ PACKED = {
 PLAIN = {
     "version 2.0": (lambda d: put(d, VERSION, "<BB", 2, 0), "cloud.damaged"),
     "version 1.0": (lambda d: put(d, VERSION, "<BB", 1, 0), "cloud.empty"),
-    "fewer points": (lambda d: put(d, COUNT, "<Q", 300), "cloud.count"),
     "more points": (lambda d: put(d, COUNT, "<Q", 30_000), "cloud.count"),
     "offset": (lambda d: put(d, OFFSET_X, "<d", 1e18), "cloud.scales"),
-    "offset not finite": (lambda d: put(d, OFFSET_X, "<d", float("nan")), "cloud.scales"),
     "scale": (lambda d: put(d, SCALE_X, "<d", 1e300), "cloud.scales"),
-    "scale of zero": (lambda d: put(d, SCALE_X, "<d", 0.0), "cloud.scales"),
-    "size of the header": (lambda d: put(d, HEADER_SIZE, "<H", 0), "cloud.damaged"),
-    "start of the points": (lambda d: put(d, POINTS_START, "<I", 10), "cloud.damaged"),
-    "records": (lambda d: put(d, VLRS, "<I", 2**31), "cloud.damaged"),
     "records behind": (lambda d: put(d, EVLRS, "<QI", 2**63, 4), "cloud.damaged"),
-    "format": (lambda d: put(d, FORMAT, "<B", 200), "cloud.damaged"),
-    "short record": (lambda d: put(d, RECORD, "<H", 3), "cloud.damaged"),
     "count of points": (lambda d: put(d, COUNT, "<Q", 2**63), "cloud.damaged"),
-    "empty": (lambda d: b"", "cloud.damaged"),
 }
 CASES = [
     *(pytest.param(".laz", *case, id=name) for name, case in PACKED.items()),
@@ -108,24 +94,3 @@ def label(data, suffix, folder):
 @pytest.mark.parametrize(("suffix", "damage", "code"), CASES)
 def test_damage(suffix, damage, code, clouds, tmp_path):
     assert label(damage(clouds[suffix]), suffix, tmp_path).code == code
-
-
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-@pytest.mark.parametrize(
-    "seed", [1, *(pytest.param(s, marks=pytest.mark.nightly) for s in range(2, 12))]
-)
-def test_random_bytes(suffix, seed, clouds, tmp_path):
-    """A change is refused in a sentence, or leaves a cloud of which every row comes out."""
-    whole, rng = clouds[suffix], random.Random(seed)
-    start, table, _ = chunks_of(clouds[".laz"])
-    places = range(start if suffix == ".laz" else 800)
-    if suffix == ".laz":
-        places = [*places, *range(start, start + 8), *range(table, len(whole))]
-    refused = 0
-    for _ in range(30):
-        changed = bytearray(whole)
-        for place in rng.sample(places, rng.choice([1, 1, 2, 8])):
-            changed[place] = rng.randrange(256)
-        said = label(bytes(changed), suffix, tmp_path)
-        refused += said is not None
-    assert refused >= 1

@@ -1,7 +1,5 @@
 """A disk that is full at any stage of a command: nothing half-written, and one clear sentence."""
 
-from __future__ import annotations
-
 import gc
 import json
 import math
@@ -10,7 +8,6 @@ import shutil
 import sqlite3
 import subprocess
 from contextlib import closing
-from itertools import pairwise
 from pathlib import Path
 
 import laspy
@@ -19,8 +16,8 @@ import rasterio
 
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
+from tests.utils.shared import SCENE
 
-SCENE = Path(__file__).parents[2] / "samples" / "scene"
 PAGE = 4096
 
 
@@ -136,15 +133,3 @@ def test_full_at_any_stage(name, growth, disk, inputs):
     assert written >= named - {"of"}
     assert len(blamed) >= 3
     assert state(inputs) == before
-
-
-@pytest.mark.nightly
-def test_full_at_every_step_of_a_run(disk, inputs):
-    words = ("run", "cloud.laz", "DISK/run", *CAMERAS, "--reference", "lidar.laz")
-    blamed, pages = [], 1
-    while (file := on_a_disk_of(pages, words, disk, inputs)) is not None:
-        blamed.append(file)
-        pages = math.ceil(pages * 1.2)
-    assert (disk / "run" / "report.html").is_file()
-    changes = [two for one, two in pairwise(blamed) if one != two]
-    assert len(changes) >= 8

@@ -1,7 +1,5 @@
 """Names and things that are no ordinary files: one sentence each, and nothing written over."""
 
-from __future__ import annotations
-
 import os
 import stat
 import tempfile
@@ -18,21 +16,6 @@ from tests.utils.program import run_pcfix
 
 LONG = "9" * 300
 NOT_UTF8 = os.fsdecode(b"h\xf6he")
-PLY = """ply
-format ascii 1.0
-comment H\xf6he \xfcber Normal
-element vertex 3
-property double x
-property double y
-property double z
-element face 1
-property list uchar int vertex_indices
-end_header
-455900 5431900 {0}
-456300 5431900 {0}
-456100 5432300 {0}
-3 0 1 2
-"""
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +29,6 @@ def odd(tmp_path_factory):
     (folder / "folder" / "self").symlink_to("../folder")
     if hasattr(os, "mkfifo"):
         os.mkfifo(folder / "pipe")
-    (folder / "latin.ply").write_text(PLY.format(WATER_M), "latin-1")
     return folder
 
 

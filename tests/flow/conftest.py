@@ -1,7 +1,5 @@
 """What several of these files leave out or share."""
 
-from __future__ import annotations
-
 import pytest
 
 

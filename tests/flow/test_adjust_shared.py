@@ -1,21 +1,23 @@
 """A rendered block that ordinary software bent, mended with tie points and without."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import laspy
 import numpy as np
 import pytest
+import rasterio
+from scipy.interpolate import RegularGridInterpolator
 
 import pcfix
 from pcfix.adjust.block import usable_ties
 from pcfix.flow.adjust import adjust_cameras
-from tests.flow.test_carrying import FREE, TRUE, errors_gsd, free, true
 from tests.utils.nightly import mostly_nightly
+from tests.utils.shared import needs
 
 pytestmark = pytest.mark.filterwarnings("default::pcfix.errors.PcfixWarning")
 
+FREE, free = needs("rendered_a_free")
+TRUE, true = needs("rendered_a")
 WATER_M, FOCAL_PX = 0.37, 1500.0
 TIES = 3000
 """Enough for these bounds; all of them take a minute."""
@@ -49,3 +51,17 @@ def test_rendered_block(tmp_path, monkeypatch, ties, bed_gsd, land_gsd):
     bed, land = (np.sqrt((e**2).mean()) for e in errors_gsd(laspy.read(tmp_path / "out.las")))
     assert bed < bed_gsd
     assert land < land_gsd
+
+
+def errors_gsd(las):
+    """Return height errors against the true surface, bed and land apart, in GSD of 5 cm."""
+    with rasterio.open(TRUE / "truth_dsm.tif") as truth:
+        heights, way = truth.read(1).astype(float), truth.transform
+    rows = (np.arange(len(heights)) + 0.5, np.arange(heights.shape[1]) + 0.5)
+    at = RegularGridInterpolator(rows, heights, bounds_error=False)
+    xyz = np.array(las.xyz)
+    column, row = (xyz[:, 0] - way.c) / way.a, (xyz[:, 1] - way.f) / way.e
+    z = at(np.column_stack([row, column]))
+    error = (xyz[:, 2] - z) / 0.05
+    known = np.isfinite(error)
+    return error[known & (z < 0.27)], error[known & (z > 0.47)]

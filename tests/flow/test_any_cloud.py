@@ -1,7 +1,5 @@
 """Whatever the cloud, the cameras, the water and the options: what a correction may never do."""
 
-from __future__ import annotations
-
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -214,48 +212,3 @@ def test_frame_and_order(data, scene, turn):
     # their squares are what is left of sums of squares of 100 m, of rays that are nearly parallel
     miss2, expected2 = there.ray_miss_m**2, here.ray_miss_m[points] ** 2
     np.testing.assert_allclose(miss2, expected2, rtol=0, atol=1e-7)
-
-
-@st.composite
-def label_options(draw) -> dict[str, object]:
-    connected, band = draw(st.booleans()), draw(st.sampled_from([0.0, 0.02, 1.0]))
-    return {
-        "connected": connected,
-        "least_pool": draw(st.sampled_from([None, 1.0])) if connected else None,
-        "band": band,
-        "dead_band": draw(st.sampled_from([0.0, 1.5])),
-        "reset": draw(st.booleans()),
-        "respect_classes": draw(st.sampled_from([(), (2,), (0, 2, 40, 41)])),
-    }
-
-
-@given(scene=scenes(on_surface=True), given=label_options(), point_format=FORMATS, suffix=SUFFIXES)
-def test_label_changes_classes_only(scene, given, point_format, suffix):
-    with tempfile.TemporaryDirectory() as folder:
-        source, target = (Path(folder, name + suffix) for name in ("in", "out"))
-        scene.write(source, point_format)
-        try:
-            summary = pcfix.label_file(source, target, water=scene.water, jobs=1, **given)
-        except pcfix.GeometryError:
-            assert given["respect_classes"] or given["dead_band"]
-            assume(False)
-        before, after = read_raw(source), read_raw(target)
-    old, new = fields(before), fields(after)
-    for name in old.keys() - {"class", "angle"}:
-        np.testing.assert_array_equal(new[name], old[name], name)
-    assert (after.scales, after.offsets) == (before.scales, before.offsets)
-    assert after.foreign()[: len(before.foreign())] == before.foreign()
-    assert after.extended == before.extended
-    height, was, now = scene.height_m(xyz_of(before)), old["class"], new["class"]
-    respected = np.isin(was, given["respect_classes"])
-    assert (now[respected] == was[respected]).all()
-    changed = now != was
-    assert np.isin(now[changed], [1, 40, 41]).all()
-    reset = np.isin(was, [40, 41]) & (now == 1) & given["reset"]
-    far = height > max(given["band"], given["dead_band"]) + NANOMETRE
-    assert not (changed & ~reset)[far].any()
-    assert (np.abs(height[changed & (now == 41)]) <= given["band"] + NANOMETRE).all()
-    if not (given["connected"] or given["dead_band"]):
-        wet = (height < 0.0) & ~respected & (np.abs(height) > given["band"] + NANOMETRE)
-        assert (now[wet] == 40).all()
-    assert summary.points == len(before.points)

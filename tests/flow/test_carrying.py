@@ -1,6 +1,5 @@
 """A cloud of the original cameras, corrected with adjusted ones, through every door."""
 
-import json
 from dataclasses import replace
 from functools import partial
 
@@ -11,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 import pcfix
 from pcfix.flow.inputs import Inputs, both_models
-from pcfix.flow.request import Request, request_of
 from pcfix.model import Cameras, Outcome, Views
 from pcfix.report.text import summary_text
 from tests.utils.beyond_frames import BEYOND_FRAMES
@@ -27,14 +25,9 @@ from tests.utils.clouds import (
     write_cloud,
 )
 from tests.utils.codes import refused
-from tests.utils.nightly import mostly_nightly
-from tests.utils.program import run_pcfix
-from tests.utils.shared import ROOT, needs
 
 pytestmark = BEYOND_FRAMES
 
-FREE, free = needs("rendered_a_free")
-TRUE, true = needs("rendered_a")
 
 MIDDLE = np.array([EAST_M + SIDE_M / 2, NORTH_M + SIDE_M / 2, WATER_M])
 TURN = Rotation.from_rotvec([0.004, -0.003, 0.05]).as_matrix()
@@ -142,52 +135,6 @@ def test_restored(tmp_path, old, number):
     assert np.array_equal(before.points, back.points)
 
 
-def test_doors_agree(cloud, old, tmp_path):
-    """The program, files, arrays, and the stage of PDAL as a function of arrays."""
-    from tests.pdal_stage.test_arrays import arrays_of, metadata_of, run
-
-    for name, cameras in (
-        ("old", old),
-        ("new", replace(old, centres=old.centres + np.array([0.4, 0.2, 0.9]))),
-    ):
-        (tmp_path / name).mkdir()
-        cameras_csv(tmp_path / name / "cameras.csv", cameras, angles=True)
-        (tmp_path / name / "sensor.csv").write_text("focal,sensor_x,sensor_y\n24,24,9.6\n")
-    paths = {
-        "cameras": str(tmp_path / "new" / "cameras.csv"),
-        "adjusted_from": str(tmp_path / "old" / "cameras.csv"),
-    }
-    _, before, after = correct(cloud, **paths)
-    words = [f"--{key.replace('_', '-')}={value}" for key, value in paths.items()]
-    words += ["--method=snell", "--max-angle=none"]
-    done = run_pcfix("correct", cloud, tmp_path / "cli.las", "--water", WATER_M, "-q", *words)
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "cli.las").read_bytes() == (tmp_path / "out.las").read_bytes()
-    outs, _ = run(
-        "correct",
-        arrays_of(before),
-        metadata_of(before.header),
-        water=WATER_M,
-        method="snell",
-        max_angle="none",
-        **paths,
-    )
-    for axis in "XYZ":
-        scale, offset = (getattr(after.header, f"{axis.lower()}_{w}") for w in ("scale", "offset"))
-        assert np.array_equal(np.rint((outs[axis] - offset) / scale), after[axis])
-        assert np.array_equal(outs[f"Shift{axis}"], np.array(after[f"Shift{axis}"], np.float32))
-    assert np.array_equal(outs["Classification"], np.array(after.classification))
-    assert np.array_equal(outs["ClassFlags"] & 4 != 0, np.array(after.withheld) != 0)
-    result = snell(
-        before.xyz, pcfix.read_cameras(paths["cameras"]), WATER_M,
-        adjusted_from=pcfix.read_cameras(paths["adjusted_from"]),
-    )  # fmt: skip
-    assert np.array_equal(np.rint(result.shift_m / SCALES), shift_of(after))
-    done = run_pcfix("pipeline", cloud, "o.las", "--water", WATER_M, *words)
-    stage = json.loads(done.stdout)["pipeline"][1]
-    assert stage["pdalargs"]["adjusted_from"] == paths["adjusted_from"]
-
-
 def test_views(old):
     """They come in another order there, and under whole paths; one was not adjusted."""
     rng = np.random.default_rng(3)
@@ -269,57 +216,3 @@ def test_offset(tmp_path, old, local, said):
         return
     assert (before.cameras_offset is not None) == (local in ("old", "both"))
     assert (after.cameras_offset is not None) == (local in ("new", "both"))
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_run(tmp_path):
-    scene = ROOT / "samples" / "scene"
-    done = run_pcfix(
-        "run", "-q", scene / "cloud.laz", tmp_path / "a", "--water", "0.37",
-        "--cameras", scene / "cameras.csv", "--adjusted-from", scene / "cameras.csv",
-        "--method", "snell",
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    record = tmp_path / "a" / "run.json"
-    request = request_of(record)
-    assert isinstance(request, Request)
-    assert request.adjusted_from == str(scene / "cameras.csv")
-    assert json.loads(record.read_text())["steps"]["correct"]["result"]["carried"]["land"] > 0
-
-
-@free
-@true
-@pytest.mark.parametrize("views", mostly_nightly([None, "dense.vis"], "dense.vis"))
-def test_rendered_block(tmp_path, views):
-    """With true poses; before, land lies 19 GSD (of 5 cm) too low and the bed is 27 off."""
-    told = pcfix.correct_file(
-        FREE / "cloud.las", tmp_path / "out.las", cameras=TRUE / "colmap", water=0.37,
-        adjusted_from=FREE / "sparse", cameras_offset=tuple(np.loadtxt(FREE / "offset.txt")),
-        views=None if views is None else FREE / views,
-    )  # fmt: skip
-    las = laspy.read(tmp_path / "out.las")
-    bed, land = errors_gsd(las)
-    assert told.carried["points"] == told.points
-    # the noise of the matcher: with the true cameras from the start it leaves as much
-    assert np.sqrt((land**2).mean()) < 0.7
-    assert np.sqrt((bed**2).mean()) < 0.95
-    assert told.carried["shift_m"]["mean_z"] > 1.0
-    pcfix.restore_file(tmp_path / "out.las", tmp_path / "back.las")
-    assert (tmp_path / "back.las").read_bytes() == (FREE / "cloud.las").read_bytes()
-
-
-def errors_gsd(las):
-    """Return height errors against the true surface, bed and land apart, in GSD of 5 cm."""
-    import rasterio
-    from scipy.interpolate import RegularGridInterpolator
-
-    with rasterio.open(TRUE / "truth_dsm.tif") as truth:
-        heights, way = truth.read(1).astype(float), truth.transform
-    rows = (np.arange(len(heights)) + 0.5, np.arange(heights.shape[1]) + 0.5)
-    at = RegularGridInterpolator(rows, heights, bounds_error=False)
-    xyz = np.array(las.xyz)
-    column, row = (xyz[:, 0] - way.c) / way.a, (xyz[:, 1] - way.f) / way.e
-    z = at(np.column_stack([row, column]))
-    error = (xyz[:, 2] - z) / 0.05
-    known = np.isfinite(error)
-    return error[known & (z < 0.27)], error[known & (z > 0.47)]

@@ -11,9 +11,8 @@ from pcfix.flow.cameras import cameras_text, check_cameras
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.next_steps import adjust_words
 from tests.utils.crops import middle_of
-from tests.utils.shared import ROOT, needs
+from tests.utils.shared import SCENE, needs
 
-SCENE = ROOT / "samples" / "scene"
 TRUE, rendered = needs("rendered_a")
 BENT, bent = needs("rendered_a_free")
 OFFSET_M = (319900.0, 3842700.0, 0.0)

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 import pcfix
 from pcfix.flow import planning
-from pcfix.model import Outcome, TiePoints, Views
+from pcfix.model import TiePoints
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract import patches
 from pcfix.refract.batch import Batch, Survey
@@ -19,6 +19,7 @@ from pcfix.refract.patches import grid_m
 from pcfix.refract.reconstructions import IN_FRAME, hint_of
 from pcfix.water.surface import surface_above
 from tests.io.test_views import write_ply, write_vis
+from tests.utils.clouds import write_las
 from tests.utils.matchers import matched_scene
 from tests.utils.nightly import mostly_nightly
 
@@ -67,35 +68,10 @@ def test_coverage_of_a_wrong_list():
     assert covered(scene, found) >= 0.90
 
 
-def half(views):
-    """Return a list without its first half, and those points."""
-    counts = np.diff(views.start)
-    first = np.arange(len(counts)) < len(counts) // 2
-    kept = np.repeat(~first, counts)
-    start = np.concatenate([[0], np.cumsum(np.where(first, 0, counts))])
-    return Views(start, views.camera[kept], None, views.kind), first
-
-
-def test_unlisted_points():
-    scene = scene_of()
-    views, first = half(scene.views)
-    given = (scene.apparent_xyz, scene.cameras, scene.water)
-    found = pcfix.correct_points(*given, views=views)
-    alone, listed = pcfix.correct_points(*given), pcfix.correct_points(*given, views=scene.views)
-    np.testing.assert_array_equal(found.xyz[first], alone.xyz[first])
-    made = ~first & (np.diff(scene.views.start) > 1)
-    np.testing.assert_allclose(found.xyz[made], listed.xyz[made], atol=0.05 * scene.gsd_m)
-    seen = first & alone.corrected
-    assert seen.any() and (found.outcome[seen] == Outcome.CORRECTED).all()
-
-
-def as_file(path, xyz, sources, gsd_m=0.001):
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    header.scales, header.offsets = np.full(3, gsd_m), np.floor(xyz.min(axis=0))
-    cloud = laspy.LasData(header)
-    cloud.xyz = xyz
-    cloud.point_source_id = np.broadcast_to(sources, len(xyz))
-    cloud.write(path)
+def as_file(path, xyz, sources):
+    las = laspy.read(write_las(path, xyz, crs=None))
+    las.point_source_id = np.broadcast_to(sources, len(xyz))
+    las.write(path)
     return path
 
 
@@ -207,19 +183,6 @@ def test_depth_ratio():
     done = replace(came, xyz=scene.true_xyz[rows])
     assert depth_ratio(came, ties) == pytest.approx(1.0, abs=0.05)
     assert depth_ratio(done, ties) > CORRECTED_RATIO + 0.1
-
-
-def test_minimal(tmp_path):
-    scene = scene_of()
-    path = as_file(tmp_path / "cloud.las", scene.apparent_xyz, 0)
-    given = {"cameras": scene.cameras, "water": scene.water, "method": "snell", "max_angle": None}
-    made, out = {}, {}
-    for dimensions in ("all", "minimal"):
-        target = tmp_path / f"{dimensions}.las"
-        made[dimensions] = pcfix.correct_file(path, target, dimensions=dimensions, **given).made
-        out[dimensions] = laspy.read(target).xyz
-    assert made["all"]["patches"] > 0 and made["minimal"] is None
-    np.testing.assert_array_equal(out["all"], out["minimal"])
 
 
 @pytest.mark.filterwarnings("ignore::pcfix.PcfixWarning")

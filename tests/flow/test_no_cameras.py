@@ -1,7 +1,6 @@
 """Methods that need depths only work without cameras, from Python, command line and PDAL."""
 
 import json
-from pathlib import Path
 
 import laspy
 import numpy as np
@@ -16,8 +15,8 @@ from tests.pdal_stage.test_arrays import run as stage
 from tests.utils.clouds import WATER_M, block, cameras_csv, random_cloud, write_cloud
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
+from tests.utils.shared import SCENE
 
-SCENE = Path(__file__).parents[2] / "samples" / "scene"
 NONE = {"water": WATER_M}
 
 
@@ -60,26 +59,6 @@ def test_with_and_without_cameras(folder, method):
     else:
         assert not np.asarray(one.SigmaZ).any()
     assert (bare.cameras, bare.absorbed) == (0, None)
-
-
-@pytest.mark.parametrize("method", WITHOUT_CAMERAS)
-def test_doors(folder, method):
-    las, options = laspy.read(folder / "cloud.las"), asked(folder, method)
-    pcfix.correct_file(folder / "cloud.las", folder / "a.las", **NONE, **options)
-    words = [f"--{name.replace('_', '-')}={value}" for name, value in {**NONE, **options}.items()]
-    done = run_pcfix("correct", "cloud.las", "b.las", *words, folder=folder)
-    assert (done.returncode, done.stderr) == (0, "")
-    # of one path, as the file records what it was made of
-    assert (folder / "a.las").read_bytes() == (folder / "b.las").read_bytes()
-    text = {name: str(v) if name == "check_depths" else v for name, v in options.items()}
-    outs, _ = stage("correct", arrays_of(las), metadata_of(las.header), **NONE, **text)
-    out = laspy.read(folder / "a.las")
-    assert np.allclose(outs["Z"], out.z, atol=1e-9)
-    assert np.array_equal(outs["RayCount"], np.asarray(out.RayCount))
-    if method == "factor":
-        found = pcfix.correct_points(las.xyz, None, WATER_M, method="factor")
-        assert np.array_equal(found.ray_count, np.asarray(out.RayCount))
-        assert found.xyz[:, 2] == pytest.approx(np.asarray(out.z), abs=las.header.scales[2])
 
 
 REFUSED = (

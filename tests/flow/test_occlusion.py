@@ -49,27 +49,6 @@ def test_wanted(tilts_deg, wanted):
         assert wants_occlusion(block, ScienceOptions(occlusion="off")) is False
 
 
-def test_second_highest():
-    xyz = hills()
-    occluder = occluder_of(xyz)
-    column = np.floor((xyz[:, 0] - occluder.left_m) / occluder.cell_m).astype(int)
-    row = np.floor((xyz[:, 1] - occluder.bottom_m) / occluder.cell_m).astype(int)
-    rows, columns = occluder.height.shape
-    second = np.full((rows, columns), np.nan)
-    for r in range(rows):
-        for c in range(columns):
-            z = np.sort(xyz[(row == r) & (column == c), 2])
-            second[r, c] = z[-2] if len(z) > 1 else np.nan
-    inner = second[1:-1, 1:-1]
-    beside = np.stack(
-        [second[1 + i : rows - 1 + i, 1 + j : columns - 1 + j]
-         for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
-    )  # fmt: skip
-    expected = np.fmin(inner, np.nanmax(beside, axis=0))
-    expected[np.isnan(inner)] = np.nan
-    np.testing.assert_array_equal(occluder.height[1:-1, 1:-1], expected.astype(np.float32))
-
-
 def test_chunks():
     xyz = hills()
     whole = occluder_of(xyz)

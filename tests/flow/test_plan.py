@@ -1,16 +1,10 @@
 """What a plan predicts is what the correction of such a block says, and what its errors are."""
 
-from __future__ import annotations
-
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 import pcfix
 from pcfix.errors import SettingError
-from pcfix.flow import plan as flight
-from pcfix.options.scenes import PlanOptions
 
 DEPTH_M = 4.0
 FLIGHT = {"height": 50.0, "overlap": 0.75, "area": (60.0, 40.0)}
@@ -60,16 +54,6 @@ def test_correction_agrees(plan, noise_px, most):
     off = (found.xyz - scene.true_xyz)[found.corrected, 2]
     expected = plan.depths[-1].parts_m["image"] if noise_px else 0.0
     assert np.sqrt(np.mean(off**2)) == pytest.approx(expected, rel=0.05, abs=1e-4)
-
-
-def test_adjusted_poses():
-    given = PlanOptions(**FLIGHT, gnss_sigma=0.02)
-    bed = flight._bed(given, DEPTH_M)
-    fine, coarse = (
-        flight._of_adjusted_poses(replace(given, gnss_sigma=sigma), bed) for sigma in (0.02, 0.2)
-    )
-    assert 0.1 * 0.02 < fine < 0.02  # all images together are better than one
-    assert 4.0 * fine < coarse < 12.0 * fine
 
 
 @pytest.mark.parametrize(

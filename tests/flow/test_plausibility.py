@@ -11,12 +11,11 @@ import pcfix
 from pcfix.flow.diagnosis import quick_ties
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.plausibility import SAMPLE_POINTS, CloudSample, plausible
-from pcfix.flow.surfaces import Points, view_of
+from pcfix.flow.surfaces import view_of
 from pcfix.io.las.source import read_xyz
 from tests.utils.codes import refused, warned
-from tests.utils.shared import ROOT, needs
+from tests.utils.shared import SCENE, needs
 
-SCENE = ROOT / "samples" / "scene"
 RENDERED, rendered = needs("rendered_a")
 LEVEL_M = 0.37
 
@@ -127,6 +126,16 @@ def test_residuals_of_tie_points(with_ties, fault):
 
 
 @rendered
+def test_residuals_of_one_image(with_ties):
+    """The median of the block does not show it."""
+    turns = with_ties.cameras.rotations.copy()
+    turns[3] = turns[3] @ Rotation.from_euler("x", 10, degrees=True).as_matrix()
+    cameras = replace(with_ties.cameras, rotations=turns)
+    (doubt,) = plausible(cameras, with_ties.xyz, with_ties.ties).doubts
+    assert (doubt.code, doubt.values["image"]) == ("cameras.residuals", cameras.labels[3])
+
+
+@rendered
 def test_heights_of_tie_points(with_ties):
     """Cameras and tie points moved alike: an offset, or another datum."""
     ties = replace(with_ties.ties, xyz=with_ties.ties.xyz + np.array([0.0, 0.0, 47.0]))
@@ -220,16 +229,6 @@ def test_recorded_heights(scene, tmp_path, drone_m):
     found = plausible(scene.cameras, scene.xyz, file=tmp_path / "cameras.csv", water_m=LEVEL_M)
     assert codes(found) == ([] if drone_m == 78.0 else ["cameras.flying_height"])
     assert not any(one.startswith("heights") for one in found.unchecked)
-
-
-@pytest.mark.parametrize("chunk", [100, 7000])
-def test_chunks_of_a_sample(scene, chunk):
-    sample = CloudSample()
-    for row in range(0, 20_000, chunk):
-        xyz = scene.xyz[row : row + chunk]
-        points = Points(xyz, None, np.zeros(len(xyz), np.uint8))
-        sample += CloudSample.of(points, np.zeros(len(xyz)), row, 60_000)
-    assert np.array_equal(sample.xyz, scene.xyz[::2])
 
 
 def test_great_depths(scene):

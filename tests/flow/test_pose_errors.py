@@ -9,26 +9,19 @@ from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
 import pcfix
-from pcfix.adjust.block import Unknowns
-from pcfix.adjust.precision import Members, precision_of
-from pcfix.adjust.problem import solved_cameras
+from pcfix.adjust.precision import Members
 from pcfix.adjust.transfer import CloudTransfer
-from pcfix.flow.pose_errors import pose_errors, variances, with_poses
+from pcfix.flow.pose_errors import variances
 from pcfix.flow.surfaces import Points
 from pcfix.io.members import FILE, write_members
 from pcfix.model import Cameras, Lens, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import Batch, Survey
-from pcfix.refract.methods import correct
+from pcfix.refract.batch import Survey
 from pcfix.running import threads
 from pcfix.simulate.tracing import project, triangulate
-from pcfix.water.surface import surface_above
 from tests.utils.bed_rays import piercing_points
 from tests.utils.beyond_frames import BEYOND_FRAMES
 from tests.utils.clouds import WATER_M, cameras_csv, framed_block, write_cloud
-from tests.utils.tie_blocks import adjusted, block_of, some_ties
-from tests.utils.tie_points import simulate_tie_points
-from tests.utils.unaware_blocks import parted
 
 pytestmark = BEYOND_FRAMES
 
@@ -134,36 +127,7 @@ def test_same_as_twin(moved):
     np.testing.assert_allclose(np.sqrt(found), np.sqrt(wanted), rtol=0.01)
 
 
-REPEATS = 40
 """Most of an error is common to a bed, so that it lies within its bounds whole, or not at all."""
-
-
-def test_coverage():
-    """A block adjusted again and again with noise of its own, and the cloud that it makes."""
-    scene, others = parted(
-        simulate_tie_points(400, area_m=(50, 40), greatest_depth_m=5, image_noise=0.3), 250
-    )
-    others = some_ties(others, np.flatnonzero(others.is_wet))
-    truth, views, rng = others.truth, others.views, np.random.default_rng(8)
-    settings = replace(EXACT, sigma_image=0.3, index=scene.refractive_index)
-    known, bare, poses = [], [], None
-    for _ in range(REPEATS):
-        problem, found = adjusted(block_of(scene.measured(rng)), Unknowns(lens=("f",)))
-        cameras, image = solved_cameras(problem, found), others.measured(rng).ties.image_xy
-        lens = cameras.lenses[0]
-        xyz = triangulate(image, cameras, views.camera, views.start, lens, truth)
-        survey = Survey(scene.water, cameras, settings)
-        if poses is None:  # the covariance hardly changes
-            members = precision_of(problem, found).members
-            sample = Points(xyz, None, np.zeros(len(xyz), np.uint8), views=views)
-            poses = pose_errors(sample, survey, members, None)
-        for one, into in ((with_poses(survey, poses), known), (survey, bare)):
-            result = correct(Batch(xyz, surface_above(scene.water, xyz), one, views))
-            into.append((xyz[:, 2] + result.shift_m[:, 2] - truth[:, 2]) / result.sigma_z_m)
-    known, bare = np.abs(known), np.abs(bare)
-    assert 0.90 <= np.mean(known < 1.96) <= 0.98
-    assert np.sqrt(np.mean(known**2)) == pytest.approx(1.0, abs=0.2)
-    assert np.mean(bare < 1.96) < 0.5
 
 
 def members_of(cameras, sigma_m):
@@ -209,19 +173,6 @@ def test_file(files):
     np.testing.assert_array_equal(las.xyz, bare.xyz)
     since, _ = corrected(files, adjusted_from=files[1])
     assert since.uncertainty["poses_m"] == pytest.approx(told.uncertainty["poses_m"], rel=0.01)
-
-
-def test_pdal_stage(files):
-    from tests.pdal_stage.test_arrays import arrays_of, metadata_of, run
-
-    write_members(files[1].parent, members_of(pcfix.read_cameras(files[1]), 0.1))
-    _, las = corrected(files)
-    before = laspy.read(files[0])
-    outs, _ = run(
-        "correct", arrays_of(before), metadata_of(before.header), cameras=str(files[1]),
-        water=WATER_M, method="snell", max_angle="none", sigma_level=0.0,
-    )  # fmt: skip
-    np.testing.assert_array_equal(outs["SigmaZ"], np.array(las.SigmaZ).astype(np.float32))
 
 
 def test_other_ensemble(files):

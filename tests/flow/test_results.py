@@ -1,7 +1,5 @@
 """A run from Python, and its results as xarray, GeoPandas and pandas have them."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import sys

@@ -1,8 +1,5 @@
 """All steps in one call: what it leaves, and how it resumes."""
 
-from __future__ import annotations
-
-import importlib.util
 import json
 import os
 import re
@@ -11,7 +8,6 @@ import sqlite3
 import warnings
 from contextlib import closing, nullcontext
 from dataclasses import replace
-from pathlib import Path
 from xml.etree import ElementTree
 
 import laspy
@@ -29,11 +25,10 @@ from pcfix.io.rasters import values_at
 from pcfix.report.summary import Summary
 from pcfix.report.text import tvu_sentence
 from tests.utils.program import run_pcfix
-from tests.utils.rasters import HAS_STATISTICS
+from tests.utils.shared import SCENE
 from tests.utils.tiles import finished as finished_in
 from tests.utils.tiles import records, write
 
-SCENE = Path(__file__).parents[2] / "samples" / "scene"
 WORDS = [
     str(SCENE / "cloud.laz"), "out", "--cameras", str(SCENE / "cameras.csv"), "--water", "0.37",
     "--reference", str(SCENE / "lidar.laz"),
@@ -101,19 +96,6 @@ def test_dod(finished):
     assert abs(np.median(found.compressed())) < 0.02  # a bed gridded at 2 m, noise of 4 cm
 
 
-def test_rasters(finished):
-    units = {"surface": "height", "bed": "height", "depth": "depth", "uncertainty": "uncertainty"}
-    for name, what in units.items():
-        with rasterio.open(finished[0] / f"{name}.tif") as raster:
-            assert (raster.count, raster.nodata, raster.units) == (1, -9999.0, ("metre",))
-            assert raster.descriptions == (what,)
-            assert raster.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
-            assert ("STATISTICS_MEAN" in raster.tags(1)) is HAS_STATISTICS
-            assert raster.crs.to_epsg() == 32633, "no vertical datum was stated"
-    with rasterio.open(finished[0] / "surface_counts.tif") as counts:
-        assert counts.descriptions == ("count", "spread")
-
-
 def test_depth_and_bed(finished):
     """Where no hole was filled both are of the same points; each is kept to the millimetre."""
     bed, depth, surface, shaded = (
@@ -167,23 +149,6 @@ def test_map(finished):
         assert ElementTree.fromstring(text.split("\n", 1)[1]).find("renderer-v2") is not None
 
 
-def test_accuracy(finished):
-    steps, page = steps_and_page(finished[0])
-    text, found = page.read_text(), steps["compare"]["figures"]
-    bed, land, own = (found[name] for name in ("bed", "land", "own"))
-    assert bed["after"]["count"] + land["after"]["count"] == found["counts"]["compared"]
-    tile = re.search(r"<h2>Accuracy of the bed.*?</section>", text, re.S)[0]
-    assert ">measured<" in tile and "predicted" not in tile
-    assert f"<dd>{own['rmse_m']:.3f} m</dd>" in tile and own["rmse_m"] < bed["after"]["rmse_m"]
-    assert f"with it RMSE {bed['after']['rmse_m']:.3f} m" in tile
-    assert f"RMSE {land['after']['rmse_m']:.3f} m, reference included" in tile
-    assert str(finished[0]) not in text and str(SCENE) not in text
-    assert page.stat().st_size < 8_000_000
-    links = re.findall(r'<a href="([^"]*)"', text)
-    assert "corrected.laz" in links and "compare/compare.json" in links
-    assert all((finished[0] / link).is_file() for link in links)
-
-
 def steps_and_page(folder):
     steps = json.loads((folder / "run.json").read_text())["steps"]
     return {name: step["result"] for name, step in steps.items()}, (folder / "report.html")
@@ -215,16 +180,6 @@ def test_order_not_claimed(tmp_path):
     assert said.endswith("IHO S-44 order 1a/1b")  # the bed is off by nearly half of the level
     assert said in text
     assert formal not in text and "Exclusive Order" not in text
-
-
-@pytest.mark.skipif(importlib.util.find_spec("py4dgeo") is None, reason="needs the extra m3c2")
-def test_m3c2(copied):
-    done = run(copied, *WORDS, "--m3c2", "--overwrite")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "M3C2 distance, corrected" in (copied / "out" / "report.html").read_text()
-    m3c2 = json.loads((copied / "out" / "compare" / "compare.json").read_text())["m3c2"]
-    assert abs(m3c2["after"]["statistics"]["mean_m"]) < 0.05  # noise of 4 cm; 1.3 m before
-    assert m3c2["before"]["statistics"]["mean_m"] > 1.0
 
 
 def test_done_before(copied):
@@ -453,23 +408,6 @@ def test_check_points(tmp_path):
     assert not (tmp_path / "out" / "compare" / "dod.tif").exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "code"),
-    [
-        (["--water", "-40"], None),
-        (["--reference", "none.laz"], None),
-        (["--cameras", "none.csv"], None),
-        (["--resolution", "0"], "option.range"),
-        (["--index", "2"], "option.range"),
-    ],
-)
-def test_mistakes(tmp_path, words, code):
-    done = run(tmp_path, *WORDS, *words)
-    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
-    assert code in (None, done.code)
-    assert not (tmp_path / "out" / "corrected.laz").exists()
-
-
 def test_refused(tmp_path):
     done = run(tmp_path, *WORDS[:-2], "--m3c2")
     assert (done.code, done.error.values["needs"]) == ("option.needs", "reference")
@@ -481,26 +419,3 @@ def test_refused(tmp_path):
         (tmp_path / "run.json").write_text(text)
         assert run(tmp_path, "new", "--config", "run.json").code == "run.record"
     assert not (tmp_path / "new").exists()
-
-
-@pytest.mark.parametrize("words", [[], ["a.laz", "out"], ["--config", "run.json"]])
-def test_usage(tmp_path, words):
-    assert run(tmp_path, *words).returncode == 2
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_shoreline(tmp_path):
-    pytest.importorskip("pyogrio")
-    words = [*WORDS[:6], "--method", "snell", "--max-angle", "none", "--shoreline"]
-    words += ["out/shore.gpkg"]
-    done = run(tmp_path, *words)
-    assert (done.returncode, done.stderr) == (0, "")
-    written = (tmp_path / "out" / "shore.gpkg").stat().st_mtime_ns
-    again = run(tmp_path, *words)
-    assert again.stdout.count("done before") == len(again.stdout.splitlines())
-    assert (tmp_path / "out" / "shore.gpkg").stat().st_mtime_ns == written
-    (tmp_path / "mine.gpkg").write_bytes(b"work")
-    words[1], words[-1] = "other", "mine.gpkg"
-    done = run(tmp_path, *words)
-    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
-    assert (tmp_path / "mine.gpkg").read_bytes() == b"work"

@@ -98,16 +98,6 @@ def test_view_list(tmp_path):
     assert np.abs(here["Z"] - there["Z"]).max() <= 5
 
 
-def test_shoreline(cloud, tmp_path):
-    pyogrio = pytest.importorskip("pyogrio")
-    given = {"cameras": CAMERAS, "water": 0.37, **PLAIN}
-    pcfix.correct_file(cloud[1], tmp_path / "a.las", shoreline=tmp_path / "a.gpkg", **given)
-    pcfix.correct_file(cloud[0], tmp_path / "b", shoreline=tmp_path / "b.gpkg", **given)
-    one, many = (pyogrio.raw.read(tmp_path / f"{name}.gpkg") for name in "ab")
-    assert len(one[2]) > 0
-    assert list(one[2]) == list(many[2])
-
-
 def test_restored(cloud, corrected, tmp_path):
     points = pcfix.restore_file(corrected[0] / "tiles", tmp_path / "back")
     assert points == 20_000

@@ -1,71 +1,30 @@
 """Printed commands work, errors have the right reason, absorbed refraction is detected."""
 
 import json
-import shlex
 import shutil
 import warnings
-from functools import partial
 
 import laspy
 import numpy as np
 import pytest
 
 import pcfix
-from pcfix.adjust.block import usable_ties
 from pcfix.adjust.diagnosis import Diagnosis, land_sign, neighbours_sign
 from pcfix.model import Cameras, Lens, Outcome
 from tests.utils.crops import middle_of
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
-from tests.utils.shared import ROOT, needs
+from tests.utils.shared import needs
 
-SCENE = ROOT / "samples" / "scene"
 BENT, bent = needs("rendered_c_free")
 OFFSET_M = (318700.0, 3851200.0, 0.0)
 LEVEL_M = 0.37
-TIES = 1000
 """Enough for lines that work; `test_adjust_shared.py` asks how good the block gets."""
 
 
 @pytest.fixture(scope="module")
 def bent_middle(tmp_path_factory):
     return middle_of(BENT, tmp_path_factory.mktemp("bent"))
-
-
-def run_line(line, **instead):
-    """Run a printed command with what it has in capitals, or is not to be overwritten, replaced."""
-    words = shlex.split(line)
-    assert words[0] == "pcfix"
-    done = run_pcfix(*(str(instead.get(word, word)) for word in words[1:]))
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-@bent
-@pytest.mark.nightly
-@pytest.mark.usefixtures("undrawn")
-def test_next_commands(bent_middle, tmp_path, monkeypatch):
-    """From the warning by `pcfix adjust` to the corrected cloud, as printed."""
-    monkeypatch.setattr("pcfix.flow.adjust.usable_ties", partial(usable_ties, most=TIES))
-    cloud, listed = bent_middle / "cloud.las", bent_middle / "dense.vis"
-    done = run_pcfix(
-        "correct", cloud, tmp_path / "bent.laz", "--cameras", BENT / "sparse", "--water", LEVEL_M,
-        "--cameras-offset", ",".join(map(str, OFFSET_M)), "--views", listed,
-    )  # fmt: skip
-    assert "--gnss GNSS.csv" in done.stderr
-    line = done.stderr.split("poses first")[1].split(": ", 1)[1].splitlines()[0]
-    assert f"--views {listed}" in line
-    out = run_line(line, **{"GNSS.csv": BENT / "gnss.csv", "OUT": tmp_path / "adjusted"})
-    assert "(direct)" not in out
-    line = out.split("Next: ")[1].splitlines()[0]
-    assert f"--views {listed}" in line
-    assert "--cameras-offset 318700,3851200,0" in line
-    out = run_line(line, **{"corrected.laz": tmp_path / "mended.laz"})
-    assert float(out.partition("Depth")[2].split()[0]) >= 0.0
-    words = [word for word in shlex.split(line)[1:] if word != "--cameras-offset"]
-    words.remove("318700,3851200,0")
-    words[2] = str(tmp_path / "none.laz")
-    assert run_pcfix(*words).returncode == 1  # the offset is missing
 
 
 @bent

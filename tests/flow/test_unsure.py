@@ -1,7 +1,5 @@
 """Points seen only by oblique images: found, withheld, restored."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from functools import cache
 
@@ -17,7 +15,6 @@ from pcfix.refract.matcher import without_border
 from pcfix.report.text import summary_text
 from tests.utils.half_oblique import half_oblique, seen_flat, write_half_oblique
 from tests.utils.nightly import mostly_nightly
-from tests.utils.program import run_pcfix
 
 SNELL = {"method": "snell", "max_angle": None, "occlusion": "off"}
 WAYS = {
@@ -55,13 +52,6 @@ def corrected(folder, needed):
         return known[key]
 
     return corrected
-
-
-@pytest.fixture(scope="module")
-def by_default(folder, needed):
-    """Return a summary and a file as `corrected` does, with the default method."""
-    out = folder / "default.las"
-    return pcfix.correct_file(folder / "cloud.las", out, **needed, unsure="withhold"), out
 
 
 @cache
@@ -132,12 +122,3 @@ def test_restored(folder, corrected, tmp_path, uncorrected, max_angle):
     assert told.unsure and (max_angle is None or sum(told.uncorrected.values()))
     pcfix.restore_file(out, tmp_path / "back.las")
     assert (tmp_path / "back.las").read_bytes() == (folder / "cloud.las").read_bytes()
-
-
-def test_command_line(folder, needed, by_default, tmp_path):
-    words = [word for name, value in needed.items() for word in ("--" + name, value)]
-    done = run_pcfix(
-        "correct", folder / "cloud.las", tmp_path / "b.las", *words, "--unsure", "withhold"
-    )
-    assert done.returncode == 0, done.stderr
-    assert by_default[1].read_bytes() == (tmp_path / "b.las").read_bytes()

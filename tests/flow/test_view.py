@@ -1,7 +1,5 @@
 """`pcfix view`: points in the colours of their values, cameras and water in place."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

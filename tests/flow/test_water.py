@@ -5,16 +5,14 @@ import json
 import laspy
 import numpy as np
 import pytest
-import rasterio
 from scipy.spatial.transform import Rotation
 
 import pcfix
 from pcfix.flow.water import check_water
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
-from tests.utils.shared import ROOT
+from tests.utils.shared import SCENE
 
-SCENE = ROOT / "samples" / "scene"
 CLOUD, CAMERAS = SCENE / "cloud.laz", SCENE / "cameras.csv"
 LEVEL_M = 0.37
 CRS = "EPSG:32633"
@@ -103,34 +101,6 @@ def test_tilted_river(river, tmp_path):
     assert river.rmse_z(level) > 2.0 * river.gsd_m  # what ignoring the tilt costs
 
 
-def test_raster_and_mesh_of_a_plane(river, tmp_path):
-    plane = pcfix.WaterPlane(LEVEL_M - TILT * river.pivot[0], TILT, 0.0)
-    west, south = np.floor(river.low) - 20.0
-    east, north = np.ceil(river.high) + 20.0
-    cell = 2.0
-    x = np.arange(west + cell / 2, east, cell)
-    y = np.arange(north - cell / 2, south, -cell)
-    grid = np.broadcast_to(plane.a + plane.b * x, (len(y), len(x)))
-    raster = tmp_path / "water.tif"
-    with rasterio.open(
-        raster, "w", driver="GTiff", width=len(x), height=len(y), count=1, dtype="float64",
-        transform=rasterio.transform.from_origin(west, north, cell, cell),
-    ) as out:  # fmt: skip
-        out.write(grid, 1)
-    corners = [(px, py, plane.a + plane.b * px) for px in (west, east) for py in (south, north)]
-    mesh = tmp_path / "water.obj"
-    mesh.write_text(
-        "".join(f"v {a:.17g} {b:.17g} {c:.17g}\n" for a, b, c in corners) + "f 1 3 4\nf 1 4 2\n"
-    )
-    given = [pcfix.read_water(one) for one in (raster, mesh)]
-    options = {"views": river.views}
-    expected = pcfix.correct_points(river.apparent, river.cameras, plane, **options)
-    for surface in given:
-        found = pcfix.correct_points(river.apparent, river.cameras, surface, **options)
-        # 1 mm is the need; secant steps end at 1e-6 m, and heights of 64 bits add nothing
-        assert np.abs(found.xyz - expected.xyz).max() < 1e-5
-
-
 def invoke(*arguments):
     done = run_pcfix(*arguments)
     assert done.returncode == 0, done.stderr
@@ -162,17 +132,6 @@ def test_shoreline_points(thin, tmp_path):
     assert found["share_below"] == pytest.approx(0.7368, abs=0.001)  # 14,736 of 20,000 points
 
 
-def test_points_without_heights(tmp_path):
-    xyz = laspy.read(CLOUD).xyz
-    near = xyz[np.abs(xyz[:, 2] - LEVEL_M) < 0.02]
-    path = write_points(tmp_path / "shore.csv", near[:, :2], names="x,y")
-    report = check_water(path, water_model="level", water_crs=CRS, cloud=CLOUD)
-    # the bank is 3 % steep and rough by some centimetres
-    assert report.found.level_m == pytest.approx(LEVEL_M, abs=0.1)
-    with pytest.raises(pcfix.InputError):
-        check_water(path)
-
-
 def test_auto(tmp_path):
     plot, summary = tmp_path / "auto.png", tmp_path / "auto.json"
     invoke("water", "auto", "--cloud", CLOUD, "--plot", plot, "--summary", summary)
@@ -181,18 +140,6 @@ def test_auto(tmp_path):
     assert abs(found["level_m"] - LEVEL_M) < 3.0 * found["sigma_level_m"]
     with pytest.raises(pcfix.SettingError):
         check_water("auto")
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_run_with_auto(tmp_path):
-    invoke(
-        "run", CLOUD, tmp_path / "out", "--cameras", CAMERAS, "--water", "auto", "--index", "sea"
-    )
-    record = json.loads((tmp_path / "out" / "run.json").read_text())
-    summary = record["steps"]["correct"]["result"]
-    assert summary["water_fit"]["model"] == "auto"
-    assert summary["settings"]["index_from"] == "sea: 35 PSU, 15 C, 0.53 um"
-    assert "level 0.3" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_salinity(thin, tmp_path):

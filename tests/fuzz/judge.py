@@ -1,7 +1,5 @@
 """One reading of damaged files: a sentence, or a result that is fit for use, else a finding."""
 
-from __future__ import annotations
-
 import io
 import resource
 import signal
@@ -54,7 +52,7 @@ class Bench:
 
     def __init__(self, name: str, folder: Path) -> None:
         self.name, self.reader, self.folder = name, READERS[name], folder
-        self._given: dict[str, Any] = {}
+        self._given: dict[str, Path] = {}
         self.parts: list[Part] = []
         for i, (seed, write) in enumerate(self.reader.seeds.items()):
             home = folder / f"seed_{i}"
@@ -70,21 +68,19 @@ class Bench:
         """
         whole = part.path.read_bytes()
         part.path.write_bytes(_packed(whole, part.entry, data) if part.entry else data)
-        given = self._given[part.seed]
-        path, options = (given, {}) if isinstance(given, Path) else given
         try:
-            return self._judged(path, options)
+            return self._judged(self._given[part.seed])
         finally:
             part.path.write_bytes(whole)
 
-    def _judged(self, path: Path, options: dict[str, Any]) -> tuple[int, str]:
+    def _judged(self, path: Path) -> tuple[int, str]:
         began, results = time.process_time(), 0
         said: list[str] = []
         with warnings.catch_warnings(record=True) as shown:
             warnings.simplefilter("always", pcfix.PcfixWarning)
             try:
                 with within(LONGEST_S):
-                    for found in self.reader.read(path, **options):
+                    for found in self.reader.read(path):
                         check_result(found)
                         results += 1
             except pcfix.PcfixError as error:

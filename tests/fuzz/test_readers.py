@@ -1,7 +1,5 @@
 """Damaged files of every reader: one sentence each, or a result that is fit for use."""
 
-from __future__ import annotations
-
 import random
 import struct
 
@@ -73,8 +71,8 @@ FOUND = {
     "records of many bytes": ("las", "1.2", "cloud.las", put(105, "<HI", 60_000, 2**31)),
     "octree behind the end": ("las", "copc", "cloud.copc.laz", put(ROOT + 8, "<Q", 2**40)),
     "dimension of no bytes": ("las", "1.4", "cloud.las", extra_dimension),
-    "infinite place": ("metashape", "geocentric", "cameras.xml",
-        instead(b"<scale>7.3", b"<scale>9e307")),
+    "infinite place": ("metashape", "chunk", "cameras.xml",
+        instead(b"<scale>10", b"<scale>9e307")),
     "no transformation": ("odm", "project", "geocoords_transformation.txt", lambda data: b"\n" * 9),
     "infinitely many cameras": ("bundler", "points", "bundle.out", instead(b"\n2 3", b"\n1e999 3")),
     "image without a name": ("tides", "images", "images.json", instead(b'"IMG_0001.jpg"', b"null")),

@@ -1,31 +1,16 @@
 """Small clouds to grid."""
 
-from __future__ import annotations
-
-import laspy
 import numpy as np
-from pyproj import CRS
+
+from tests.utils.clouds import write_las
 
 EAST, NORTH = 456_000.0, 5_432_000.0
 SCALE = "0.001"
 
 
-def write(path, xyz, classes=None, withheld=None, crs=32633, offsets=(EAST, NORTH, 0.0)):
+def write(path, xyz, classes=0, withheld=0, crs=32633, offsets=(EAST, NORTH, 0.0)):
     """Write a cloud in millimetres and return its path."""
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    header.scales, header.offsets = np.full(3, float(SCALE)), np.array(offsets)
-    if crs is not None:
-        header.add_crs(CRS.from_user_input(crs))
-    las = laspy.LasData(header)
-    las.points = laspy.ScaleAwarePointRecord.zeros(len(xyz), header=header)
-    for axis, name in enumerate("XYZ"):
-        las.points.array[name] = np.rint((xyz[:, axis] - offsets[axis]) / float(SCALE))
-    if classes is not None:
-        las.classification[:] = classes
-    if withheld is not None:
-        las.withheld[:] = withheld
-    las.write(path)
-    return path
+    return write_las(path, xyz, classes, withheld=withheld, crs=crs, offsets=offsets)
 
 
 def scattered(count, width, height, seed=5):

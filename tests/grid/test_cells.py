@@ -1,7 +1,5 @@
 """Every cell of a small cloud against a slow implementation."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The command ``pcfix dsm``."""
 
-from __future__ import annotations
-
 import json
 
 from tests.grid.clouds import scattered, write

@@ -1,7 +1,5 @@
 """Contours: their place, and the interval of a map."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

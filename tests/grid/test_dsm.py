@@ -1,7 +1,5 @@
 """The whole raster: seams, files, surfaces, holes, and refused input."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -10,7 +8,6 @@ import numpy as np
 import pytest
 import rasterio
 
-import pcfix
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow import dsm as flow
 from pcfix.flow.dsm import grid_dsm
@@ -19,9 +16,7 @@ from tests.grid.clouds import EAST, NORTH, awkward, scattered, write
 from tests.utils.codes import refused
 from tests.utils.nightly import mostly_nightly
 from tests.utils.rasters import HAS_STATISTICS, read_raster
-from tests.utils.shared import ROOT
 
-SCENE = ROOT / "samples" / "scene"
 METHODS = ("mean", "median", "min", "max", "idw", "tin")
 
 
@@ -92,19 +87,6 @@ def test_plane(tmp_path, method):
     expected = sloping(centre_x, centre_y) + corner
     part = (slice(1, -1),) * 2 if method == "idw" else ...
     np.testing.assert_allclose(found[part], expected[part], rtol=0, atol=2e-6)
-
-
-def test_plane_by_tin(tmp_path):
-    """Triangles give the plane back wherever points lie; these are rounded to 1 mm in height."""
-    xyz = scattered(3000, 30.0, 20.0)
-    xyz[:, 2] = sloping(xyz[:, 0], xyz[:, 1])
-    cloud = write(tmp_path / "plane.las", xyz)
-    grid_dsm(cloud, tmp_path / "plane.tif", resolution=0.5, method="tin")
-    found = heights(tmp_path / "plane.tif")
-    x, y = np.meshgrid(EAST + 0.25 + np.arange(60) / 2, NORTH + 19.75 - np.arange(40) / 2)
-    known = ~np.isnan(found)
-    assert known[1:-1, 1:-1].all()
-    np.testing.assert_allclose(found[known], sloping(x, y)[known], rtol=0, atol=5.1e-4)
 
 
 def with_sigma(path, xyz, sigma):
@@ -224,40 +206,6 @@ def test_fill(tmp_path):
     np.testing.assert_array_equal(
         found[0, 12:15, 5:8], [[5.0 + v / 4.0 for v in (5.5, 6.5, 7.5)]] * 3
     )
-
-
-@pytest.fixture(scope="module")
-def corrected(tmp_path_factory):
-    path = tmp_path_factory.mktemp("scene") / "corrected.laz"
-    pcfix.correct_file(SCENE / "cloud.laz", path, cameras=SCENE / "cameras.csv", water=0.37)
-    return path
-
-
-@pytest.mark.parametrize(("method", "fill"), [("mean", None), ("tin", None), ("mean", 1.5)])
-def test_scene(corrected, tmp_path, method, fill):
-    """A DSM of the corrected cloud is that of the true one.
-
-    Corrected points lie where true ones do to within the image noise of 0.5 px, which the scene's
-    GSD of 2.2 cm and intersections of a few rays make some centimetres in height. On cells of 2 m
-    with 8 points of a slope of 1 in 8 a point that changes cells adds a few more, so half of the
-    cells must agree to 1 cm, and 99 of 100 to 10 cm; uncorrected, the bed is metres too high.
-    """
-    inputs = {"ours": corrected, "truth": SCENE / "truth.laz", "apparent": SCENE / "cloud.laz"}
-    found = {}
-    for name, path in inputs.items():
-        target = tmp_path / f"{name}.tif"
-        summary = grid_dsm(path, target, resolution=2.0, method=method, fill=fill)
-        left, _, _, top = summary.bounds_m
-        column, row = round((left - 410_200.0) / 2.0), round((4_650_382.0 - top) / 2.0)
-        found[name] = np.full((43, 62), np.nan)
-        values = heights(target)
-        found[name][row : row + values.shape[0], column : column + values.shape[1]] = values
-    both = ~np.isnan(found["ours"] + found["truth"])
-    assert both.sum() > 0.95 * 60 * 40
-    error = np.abs(found["ours"] - found["truth"])[both]
-    assert np.median(error) < 0.01
-    assert np.quantile(error, 0.99) < 0.10
-    assert np.nanmax(found["apparent"] - found["truth"]) > 2.0
 
 
 def test_surfaces(tmp_path):

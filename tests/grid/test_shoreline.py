@@ -1,9 +1,7 @@
 """The shoreline: its standard error, and lines of shores, islands and pools."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,9 +15,6 @@ from pcfix.io.vectors import read_vectors
 from pcfix.simulate.scene import ORIGIN_M
 from pcfix.simulate.terrain import Terrain
 from tests.utils.program import run_pcfix
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pyogrio = pytest.importorskip("pyogrio")
 LEVEL_M, SIGMA_M = 0.37, 0.03

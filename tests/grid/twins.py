@@ -1,7 +1,5 @@
 """A raster made slowly: one cell after the other, in exact fractions where it can be."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 from itertools import combinations

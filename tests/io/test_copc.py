@@ -1,9 +1,8 @@
 """Parts of a cloud, and COPC files, which another library writes."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
@@ -25,9 +24,6 @@ from tests.utils.clouds import (
 )
 from tests.utils.codes import refused
 from tests.utils.copc import write_copc
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytest.importorskip("copclib")
 WEST, SOUTH = EAST_M + 0.2 * SIDE_M, NORTH_M + 0.2 * SIDE_M

@@ -10,14 +10,12 @@ from pcfix.io.crs import (
     check_projected_metres,
     geographic_3d,
     heights_of,
-    is_same,
     metres_up,
     parse_crs,
-    parts,
     transformation,
 )
 from tests.utils.codes import refused
-from tests.utils.pose_files.block import geocentric
+from tests.utils.geodesy import geocentric
 
 pytestmark = pytest.mark.quick_but("test_unknown")
 
@@ -97,18 +95,6 @@ def test_vertical_only():
 )  # fmt: skip
 def test_heights_of(text, kind):
     assert heights_of(CRS(text)) == kind
-
-
-def test_parts_of_bound_compound():
-    wkt = (
-        'COMPD_CS["a",' + CRS("EPSG:25830").to_wkt("WKT1_GDAL").replace(
-            'AUTHORITY["EPSG","6258"]', 'TOWGS84[0,0,0,0,0,0,0],AUTHORITY["EPSG","6258"]'
-        ) + "," + CRS("EPSG:5782").to_wkt("WKT1_GDAL") + "]"
-    )  # fmt: skip
-    plan, vertical = parts(CRS(wkt))
-    assert plan.is_bound
-    assert is_same(plan, CRS("EPSG:25830"))
-    assert vertical.to_epsg() == 5782
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-import pcfix
-from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.io.cameras import read_cameras
-from pcfix.io.scenes import write_scene
 from pcfix.io.tides import (
     ImageTimes,
     TideTable,
@@ -161,24 +158,6 @@ def test_times_of_other_software(tmp_path, name, content):
     zero = path.read_text().replace(str(1000.0 * NOON_S), "0").replace(str(NOON_S), "0")
     with refused("image_times.missing", images=["a"]):
         read_image_times(table(tmp_path, zero, name), ["a"])
-
-
-def test_inputs(tmp_path):
-    write_scene(pcfix.simulate_scene(500, seed=3), tmp_path, overwrite=False)
-    file = tmp_path / "cameras.csv"
-    cameras = pcfix.read_cameras(file)
-    minutes = np.linspace(0, 59, len(cameras)).astype(int)
-    rows = [
-        f"{label},2026-05-01T10:{m:02d}:00Z"
-        for label, m in zip(cameras.labels, minutes, strict=True)
-    ]
-    times = table(tmp_path, "\n".join(["label,time", *rows]) + "\n", "times.csv")
-    tide = table(tmp_path, TIDE)
-    inputs = Inputs(cameras=file, water=0.37, tide=tide, image_times=times)
-    level = np.interp(minutes, [0, 30, 60], [1.0, 1.3, 1.4])
-    assert inputs.level_offset_m(cameras) == pytest.approx(level - level.mean(), abs=1e-9)
-    assert {tide, times} <= set(paths_in(inputs))
-    assert Inputs(cameras=cameras, water=0.37).level_offset_m(cameras) is None
 
 
 @pytest.mark.parametrize("text", ['="+30.10"', ">30.10</drone-dji:RelativeAltitude>", "='30.1'"])

@@ -229,18 +229,6 @@ def test_feet(tmp_path):
         pcfix.read_water(path)
 
 
-def test_other_vertical_datum(tmp_path):
-    path = write(tmp_path / "w.tif", np.full((5, 5), 10.0), crs="EPSG:25833+7837")
-    with refused("crs.heights"):
-        pcfix.read_water(path, "EPSG:25833+5621")
-
-
-def test_no_crs(tmp_path):
-    path = write(tmp_path / "w.tif", tilted(*cells(from_origin(LEFT, TOP, 2, 2))), crs=None)
-    with warned("crs.assumed"):
-        expect_plane(pcfix.read_water(path, UTM33))
-
-
 FLAT = np.full((20, 20), 10.0)
 
 

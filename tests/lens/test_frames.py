@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 import pcfix
 from pcfix.lens.frames import NOT_DISTORTED, frames_of, holds, may_hold
-from pcfix.lens.imaging import project
 from pcfix.refract.intersect import TILE
 from tests.refract.test_kernels import same
 from tests.utils.beyond_frames import BEYOND_FRAMES
@@ -105,43 +104,6 @@ def test_slow_implementation(name, points):
     assert 0 <= seen.min() < seen.max() <= len(cameras)  # the scene tests something
     assert np.array_equal(result.ray_count, np.where(seen >= 2, seen, 0))
     same(result, snell(some, cameras, 0.0, views=views))
-
-
-def boxes(rng, count=200):
-    """Return upright boxes of all sizes below and above the block."""
-    middle = rng.uniform((-100, -100, -20), (200, 200, 150), (count, 3))
-    half = 10 ** rng.uniform(-2, 1.5, (count, 1)) * rng.uniform(0.05, 1, (count, 3))
-    return middle - half, middle + half
-
-
-@pytest.mark.parametrize("name", mostly_nightly(LENSES, "everything"))
-def test_may_hold(name):
-    rng = np.random.default_rng(5)
-    cameras = block(LENSES[name], k=8, seed=3)
-    frames, excluded = frames_of(cameras), 0
-    for low, high in zip(*boxes(rng), strict=True):
-        inside = rng.uniform(low, high, (20, 3))
-        inside[:8] = np.where(np.indices((2, 2, 2)).reshape(3, 8).T == 0, low, high)
-        for c, centre in enumerate(cameras.centres):
-            if not may_hold(frames, c, centre, low, high):
-                excluded += 1
-                assert not any(holds(frames, c, tuple(row)) for row in centre - inside)
-    assert excluded > 0
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_pyramid_and_cone(name):
-    lens = LENSES[name]
-    frames = frames_of(pcfix.Cameras(("a",), np.zeros((1, 3)), np.eye(3)[None], (lens,)))
-    directions = np.random.default_rng(2).normal(size=(200_000, 3))
-    u, v = project(lens, directions).T
-    held = directions[(u >= 0) & (u <= lens.width) & (v >= 0) & (v <= lens.height)]
-    assert len(held) > 1000
-    assert (held @ frames.planes[0].T >= 0).all()
-    angle = np.arccos(held[:, 2] / np.linalg.norm(held, axis=1))
-    assert angle.max() <= frames.cone[0, 3] <= np.pi + 0.1
-    if lens.projection == "perspective" and name != "folding":
-        assert frames.cone[0, 3] < 1.02 * angle.max() + 0.01  # and not far around
 
 
 def test_different_lenses(points):

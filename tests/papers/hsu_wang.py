@@ -16,8 +16,6 @@ depth, from 3 to 7 mm. A shift between the two surface models or another water l
 it.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

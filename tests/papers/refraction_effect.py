@@ -4,7 +4,7 @@
 
 Figures 4 to 6 of Skarlatos & Agrafiotis (2018), "A Novel Iterative Water Refraction Correction
 Algorithm for Use in Structure from Motion Photogrammetric Pipeline", JMSE 6(3) 77: the error of the
-apparent depth over the model of two vertical images. Nothing here is shared with the correction.
+apparent depth over the model of two vertical images, by the method `snell`.
 
 The paper gives one pair of numbers: SwingletCAM from 100 m, 80 % overlap, apparent depth 15 m:
 -8.23 m in the corners of the model and -5.15 m in its centre. This reading gives both (-8.232,
@@ -18,15 +18,15 @@ the point on the vertical through the true point that lies 1/s as deep, with
     s = tan a / tan b = sqrt(n^2 + (n^2 - 1) tan^2 a),    tan a = R / (Z_o - Z / s).
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+import pcfix
 from pcfix.report.page import AFTER, BEFORE, WATER, new_figure, png_of
 from tests.papers import hsu_wang
 from tests.utils.bed_rays import piercing_points
@@ -104,29 +104,14 @@ def effect(pair, depth_m, index=1.34, nodes=61):
     x, y = (np.linspace(-side / 2.0, side / 2.0, nodes) for side in pair.model_m)
     plan = np.stack(np.meshgrid(x, y), axis=-1)
     apparent = np.dstack([plan, np.full(plan.shape[:2], -depth_m)])
-    true = true_points(apparent, pair.centres, index)
+    cameras = pcfix.Cameras(("left", "right"), pair.centres)
+    options = {"index": index, "method": "snell", "max_angle": None, "deep": True}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pcfix.PcfixWarning)
+        true = pcfix.correct_points(apparent.reshape(-1, 3), cameras, 0.0, **options).xyz
+    true = true.reshape(apparent.shape)
     shift = np.linalg.norm(true[..., :2] - plan, axis=-1)
     return Effect(pair, depth_m, x, y, depth_m + true[..., 2], shift)
-
-
-def true_points(apparent, centres, n):
-    """Return the midpoints of the shortest lines between both refracted rays (eqs 8 to 11)."""
-    (first, a), (second, b) = (_in_water(apparent, centre, n) for centre in centres)
-    gap = second - first
-    cosine, along_a, along_b = ((u * v).sum(axis=-1) for u, v in ((a, b), (gap, a), (gap, b)))
-    sine2 = 1.0 - cosine**2
-    on_first = first + a * ((along_a - cosine * along_b) / sine2)[..., None]
-    on_second = second + b * ((cosine * along_a - along_b) / sine2)[..., None]
-    return (on_first + on_second) / 2.0
-
-
-def _in_water(apparent, centre, n):
-    """Return the piercing point and the direction in the water, whose horizontal part shrinks."""
-    sight = apparent - centre
-    surface = centre + sight * (centre[2] / -sight[..., 2])[..., None]
-    down = sight / np.linalg.norm(sight, axis=-1, keepdims=True) / n
-    down[..., 2] = -np.sqrt(1.0 - down[..., 0] ** 2 - down[..., 1] ** 2)
-    return surface, down
 
 
 class Iteration(NamedTuple):

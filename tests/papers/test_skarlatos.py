@@ -1,6 +1,5 @@
 """Numbers of Skarlatos & Agrafiotis (2018), JMSE 6(3) 77, and Shan's iteration as given there."""
 
-import math
 from itertools import pairwise
 
 import numpy as np
@@ -15,13 +14,10 @@ from tests.papers.refraction_effect import (
     ULTRACAM,
     StereoPair,
     effect,
-    effect_rows,
     shan_iterations,
-    true_points,
     write_all,
 )
 from tests.papers.test_equations import pierced, refracted
-from tests.utils.bed_rays import piercing_points
 
 PAIR = StereoPair(SWINGLETCAM, 100.0)
 PAIRS = [
@@ -84,14 +80,6 @@ def test_largest_error(pair):
     assert corner / 15.0 == pytest.approx(0.5, abs=0.076)
 
 
-def test_depth_zero():
-    zero, deep = (effect(PAIR, depth, PAPER_INDEX) for depth in (0.0, 15.0))
-    assert np.abs(zero.error_m).max() < 1e-12  # m, rounding of sums of 100 m
-    rows = effect_rows([zero, deep], PAPER_INDEX)
-    assert rows[0]["factor_centre"] == rows[0]["factor_corner"] == ""
-    assert rows[1]["factor_corner"] == pytest.approx(23.23 / 15.0, abs=0.005 / 15.0)
-
-
 @pytest.mark.parametrize("pair", [PAIR, StereoPair(ULTRACAM, 1000.0)])
 def test_shan_converges(pair):
     table = shan_iterations(pair, 15.0)
@@ -104,17 +92,6 @@ def test_shan_converges(pair):
     assert table[-1].change < 1e-9
 
 
-def test_shan_starts_with_straight_rays():
-    """With s = 1 the centre of the model has the depth of two straight rays."""
-    half = PAIR.base_m / 2.0
-    tan_air = tan_water = 0.0
-    for _ in range(50):  # 100 tan a + 15 tan b = half the base, by substitution
-        tan_air = (half - 15.0 * tan_water) / 100.0
-        tan_water = math.tan(math.asin(math.sin(math.atan(tan_air)) / 1.34))
-    first = shan_iterations(PAIR, 15.0, nodes=1)[0]
-    assert first.mean_m == pytest.approx(half / tan_air - 115.0, abs=1e-9)  # m, rounding
-
-
 def test_shan_of_the_correction():
     """In the centre, the rays of the apparent point are those of the images."""
     start, *_, end = shan_iterations(PAIR, 15.0, nodes=1)
@@ -122,33 +99,6 @@ def test_shan_of_the_correction():
     apparent = [[0.0, 0.0, -(15.0 + start.mean_m)]]
     corrected = pcfix.correct_points(apparent, cameras, 0.0, method="shan").xyz
     assert -corrected[0, 2] == pytest.approx(15.0 + end.mean_m, abs=1e-6)  # m; it stops at 1e-9
-
-
-def test_effect_index_of_one():
-    still = effect(PAIR, 15.0, 1.0)
-    assert np.abs(still.error_m).max() < 1e-9  # m, rounding of sums about 100
-    assert still.shift_m.max() < 1e-9
-
-
-def test_light_from_true_point():
-    """Fermat's path from the true point: where two rays meet, straight lines meet as well."""
-    apparent = np.array([[0.0, y, -15.0] for y in (0.0, 20.0, 60.0)])  # on the plane of symmetry
-    true = true_points(apparent, PAIR.centres, 1.34)
-    for centre in PAIR.centres:
-        surface = piercing_points(true, np.tile(centre, (3, 1)), 0.0, 1.34)
-        sight, straight = surface - centre, apparent - centre
-        lengths = np.linalg.norm(sight, axis=1) * np.linalg.norm(straight, axis=1)
-        sine = np.cross(sight, straight) / lengths[:, None]  # of two lines of about 120 m
-        assert np.abs(sine).max() < 1e-9
-
-
-def test_correction_agrees():
-    model = effect(PAIR, 15.0, nodes=9)
-    x, y = (side.ravel() for side in np.meshgrid(model.x_m, model.y_m))
-    apparent = np.column_stack([x, y, np.full(len(x), -15.0)])
-    cameras = pcfix.Cameras(("left", "right"), PAIR.centres)
-    corrected = pcfix.correct_points(apparent, cameras, 0.0, index=1.34).xyz
-    assert corrected[:, 2] == pytest.approx(model.error_m.ravel() - 15.0, abs=1e-8)  # m
 
 
 def test_files(tmp_path):

@@ -1,7 +1,5 @@
 """The stage as a function of arrays; no PDAL is needed for it."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -64,7 +62,7 @@ def test_correct(cloud, tmp_path, monkeypatch):
     """The arrays are those of a file, and as PDAL takes them without a check."""
     path, ins, metadata = cloud
     before = {name: values.copy() for name, values in ins.items()}
-    options = {"cameras": str(tmp_path / "cameras.csv"), "water": WATER_M}
+    options = {"cameras": str(tmp_path / "cameras.csv"), "water": WATER_M, "max_angle": 80.0}
     outs, _ = run("correct", ins, metadata, **options)
     pcfix.correct_file(path, tmp_path / "out.las", **options)
     las = laspy.read(tmp_path / "out.las")
@@ -142,7 +140,7 @@ def test_report(cloud, tmp_path):
     """The metadata and the summary are those of a file; so is the shoreline."""
     path, ins, metadata = cloud
     pyogrio = pytest.importorskip("pyogrio")
-    options = {"cameras": str(tmp_path / "cameras.csv"), "water": str(WATER_M)}
+    options = {"cameras": str(tmp_path / "cameras.csv"), "water": str(WATER_M), "max_angle": 80.0}
     names = {"summary": str(tmp_path / "s.json"), "shoreline": str(tmp_path / "stage.gpkg")}
     _, report = run("correct", ins, metadata, **options, **names)
     found = {node["name"]: node["value"] for node in report["children"]}
@@ -159,7 +157,7 @@ def test_report(cloud, tmp_path):
     assert json.loads(found["shoreline"])["lines"] == len(stage[2])
 
 
-GOOD = {"cameras": "cameras.csv", "water": WATER_M}
+GOOD = {"cameras": "cameras.csv", "water": WATER_M, "max_angle": 80.0}
 MISTAKES = [
     ({**GOOD, "watre": 1}, None),
     ({"water": 1.0}, "option.missing"),

@@ -1,7 +1,5 @@
 """Sequences through waves, against the same bed through calm water."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -14,7 +12,7 @@ import pcfix
 from pcfix.flow.photos import map_photos
 from pcfix.io.water import read_water_raster
 from pcfix.model import Lens
-from pcfix.photos.calm import corners_in, laid, median_of, register
+from pcfix.photos.calm import corners_in, laid, register
 from pcfix.photos.mapping import Photo
 from pcfix.photos.waves import View, bed_places, slopes_of
 from pcfix.water.surface import surface_above
@@ -76,21 +74,6 @@ def test_slopes():
         height, slope = sea.at(xy, 1.0)
     found = slopes_of(view, xy, height, shift)
     assert found == pytest.approx(slope, abs=1e-6)  # the simulator steps to the surface
-
-
-def test_median():
-    rng = np.random.default_rng(1)
-    values = rng.normal(100.0, 4.0, (400, 6, 7, 3)).round().astype(np.uint8)
-    known = np.ones((400, 6, 7), bool)
-    known[:, 0, 0] = False
-    known[7:, 0, 1] = False
-    values[7:, 0, 1] = 255
-    median, spread = median_of(values, known)
-    assert median[0, 0].tolist() == [0, 0, 0]
-    assert np.isnan(spread[0, 0])
-    assert median[0, 1] == pytest.approx(np.median(values[:7, 0, 1], axis=0), abs=0.51)
-    assert median[1:] == pytest.approx(np.median(values[:, 1:], axis=0), abs=0.51)
-    assert spread[1:].mean() == pytest.approx(4.0, rel=0.1)
 
 
 def test_registration():

@@ -93,29 +93,6 @@ def test_land_unchanged(project):
     assert (before == after)[inland].all()
 
 
-def test_cameras_transformed(project, tmp_path):
-    import pyproj
-
-    poses = np.genfromtxt(project / "cameras.csv", delimiter=",", skip_header=1, usecols=(1, 2, 3))
-    east, north = pyproj.Transformer.from_crs(32633, 32634, always_xy=True).transform(*poses.T[:2])
-    turn = pyproj.Proj(32633).get_factors(15.0, 36.14).meridian_convergence
-    turn -= pyproj.Proj(32634).get_factors(15.0, 36.14).meridian_convergence
-    rows = [
-        f"IMG_{i},{e},{n},{z},{35 + turn},4,3"
-        for i, (e, n, z) in enumerate(zip(east, north, poses[:, 2], strict=True))
-    ]
-    (tmp_path / "cameras.csv").write_text("label,x,y,z,yaw,pitch,roll\n" + "\n".join(rows) + "\n")
-    (tmp_path / "sensor.csv").write_text((project / "sensor.csv").read_text())
-    given = words(project, "--spacing", "32", out=str(tmp_path / "out"))
-    given[given.index("--cameras") + 1] = str(tmp_path / "cameras.csv")
-    assert run_pcfix(*given).code == "cameras.no_overlap"
-    done = run_pcfix(*given, "--cameras-crs", "EPSG:32634")
-    assert done.returncode == 0, done.stderr
-    run_pcfix(*words(project, "--spacing", "32", out=str(tmp_path / "here")))
-    one, other = (read_photograph(tmp_path / at / "IMG_0.JPG") for at in ("out", "here"))
-    assert np.abs(one.astype(float) - other).mean() < 3.0  # grey values; 60 where they do not fit
-
-
 def test_resumed(project):
     run_pcfix(*words(project, out="again"))
     (project / "again" / "IMG_1.JPG").unlink()

@@ -1,7 +1,5 @@
 """Images through a housing port, adjusted from files: poses, points and the program."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -37,10 +35,9 @@ def write_scene(folder, port):
     made = simulate_port(port, points=300, noise_px=0.3, seed=4)
     rng = np.random.default_rng(6)
     off = rng.normal(0.0, 0.02, made.cameras.centres.shape)
-    cameras = replace(made.cameras, centres=made.cameras.centres + off)
-    write_colmap(
-        folder / "model", cameras, TiePoints(made.apparent, made.views, made.image_xy), crs=EPSG
-    )
+    cameras = replace(made.cameras, centres=made.cameras.centres + off, crs=EPSG)
+    ties = TiePoints(made.apparent, made.views, made.image_xy)
+    write_colmap(folder / "model", cameras, ties)
     places = made.cameras.centres + rng.normal(0.0, SIGMA_M, off.shape)
     write_gnss(folder / "gnss.csv", cameras.labels, places, np.full(off.shape, SIGMA_M))
     return made

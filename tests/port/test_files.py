@@ -12,8 +12,8 @@ from pcfix.options.correct import ScienceOptions
 from pcfix.port.methods import correct_through_port
 from pcfix.port.shapes import FlatPort
 from pcfix.report.text import summary_text
+from tests.utils.clouds import write_las
 from tests.utils.port_scenes import simulate_port
-from tests.utils.program import run_pcfix
 
 SPEC = "flat:distance=0.02,thickness=0.008"
 
@@ -25,14 +25,9 @@ def scene():
 
 @pytest.fixture(scope="module")
 def cloud(scene, tmp_path_factory):
-    header = laspy.LasHeader(point_format=6, version="1.4")
-    header.scales, header.offsets = [0.0001] * 3, scene.apparent[0].round()
-    las = laspy.LasData(header)
-    las.xyz = scene.apparent
-    las.classification = np.where(np.arange(len(las)) % 10 == 0, 7, 2)
     path = tmp_path_factory.mktemp("port") / "cloud.las"
-    las.write(path)
-    return path
+    classes = np.where(np.arange(len(scene.apparent)) % 10 == 0, 7, 2)
+    return write_las(path, scene.apparent, classes, crs=None, scale=0.0001)
 
 
 def test_file(scene, cloud, tmp_path):
@@ -94,16 +89,3 @@ def test_other_cameras_refused(scene, cloud, tmp_path):
     with pytest.raises(GeometryError):
         pcfix.correct_file(cloud, tmp_path / "out.las", cameras=away, port=SPEC)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("words", "exit_code"),
-    [([], 2), (["--water", "0", "--port", SPEC], 1), (["--port", "flat:distance=-1"], 1),
-     (["--port", SPEC], 1)],
-)  # fmt: skip
-def test_command_line(words, exit_code, cloud, tmp_path):
-    given = ["--cameras", tmp_path / "none.csv", *words]
-    done = run_pcfix("correct", cloud, tmp_path / "out.las", *given)
-    assert done.returncode == exit_code
-    if "flat:distance=-1" in words:
-        assert done.code == "port.range"

@@ -1,7 +1,5 @@
 """The plugin of QGIS: its table, its words, its process, and the same bytes under Debian's QGIS."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import lru_cache
 
-import numba
 import numpy as np
 import pytest
 
@@ -12,25 +11,14 @@ from pcfix.io.views import ViewMatch, read_views
 from pcfix.lens.frames import frames_of
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import FLAT_DEG, Batch, Chosen, Learned, Survey, images_of
-from pcfix.refract.depth_maps import (
-    BED,
-    BEST,
-    DEPTH,
-    Block,
-    best_pairs,
-    look,
-    room_of_tile,
-    start_tile,
-)
+from pcfix.refract.batch import Batch, Learned, Survey
 from pcfix.refract.learning import learn_of_sample
-from pcfix.refract.matcher import Bed, Matcher, bed_of
-from pcfix.refract.methods import correct, with_rays
-from pcfix.refract.tiling import TILE
+from pcfix.refract.matcher import Matcher
+from pcfix.refract.methods import correct
 from pcfix.running import threads
 from pcfix.water.surface import is_submerged, surface_above
 from tests.utils.batches import batch_of
-from tests.utils.depth_map_twin import LENS, costs_of, fused_slowly, looking, on_bed, slow_depth
+from tests.utils.depth_map_twin import LENS, fused_slowly, looking
 from tests.utils.matchers import matched_scene
 from tests.utils.nightly import mostly_nightly
 from tests.utils.shared import needs
@@ -76,67 +64,6 @@ def listed(lists, weights=None):
 
 
 # one depth
-
-
-def test_best_pairs():
-    rng = np.random.default_rng(1)
-    for count in (1, 2, 3, 5):
-        places, squares = rng.normal(0, 0.3, (count, 20)), rng.uniform(0, 1, (count, 20))
-        curvatures = rng.uniform(4, 40, (count, 20))
-        found = best_depths(places, squares, curvatures, 0.1)
-        for i, t in enumerate(found):
-            columns = zip(places[:, i], squares[:, i], curvatures[:, i], strict=True)
-            costs = [lambda t, p=p: float(p[1] + p[2] * (t - p[0]) ** 2) for p in columns]
-            # scipy knows the place of a least value to about the root of its precision
-            assert t == pytest.approx(
-                slow_depth(costs, 0.1) if count > 1 else places[0, i], abs=1e-6
-            )
-
-
-@numba.njit(error_model="numpy")
-def best_depths(places, squares, curvatures, tolerance):
-    """Return the depths of best agreement at places, of partners by row and points by column."""
-    tile = room_of_tile(1, len(places))
-    for p in range(len(places)):
-        for i in range(places.shape[1]):
-            tile.partners[p, i], tile.partners[p, TILE + i] = places[p, i], squares[p, i]
-            tile.partners[p, 2 * TILE + i] = curvatures[p, i]
-    best_pairs(tile.room, tile.partners, tile.pairs, places.shape[1], tolerance)
-    return tile.room[BEST * TILE : BEST * TILE + places.shape[1]].copy()
-
-
-@numba.njit(error_model="numpy")
-def depth_of(block, c, bed):
-    """Return the depth of a bed, at a height over the one point of a block, in the map of c."""
-    tile = room_of_tile(1, block.matcher.matched.shape[1])
-    start_tile(tile, np.zeros(1, np.int64), np.zeros(0), block)
-    tile.room[BED * TILE] = bed
-    look(tile, np.full(1, c), np.ones((1, 1)), block)
-    return tile.looks[0, DEPTH * TILE]
-
-
-@pytest.mark.parametrize("c", [0, 2, 4, 5, 7])
-def test_depth_as_twin(c):
-    """The same costs, minimised by scipy; the light traced by other means."""
-    p, plane, bed = np.array([3.0, 4.0, -4.5]), (0.3, 0.004, -0.003), (-6.5, 0.0, 0.0)
-    offset = np.array([0.0, 0.05, -0.03, 0.02, 0.0, 0.04, 0.0, -0.05])
-    planes = [(plane[0] + up, *plane[1:]) for up in offset]
-    length = np.linalg.norm(p - CAMERAS.centres[c])
-    u = (p - CAMERAS.centres[c]) / length
-    q = on_bed(CAMERAS.centres[c], p, planes[c], bed, N_WATER)
-    partners = [j for j in MATCHED[c] if j >= 0]
-    costs = costs_of(p, u, q, CAMERAS, partners, planes, N_WATER, "angles")
-    height = plane[0] + plane[1] * p[0] + plane[2] * p[1]
-    nothing = np.zeros(0, np.int64)
-    points = Chosen(
-        p[None], p[None], np.array([height]), np.array([plane[1:]]), CAMERAS.centres, offset,
-        nothing, nothing, N_WATER,
-    )  # fmt: skip
-    block = Block(points, images_of(None, CAMERAS), matcher(), offset.mean())
-    # 0.3 to 1 m, in single precision; scipy's least values are flat within 1e-6 m
-    assert length * depth_of(block, c, q[2] - p[2]) == pytest.approx(
-        slow_depth(costs, TOLERANCE), abs=2e-5
-    )
 
 
 def test_depth_needs_partner():
@@ -285,44 +212,6 @@ def test_block_without_list(name, most, monkeypatch):
 # the bed of the surroundings
 
 
-def test_bed_of_groups():
-    rng = np.random.default_rng(6)
-    xyz = np.column_stack([rng.uniform(0, 30, (60_000, 2)), rng.normal(-4, 0.5, 60_000)])
-    bed = -6.0 - 0.02 * xyz[:, 0]
-    likely = rng.uniform(-4, 2, (60_000, 6)).astype(np.float32)
-    right = rng.integers(0, 6, 60_000)
-    likely[np.arange(60_000), right] = bed - xyz[:, 2]
-    likely[rng.uniform(0, 1, likely.shape) < 0.1] = np.nan  # also some of the right ones
-    found = bed_of(xyz, likely, 0.05)
-    assert 9 < 60_000 / 30**2 * found.cell_m**2 < 15  # points a cell
-    # heights are tried at every GSD, and cells fall by 1 cm
-    close = np.abs(found.height_at(xyz[:, :2]) - bed) < 0.1
-    assert close.mean() > 0.97
-
-
-def test_unknown_bed():
-    found = Bed(np.array([[1.0, np.nan], [3.0, 4.0]]), 10.0, 20.0, 2.0)
-    xy = np.array(
-        [[10.0, 20.0], [13.9, 20.1], [11, 23.9], [13, 22], [9.9, 21], [11, 24.1], [99, 0]]
-    )
-    assert found.height_at(xy).tolist()[:1] == [1.0]
-    assert found.height_at(xy)[2:4].tolist() == [3.0, 4.0]
-    assert np.isnan(found.height_at(xy)[[1, 4, 5, 6]]).all()
-    xyz = np.repeat([[0.0, 0, 0], [50, 0, 0]], 40, axis=0)
-    likely = np.repeat([[-1.0], [np.nan]], 40, axis=0).astype(np.float32)
-    heights = bed_of(xyz, likely, 0.05).height_at(xyz[:, :2])
-    assert (heights[:40] == -1.0).all() and np.isnan(heights[40:]).all()
-
-
-def test_no_bed():
-    xyz = np.array([[3.0, 4.0, -4.5]])
-    one = Learned(matcher=matcher(fused=FUSED))
-    far = one._replace(bed=Bed(np.zeros((1, 1)), 500.0, 500.0, 1.0))
-    assert np.array_equal(
-        run(xyz, WaterPlane(0.3), None, one).shift_m, run(xyz, WaterPlane(0.3), None, far).shift_m
-    )
-
-
 def test_any_chunk():
     """The result of a point does not depend on the others, nor on the number of threads."""
     scene = scene_of("nadir")
@@ -337,18 +226,6 @@ def test_any_chunk():
         with threads(3):
             some = correct(one.take(rows)).shift_m
         np.testing.assert_array_equal(some, correct(one).shift_m[rows])
-
-
-def test_seen_flat():
-    cameras = looking(
-        [[0, 0, 70], [10, 0, 70], [160, 0, 70], [165, 5, 70]], [0, 0, 50, 50], [0, 0, 180, 180]
-    )
-    xyz = np.array([[5.0, 0.0, -2.0], [80.0, 0.0, -2.0], [900.0, 0.0, -2.0]])
-    above = surface_above(WaterPlane(0.0), xyz)
-    settings = ScienceOptions(method="consistent", camera_set="all")
-    flat = with_rays(batch_of(xyz, above, WaterPlane(0.0), cameras, settings)).seen_flat()
-    assert flat.tolist() == [False, True, False]  # from above; at 48 degrees; not at all
-    assert FLAT_DEG < 48.0
 
 
 # a real cloud

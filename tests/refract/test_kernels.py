@@ -122,12 +122,6 @@ def test_no_points(points, cameras, way):
     assert correct(batch).shift_m.shape == (0, 3)
 
 
-def test_listed_as_in_frame(points, cameras):
-    every = snell(points, cameras, 0.0)
-    chosen = snell(points, cameras, 0.0, max_cameras=len(cameras))
-    same(every, chosen)
-
-
 def test_max_cameras(points, cameras):
     result = snell(points, cameras, 0.0, max_cameras=3)
     assert result.ray_count.max() == 3

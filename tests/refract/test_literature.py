@@ -163,33 +163,6 @@ def test_hsu_wang_2_to_4(images):
     assert (found.shift_m[:, :2] == 0.0).all()
 
 
-def shan_slowly(point, centres, n):
-    """Solve X - u D / s = X_s + u H, and its like in y, for X, Y, D in turn with eq 7 for s."""
-    u = (point[:2] - centres[:, :2]) / (centres[:, 2] - point[2])[:, None]
-    s = np.ones(len(centres))
-    for _ in range(60):
-        system = np.zeros((2 * len(centres), 3))
-        system[0::2, 0] = system[1::2, 1] = 1.0
-        system[:, 2] = -(u / s[:, None]).ravel()
-        right = (centres[:, :2] + u * centres[:, 2:]).ravel()
-        x, y, depth = np.linalg.lstsq(system, right, rcond=None)[0]
-        tangent = np.hypot(x - centres[:, 0], y - centres[:, 1]) / (centres[:, 2] + depth / s)
-        s = np.array(
-            [math.tan(a) / math.tan(math.asin(math.sin(a) / n)) for a in np.arctan(tangent)]
-        )
-    return np.array([x, y, -depth])
-
-
-@pytest.mark.parametrize("k", [2, 5])
-def test_shan_as_twin(k):
-    points, centres = bed(), block(k)
-    found = run("shan", points, centres)
-    for i, point in enumerate(points):
-        expected = shan_slowly(point - UTM, centres - UTM, 1.34)
-        # 1e-9 of tan a is 1e-9 of 15 m; the weakest pair here multiplies that by 3
-        assert point - UTM + found.shift_m[i] == pytest.approx(expected, abs=5e-8)
-
-
 def test_shan_ray_miss():
     points, centres = bed(20), block(4)
     found = run("shan", points, centres)

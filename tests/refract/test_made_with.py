@@ -67,13 +67,6 @@ def run(xyz, views, learned, original_model, kind="depth-maps"):
     )
 
 
-def views_of(kind):
-    """Return maps of a list, pairs of a list, or no list for the points of `some_points`."""
-    if kind == "list":
-        return listed([MIXED] * 60)
-    return replace(listed([(0, 2, 4, 5, 2, 7)] * 60), kind="pairs") if kind == "pairs" else None
-
-
 def some_points():
     rng = np.random.default_rng(9)
     return np.column_stack([rng.uniform(-12, 12, (60, 2)), rng.uniform(-6, 0.0, 60)])

@@ -7,52 +7,11 @@ import pytest
 
 import pcfix
 from pcfix.io.cameras import read_tie_points
-from pcfix.model import TiePoints, Views
-from pcfix.refract.matcher import REPEATED_DEG, matcher_of, matcher_of_ties
-from tests.utils.depth_map_twin import in_frame, looking, scores_slowly
+from pcfix.refract.matcher import matcher_of, matcher_of_ties
 from tests.utils.matchers import matched_scene
 from tests.utils.shared import needs
 
 RENDERED, rendered = needs("rendered_a")
-
-
-def block(rng):
-    """Return fourteen nadir and six oblique images, and places that they see."""
-    grid = np.stack(np.meshgrid(np.arange(-40, 41, 14.0), [-18.0, 16.0]), axis=2).reshape(-1, 2)
-    nadir = np.column_stack([grid, np.full(len(grid), 70.0)]) + rng.normal(0, 1.5, (len(grid), 3))
-    far = [[-70, 0, 66], [68, 8, 70], [3, -66, 69], [-5, 71, 72], [-60, 30, 110], [20, 60, 30]]
-    centres = np.vstack([nadir, np.array(far, float)])
-    tilts = [*rng.uniform(0, 3, len(nadir)), 35, 35, 35, 35, 30, 50]
-    headings = [*rng.uniform(0, 360, len(nadir)), 0, 180, 90, 270, 330, 250]
-    places = np.column_stack([rng.uniform(-45, 45, (220, 2)), rng.uniform(-6, 3, 220)])
-    return looking(centres, tilts, headings), places
-
-
-def table_of(score, columns):
-    """Return the best columns of each row of scores, -1 where a score is zero."""
-    best = np.argsort(-score, axis=1, kind="stable")[:, :columns]
-    return np.where(np.take_along_axis(score, best, axis=1) > 0.0, best, -1)
-
-
-def test_partners_of_places():
-    cameras, places = block(np.random.default_rng(1))
-    found = matcher_of(cameras, places)
-    slow = scores_slowly(cameras, places, in_frame(cameras, places), REPEATED_DEG)
-    assert (slow[:, -2:] == 0.0).any() and (slow > 0.0).any(axis=1).all()
-    for table, columns in ((found.matched, 5), (found.averaged, 8), (found.fused, 12)):
-        assert np.array_equal(table, table_of(slow, columns))
-
-
-def test_partners_of_ties():
-    rng = np.random.default_rng(2)
-    cameras, places = block(rng)
-    places[7] = np.nan  # a tie point without coordinates
-    seen = in_frame(cameras, places) & (rng.uniform(0, 1, (len(cameras), len(places))) < 0.5)
-    point, camera = np.nonzero(seen.T)
-    start = np.concatenate([[0], np.cumsum(np.bincount(point, minlength=len(places)))])
-    ties = TiePoints(places, Views(start, camera), np.zeros((len(camera), 2)))
-    slow = scores_slowly(cameras, places, seen)
-    assert np.array_equal(matcher_of_ties(cameras, ties).fused, table_of(slow, 12))
 
 
 @pytest.mark.parametrize("obliques", [{}, {"obliques_deg": 35.0, "oblique_share": 0.5}])

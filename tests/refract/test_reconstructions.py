@@ -8,7 +8,6 @@ import pytest
 import pcfix
 from pcfix.model import Cameras, WaterPlane
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract import patches
 from pcfix.refract.batch import Batch, Survey
 from pcfix.refract.learning import learn_of_sample
 from pcfix.refract.reconstructions import IN_FRAME, hint_of, reconstructions_of
@@ -184,41 +183,3 @@ def test_list_of_base_images():
     error = (found.xyz - scene.true_xyz[rows])[deep, 2] / scene.gsd_m
     assert abs(error.mean()) < 0.5
     assert np.sqrt(np.mean(error**2)) < 2.0
-
-
-# squares of a large cloud
-
-WIDTH_M, MOST = 2.0, 5000
-
-
-def in_squares(xyz, cameras, size):
-    water, squares = WaterPlane(0.0), patches.Squares(WIDTH_M)
-    for start in range(0, len(xyz), size):
-        some = xyz[start : start + size]
-        squares.add(
-            Batch(some, surface_above(water, some), Survey(water, cameras, ScienceOptions()))
-        )
-    return squares.all().xyz
-
-
-@pytest.fixture
-def some(monkeypatch):
-    monkeypatch.setattr(patches, "MOST_IN_SQUARES", MOST)
-    xyz = np.random.default_rng(3).uniform(
-        [456_000, 5_432_000, -3], [456_300, 5_432_200, -1], (40_000, 3)
-    )
-    return xyz, simulated(2000, seed=1).cameras
-
-
-def test_squares_have_neighbours(some):
-    xyz, cameras = some
-    found = in_squares(xyz, cameras, 9000)
-    square_m = patches.SQUARE_PATCHES * WIDTH_M
-    squares = np.unique(np.floor(found[:, :2] / square_m), axis=0)
-    everyone = np.floor(xyz[:, :2] / square_m)
-    inside = (everyone[:, None] == squares).all(axis=2).any(axis=1)
-    assert inside.sum() == len(found)
-    whole = np.unique(everyone, axis=0)
-    # spread as by chance: the mean of their places within four standard errors of that of all
-    error = whole.std(axis=0) / np.sqrt(len(squares))
-    assert (np.abs(squares.mean(axis=0) - whole.mean(axis=0)) < 4.0 * error).all()

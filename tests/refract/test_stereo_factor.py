@@ -8,7 +8,6 @@ import pytest
 import pcfix
 from pcfix.errors import GeometryError, SettingError
 from pcfix.refract.stereo_factor import NODES, ratios, stereo_factor
-from tests.papers.refraction_effect import SWINGLETCAM, StereoPair, effect
 from tests.utils.codes import refused
 from tests.utils.twins import light_path
 
@@ -45,17 +44,6 @@ def test_traced_light():
 def test_nodes():
     fine = np.mean([ratios(0.2, 0.5 + d, 0.75, N).mean() for d in (-1e-4, 1e-4)])
     assert ratios(0.2, 0.5, 0.75, N).mean() == pytest.approx(fine, rel=1e-6)
-
-
-def test_skarlatos_agrafiotis():
-    """Theirs starts from an exact apparent point, so that bent rays miss, not straight ones."""
-    pair = StereoPair(SWINGLETCAM, 100.0)
-    along, across = (side / 200.0 for side in SWINGLETCAM.footprint_m(100.0))
-    found = effect(pair, 0.01)
-    theirs = 1.0 - found.error_m / 0.01
-    ours = ratios(pair.base_m / 100.0, along, across, N)
-    assert ours.mean() == pytest.approx(theirs.mean(), rel=0.01)
-    assert ours[NODES // 2, NODES // 2] == pytest.approx(1.0 - found.centre_m / 0.01, rel=1e-3)
 
 
 def measured(scene):

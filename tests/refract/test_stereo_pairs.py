@@ -1,6 +1,5 @@
 """Stereo pairs and their median, back to the truth: simulated clouds, a slow twin, and outcomes."""
 
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -10,22 +9,16 @@ from scipy.optimize import root
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned
-from pcfix.refract.choice import cameras_of_pairs
-from pcfix.refract.intersect import intersect
 from pcfix.refract.matcher import matcher_of
 from pcfix.refract.methods import correct
-from pcfix.refract.stereo_pairs import invert_pairs
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
-from tests.utils.codes import warned
 from tests.utils.consistent_twin import seen_through_water, triangulated_straight
 from tests.utils.depth_map_twin import LENS, looking
 from tests.utils.matchers import matched_scene
 from tests.utils.nightly import mostly_nightly
 
 N_WATER = 1.34
-DISTORTED = replace(LENS, radial=(-0.12, 0.05, -0.01), tangential=(1e-3, -6e-4), b1=1.5)
-FISHEYE = replace(LENS, focal=2200.0, projection="equidistant", radial=(0.02, -0.004))
 
 SCENES = {
     "shore": {"bed": "shore"},
@@ -118,22 +111,6 @@ def test_modelled_pairs(name):
     assert rmse < 0.85 * rmse_and_bias(scene, rows, plain)[0]
 
 
-def test_true_partners():
-    scene = scene_of("obliques", 0.5)
-    rows = under_water(scene)[:300]
-    xyz = scene.apparent_xyz[rows]
-    matcher = matcher_of(scene.cameras, xyz)._replace(matched=scene.neighbours)
-    settings = ScienceOptions(index=scene.refractive_index, method="consistent")
-    batch = batch_of(
-        xyz, surface_above(scene.water, xyz), scene.water, scene.cameras, settings,
-        scene.views.take(rows), learned=Learned(matcher=matcher),
-    )  # fmt: skip
-    modelled, known = invert_pairs(batch), invert_pairs(batch, pairs_in(scene, rows))
-    # the same pairs in another order, and cameras within a pair: two medians end 1e-6 m from P
-    assert modelled.shift_m == pytest.approx(known.shift_m, abs=1e-5)
-    assert (modelled.ray_count == known.ray_count).all()
-
-
 # the twin
 
 
@@ -209,16 +186,3 @@ def test_no_pairs():
     ]
     assert (result.shift_m[1:5] == 0.0).all()
     assert result.ray_count.tolist() == [2, 0, 0, 0, 0, 2]
-
-
-def test_unsolved_keep_snell():
-    # the second camera looks away: it has no image of the point, and no list gives it a ray
-    cameras = looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0, 170.0], [0.0, 0.0], LENS)
-    points, water, pairs = np.array([[0.0, 0, -3]]), WaterPlane(0.0), listed([[[0, 1]]])
-    assert run(points, cameras, water, pairs).outcome.tolist() == [Outcome.ONE_CAMERA]
-    settings = ScienceOptions(method="snell", index=N_WATER)
-    batch = batch_of(points, surface_above(water, points), water, cameras, settings, pairs)
-    with warned("points.unsolved", points=1):
-        result = invert_pairs(batch)
-    plain = intersect(replace(batch, views=cameras_of_pairs(pairs)))
-    assert result.shift_m == pytest.approx(plain.shift_m, abs=1e-9)

@@ -8,11 +8,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 import pcfix
 from pcfix.model import WaterRaster
-from pcfix.simulate.scene import fly_block
-from pcfix.simulate.settings import SceneSettings
-from pcfix.simulate.tracing import project, triangulate
 from pcfix.water.surface import surface_above
-from tests.utils.bed_rays import piercing_points
 from tests.utils.twins import correct_under
 
 UTM = np.array([512_345.0, 4_987_654.0, 0.0])
@@ -115,26 +111,6 @@ def test_raster_of_plane(abc, options):
     assert one.incidence_deg == pytest.approx(other.incidence_deg, abs=1e-6)
 
 
-def test_raster_and_mesh():
-    surface = plane(174.8, 0.003, -0.001)  # as of a river: floats in steps of 15 um, slopes of 3e-5
-    water = raster(surface, (0.5, 0.5))
-    stored = WaterRaster(
-        water.height_m.astype(np.float32).astype(float), water.left_m, water.top_m, (0.5, 0.5)
-    )
-    corners = np.array([[-60.0, -60], [60, -60], [60, 60], [-60, 60]])
-    mesh = pcfix.WaterMesh(
-        np.column_stack([corners, surface(*corners.T)]) + UTM, np.array([[0, 1, 2], [0, 2, 3]])
-    )
-    up = np.array([0, 0, 174.5])
-    above = pcfix.Cameras(cameras().labels, cameras().centres + up)
-    one = pcfix.correct_points(bed() + up, above, stored)
-    other = pcfix.correct_points(bed() + up, above, mesh)
-    assert one.corrected.all()
-    assert one.xyz == pytest.approx(other.xyz, abs=1e-3)
-    exact = pcfix.correct_points(bed() + up, above, water)
-    assert exact.xyz == pytest.approx(other.xyz, abs=MICROMETRE)
-
-
 @pytest.mark.parametrize("surface", [waves, weir])
 def test_twin_on_raster(surface):
     water = raster(surface)
@@ -148,17 +124,6 @@ def test_twin_on_raster(surface):
         assert found == pytest.approx(expected, abs=MICROMETRE)
 
 
-@pytest.mark.parametrize(("cell", "within_m"), [(0.5, 0.01), (0.125, 0.002)])
-def test_curved_converges(cell, within_m):
-    points, block = bed(), cameras()
-    result = pcfix.correct_points(points, block, raster(weir, (cell, cell)))
-    apart = [
-        found - correct_under(weir, point, block.centres - UTM, 1.34)
-        for point, found in zip(points - UTM, result.xyz - UTM, strict=True)
-    ]
-    assert np.sqrt(np.mean(np.square(apart))) < within_m
-
-
 def test_beyond_edge():
     # the raster ends 0.3 m beyond the point; its rays pass the water 1.5 to 3 m away
     abc = (0.1, 0.02, -0.01)
@@ -169,11 +134,6 @@ def test_beyond_edge():
     assert one.corrected.all()
     other = pcfix.correct_points(points, cameras(), there)
     assert one.xyz == pytest.approx(other.xyz, abs=MICROMETRE)
-
-
-def test_camera_under_raster():
-    with pytest.raises(pcfix.GeometryError):
-        pcfix.correct_points(bed(), cameras(), raster(plane(90.0, 0, 0)))
 
 
 # A level that moves
@@ -232,43 +192,3 @@ def test_dry_camera(options):
     # entry + slope (0.2 - z) = (z + 0.1) dry
     z = (entry + 0.2 * slope - 0.1 * dry) / (slope + dry)
     assert result.xyz[0] == pytest.approx([(z + 0.1) * dry, 0.0, z], abs=1e-9)
-
-
-def traced(truth, block, levels):
-    """Return what SfM makes of points seen through each camera's own level, and their views."""
-    optics, pixels, seen = SceneSettings().optics.lens, [], []
-    for c, level in enumerate(levels):
-        centre = np.broadcast_to(block.centres[c], truth.shape)
-        surface = piercing_points(truth, centre, level, 1.34)
-        uv, z = project(surface, block, np.full(len(truth), c), optics)
-        pixels.append(uv)
-        seen.append((z > 0) & ((uv >= 0) & (uv < [optics.width, optics.height])).all(axis=1))
-    point, camera = np.nonzero(np.array(seen).T)
-    counts = np.bincount(point, minlength=len(truth))
-    assert counts.min() >= 3
-    start = np.concatenate([[0], np.cumsum(counts)])
-    image = np.array(pixels).transpose(1, 0, 2)[point, camera]
-    return triangulate(image, block, camera, start, optics, truth), pcfix.Views(start, camera)
-
-
-def test_two_flights():
-    """Traced forwards by other code: the south flown at low water, the north 1 m higher."""
-    rng = np.random.default_rng(11)
-    flown = fly_block((120.0, 200.0), SceneSettings(), rng)[0]
-    levels = np.where(flown.centres[:, 1] < 100.0, -0.5, 0.5)
-    low, high = np.array([0.0, 0, -9]), np.array([120.0, 200, -2])
-    truth = rng.uniform(low, high, (600, 3))
-    sides = truth[:, 1] < 60.0, truth[:, 1] > 140.0
-    apparent, views = traced(truth, flown, levels)
-
-    def bias(points, **more):
-        corrected = pcfix.correct_points(points, flown, 0.0, views=views, **more)
-        return np.array([(corrected.xyz - truth)[side, 2].mean() for side in sides])
-
-    still = bias(traced(truth, flown, np.zeros(len(flown)))[0])  # of the method itself
-    assert np.abs(still).max() < SceneSettings().gsd_m
-    own = bias(apparent, level_offset_m=levels)
-    assert own == pytest.approx(still, abs=0.005)  # depths differ by half a metre: 0.01 of it
-    mean = bias(apparent)
-    # a level that is too high by 0.5 m moves z by about -0.44 of that, too low by +0.44
-    assert mean - own == pytest.approx([-0.2, 0.2], abs=0.06)

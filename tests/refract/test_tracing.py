@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 
-import pcfix
 from pcfix.errors import SettingError
 from pcfix.model import WaterDimension, WaterMesh, WaterPlane, WaterRaster
 from pcfix.refract.tracing import METHODS, trace
@@ -227,65 +226,3 @@ def test_refused(change, code):
     }
     with refused(code, SettingError):
         trace(**(given | change))
-
-
-# formulas of Mulsow 2024, slides "Raytracing", as printed and as they hold
-
-CENTRE = np.array([4.0, -7.0, 40.0])
-
-
-def distance(point, pierced, ray):
-    """Return the perpendicular from a line to a point: MDFRT's, with its signs put right."""
-    return point - pierced - ray @ (point - pierced) / (ray @ ray) * ray
-
-
-def crossing(height_at, aim):
-    """Return where the straight line from the camera to an aim crosses a surface, by bisection."""
-    low, high = 0.0, 1.0
-    for _ in range(200):
-        middle = 0.5 * (low + high)
-        x, y, z = CENTRE + middle * (aim - CENTRE)
-        low, high = (middle, high) if z > height_at(x, y) else (low, middle)
-    return CENTRE + low * (aim - CENTRE)
-
-
-def surfaces():
-    slope = WaterPlane(0.2, 0.03, -0.02)
-
-    def tilted(x, y):
-        return slope.a + slope.b * x + slope.c * y
-
-    corners = [[x, y, tilted(x, y)] for x in (-HALF, HALF) for y in (-HALF, HALF)]
-    mesh = WaterMesh(np.array(corners), np.array([[0, 2, 1], [1, 2, 3]]))
-    wavy = raster(waves(4.0))
-    return [
-        pytest.param(WaterPlane(0.0), lambda x, y: 0.0, id="plane"),
-        pytest.param(slope, tilted, id="tilted"),
-        pytest.param(mesh, tilted, id="mesh"),
-        pytest.param(wavy, bilinear(wavy), id="raster"),
-    ]
-
-
-@pytest.mark.parametrize(("water", "height_at"), surfaces())
-def test_mdfrt(water, height_at):
-    """Rays of the direction found, and of directions beside it, traced forwards in numpy."""
-    rng = np.random.default_rng(8)
-    points = np.column_stack([rng.uniform(-12, 12, (12, 2)), rng.uniform(-8.0, -1.0, 12)])
-    found = pcfix.trace(CENTRE, points, water, refractive_index=INDEX, method="mdfrt", narrow=False)
-    tested = 0
-    for i in np.flatnonzero(found.converged):
-        misses = []
-        for step in ([0.0, 0.0], [1e-4, 0.0], [-1e-4, 0.0], [0.0, 1e-4], [0.0, -1e-4]):
-            aim = found.piercing_xyz[i] + 0.5 * (found.piercing_xyz[i] - CENTRE) + [*step, 0.0]
-            pierced = crossing(height_at, aim)
-            normal = normal_at(height_at, *pierced[:2])
-            if normal is None:
-                break
-            ray = (aim - CENTRE) / np.linalg.norm(aim - CENTRE)
-            misses.append(np.linalg.norm(distance(points[i], pierced, bend(ray, normal, INDEX))))
-        else:
-            # m; the normal by differences over 1e-5 m is good to 1e-9, times 8 m of water
-            assert misses[0] < 5e-8
-            assert min(misses[1:]) > 1e-5
-            tested += 1
-    assert tested >= 10

@@ -6,24 +6,21 @@ is added to the images, and straight rays are intersected there with the poses t
 None of it is shared with the correction.
 """
 
-from __future__ import annotations
-
-import math
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from pcfix.model import Outcome, WaterPlane
+from pcfix.model import WaterPlane
 from pcfix.options.correct import LEVEL_M, BudgetOptions, ScienceOptions
 from pcfix.refract import uncertainty
 from pcfix.refract.intersect import intersect
 from pcfix.refract.methods import correct, with_rays
 from pcfix.refract.regression import DepthRegression
-from pcfix.water.surface import SurfaceAbove, surface_above
+from pcfix.water.surface import SurfaceAbove
 from tests.utils.batches import batch_of
-from tests.utils.normalised import INDEX, apparent, block, views_of
+from tests.utils.normalised import apparent, block, views_of
 
 NONE = BudgetOptions(sigma_image=0.0, sigma_level=0.0, sigma_index=0.0)
 SOURCES = {
@@ -121,83 +118,6 @@ def test_no_bias():
     ratio = normalised("consistent", 35.0, "image", 12, 100)
     # 12 points x 100 independent draws: a mean is known to 1/35; the rest is of second order
     assert np.abs(ratio.mean(axis=(0, 1))).max() < 0.1
-
-
-@pytest.mark.parametrize("tilt_deg", [0.0, 35.0], ids=["nadir", "oblique"])
-def test_common_errors_consistent(tilt_deg):
-    # finite differences of the method itself, of points that a noisy image made: what is left out
-    # is second order in residuals of some thousandths of the focal length, less than 3 % of z
-    cameras, _, xyz = drawn(tilt_deg, "image", 12, 100)
-    step = 1e-4
-    x, y = cameras.centres[:, :2].mean(axis=0)
-
-    def z_of(plane=LEVEL, index=INDEX):
-        settings = ScienceOptions(method="consistent", index=index, dimensions="minimal")
-        above = surface_above(plane, xyz)
-        views = views_of(len(xyz), cameras)
-        return correct(batch_of(xyz, above, plane, cameras, settings, views)).shift_m
-
-    def slope(**changed):
-        up, down = ({name: pair[i] for name, pair in changed.items()} for i in range(2))
-        return (z_of(**up) - z_of(**down))[:, 2] / (2.0 * step)
-
-    both = (step, -step)
-    found = {
-        "sigma_level": slope(plane=[WaterPlane(s) for s in both]),
-        "sigma_index": slope(index=[INDEX + s for s in both]),
-        "sigma_tilt": np.hypot(
-            slope(plane=[WaterPlane(-s * x, s, 0.0) for s in both]),
-            slope(plane=[WaterPlane(-s * y, 0.0, s) for s in both]),
-        ),
-    }
-    for name, expected in found.items():
-        one = math.degrees(1.0) if name == "sigma_tilt" else 1.0
-        errors = replace(NONE, **{name: one})
-        sigma = solved(xyz, cameras, ScienceOptions(method="consistent", **vars(errors))).sigma_z_m
-        rms = np.sqrt((expected**2).mean())
-        assert np.sqrt(((sigma - np.abs(expected)) ** 2).mean()) < 0.03 * rms
-
-
-@pytest.mark.parametrize("plane", [WaterPlane(0.0), WaterPlane(0.1, 0.004, -0.006)])
-def test_common_errors_snell(plane):
-    # finite differences of the intersection itself, every camera in frame; 1 % in z as the turn of
-    # M times the distance of a ray from the point is left out
-    bed, cameras, _ = scene(35.0, points=300)
-    step = 1e-4
-
-    def found(water=plane, index=INDEX):
-        above = surface_above(water, bed)
-        settings = ScienceOptions(index=index)
-        return in_frame(bed, above, water, cameras, settings)
-
-    base = found()
-    moved = base.outcome == Outcome.CORRECTED
-    x, y = cameras.centres[:, :2].mean(axis=0)
-
-    def tilted(b, c):
-        return replace(plane, a=plane.a - b * x - c * y, b=plane.b + b, c=plane.c + c)
-
-    changes = {
-        "sigma_level": [({"water": replace(plane, a=plane.a + s)}) for s in (step, -step)],
-        "sigma_index": [({"index": INDEX + s}) for s in (step, -step)],
-    }
-    for name, (up, down) in changes.items():
-        slope = (found(**up).shift_m - found(**down).shift_m)[moved, 2] / (2.0 * step)
-        errors = replace(NONE, **{name: 1.0})
-        cov = covariances(
-            bed, base.shift_m, surface_above(plane, bed), cameras, ScienceOptions(**vars(errors))
-        )
-        np.testing.assert_allclose(np.sqrt(cov[moved, 5]), np.abs(slope), rtol=0.01)
-    both = 0.0
-    for direction in ((1.0, 0.0), (0.0, 1.0)):
-        up, down = (tilted(*(s * np.array(direction))) for s in (step, -step))
-        both += ((found(up).shift_m - found(down).shift_m)[moved, 2] / (2.0 * step)) ** 2
-    errors = replace(NONE, sigma_tilt=math.degrees(1.0))
-    cov = covariances(
-        bed, base.shift_m, surface_above(plane, bed), cameras, ScienceOptions(**vars(errors))
-    )
-    # in units of slope; near the middle of the block, where little is left, the mean counts
-    assert np.sqrt(cov[moved, 5].mean()) == pytest.approx(np.sqrt(both.mean()), rel=0.02)
 
 
 def test_positive():

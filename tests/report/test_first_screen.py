@@ -1,7 +1,5 @@
 """The first screen of a page: measured or predicted accuracy, and contradictions."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,9 +1,6 @@
 """Standard errors in the terms of IHO S-44."""
 
-from __future__ import annotations
-
 import json
-from dataclasses import asdict, replace
 from functools import reduce
 from operator import add
 from pathlib import Path
@@ -13,17 +10,9 @@ import pytest
 
 import pcfix
 from pcfix.compare.statistics import tvu_of
-from pcfix.options.correct import BudgetOptions
 from pcfix.refract.tally import UncertaintyTally
 from pcfix.report.summary import Summary
-from pcfix.report.text import (
-    FEWEST,
-    budget_words,
-    formal_words,
-    summary_rows,
-    tvu_sentence,
-    uncertainty_sentence,
-)
+from pcfix.report.text import FEWEST, formal_words, summary_rows, tvu_sentence, uncertainty_sentence
 
 # Edition 6, table 1: the largest TVU at the surface and at 40 m, m, by hand
 BY_HAND = {
@@ -57,21 +46,6 @@ def test_shares_and_percentiles():
 def test_strictest_order(shares, order):
     found = {"s44": dict(zip(BY_HAND, shares, strict=True))}
     assert (order or "fewer than 95 %") in tvu_sentence(found)
-
-
-@pytest.mark.parametrize(
-    ("changes", "fitted", "words"),
-    [
-        ({}, None, "level 0.020 m (assumed)"),
-        ({}, 0.007, "level 0.007 m (fitted)"),
-        ({}, float("nan"), "level 0.020 m (assumed)"),
-        ({"sigma_level": 0.1}, 0.007, "level 0.100 m,"),
-        ({"sigma_waves": 2.0}, None, "waves 2 deg"),
-    ],
-)
-def test_budget_words(changes, fitted, words):
-    assert words in budget_words(asdict(replace(BudgetOptions(), **changes)), fitted)
-    assert "waves" not in budget_words(asdict(BudgetOptions()))
 
 
 def test_measured_tvu():

@@ -46,14 +46,3 @@ def test_corrected(nadir):
     assert after.max() < 1.0
     in_frame = pcfix.correct_points(nadir.apparent_xyz, nadir.cameras, nadir.water_level_m)
     assert errors_gsd(nadir, in_frame.xyz).max() < 1.3
-
-
-def test_obliques():
-    scene = pcfix.simulate_scene(2000, block="oblique", seed=5)
-    factor = scene.apparent_xyz.copy()
-    wet = factor[:, 2] < scene.water_level_m
-    factor[wet, 2] -= 0.34 * (scene.water_level_m - factor[wet, 2])
-    ours = pcfix.correct_points(
-        scene.apparent_xyz, scene.cameras, scene.water_level_m, views=scene.views
-    )
-    assert errors_gsd(scene, ours.xyz)[2] < 0.2 * errors_gsd(scene, factor)[2]

@@ -1,24 +1,13 @@
 """A block that swallowed the water, as the files that its user has."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-import laspy
-import numpy as np
-from pyproj import CRS
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 from pcfix.io.cameras.colmap import write_colmap
-from tests.utils.tie_points import simulate_tie_points
-from tests.utils.unaware_blocks import apparent_cloud, parted, unaware
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcfix.model import FloatArray
-    from tests.utils.tie_points import TieScene
-    from tests.utils.unaware_blocks import Unaware
+from pcfix.model import FloatArray
+from tests.utils.clouds import write_las
+from tests.utils.tie_points import TieScene, simulate_tie_points
+from tests.utils.unaware_blocks import Unaware, apparent_cloud, parted, unaware
 
 EPSG = "EPSG:32633"
 IMAGE_PX = 0.3
@@ -55,8 +44,9 @@ def write_block(folder: Path, points: int = 1600, **settings: object) -> Files:
     } | settings  # fmt: skip
     scene, others = parted(simulate_tie_points(points, **given), TIES)
     made = unaware(scene)
-    write_colmap(folder / "model", made.cameras, made.ties, crs=EPSG)
-    write_colmap(folder / "bare", made.cameras, crs=EPSG)
+    cameras = replace(made.cameras, crs=EPSG)
+    write_colmap(folder / "model", cameras, made.ties)
+    write_colmap(folder / "bare", cameras)
     write_las(folder / "cloud.las", apparent_cloud(made, others))
     positions = scene.cameras.gnss
     write_gnss(folder / "gnss.csv", scene.cameras.labels, positions.xyz, positions.sigma_m)
@@ -67,15 +57,6 @@ def write_block(folder: Path, points: int = 1600, **settings: object) -> Files:
         f"{lens.principal_x!r},{lens.principal_y!r}\n"
     )
     return Files(folder, made, others.truth)
-
-
-def write_las(path: Path, xyz: FloatArray) -> None:
-    header = laspy.LasHeader(point_format=3, version="1.4")
-    header.scales, header.offsets = np.full(3, 0.001), np.floor(xyz.min(axis=0))
-    header.add_crs(CRS(EPSG))
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = xyz.T
-    las.write(path)
 
 
 def write_gnss(path: Path, labels: tuple[str, ...], xyz: FloatArray, sigma: FloatArray) -> None:

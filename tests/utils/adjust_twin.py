@@ -6,22 +6,18 @@ level, tilt, index and shape as asked, height and slopes of planes; then all poi
 distortion.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.optimize._numdiff import approx_derivative
 from scipy.spatial.transform import Rotation
 
+from pcfix.adjust.block import Block
+from pcfix.model import FloatArray
 from pcfix.simulate.tracing import piercing_points_of_planes, project
 from tests.utils.curved_water import height, piercing_points
-
-if TYPE_CHECKING:
-    from pcfix.adjust.block import Block
-    from pcfix.model import FloatArray
 
 
 class Twin(NamedTuple):

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 from hypothesis import strategies as st
 
 from pcfix import Cameras, Lens, WaterPlane
 from tests.utils.clouds import random_cloud
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 STEP_M = 0.001
 """All coordinates of points are multiples of it."""

@@ -1,7 +1,5 @@
 """Rays of cameras through a plane water surface to a plane bed."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pcfix.model import FloatArray

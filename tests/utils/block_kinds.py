@@ -1,32 +1,42 @@
-"""Blocks that are no square of nadir images over a beach, as an unaware adjustment leaves them."""
+"""Blocks of several shapes over water, and what adjustments make of their poses.
+
+Light is traced by `pcfix.simulate.tracing`, which shares nothing with the adjustment.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import Unknowns
+from pcfix.adjust.block import Block, Unknowns, plain_block
 from pcfix.adjust.problem import prepare, solved_cameras
 from pcfix.adjust.solve import solve
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.lens.imaging import unproject
-from pcfix.model import Cameras, GnssPositions, Lens, TiePoints, Views
+from pcfix.model import (
+    BoolArray,
+    Cameras,
+    FloatArray,
+    GnssPositions,
+    Lens,
+    TiePoints,
+    Views,
+    WaterPlane,
+)
 from pcfix.simulate.scene import ORIGIN_M
 from pcfix.simulate.tracing import triangulate
-from tests.utils.adjust_files import EPSG, write_gnss, write_las
-from tests.utils.bent_blocks import DOWN, FOCAL_PX, NOISE_PX, SIZE, N, TrueBlock
+from tests.utils.adjust_files import EPSG, write_gnss
+from tests.utils.bed_rays import piercing_points
+from tests.utils.clouds import write_las
 from tests.utils.unaware_blocks import similarity
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcfix.model import FloatArray
-
-GNSS_M = 0.025
+GNSS_M, NOISE_PX = 0.025, 0.5
 HEIGHT_M, DEPTH_M = 75.0, 6.0
+FOCAL_PX, SIZE, N = 1500.0, (1600.0, 1200.0), 1.34
+DOWN = np.diag([1.0, -1.0, -1.0])
 GSD_M = HEIGHT_M / FOCAL_PX
 BASE_M, STRIP_M = 12.0, 28.0
 ALONG, ACROSS = 90.0, 0.0
@@ -83,8 +93,11 @@ KINDS = {
 reaches so far to either side."""
 
 
-class KindBlock(TrueBlock):
-    """A block of one of `KINDS`, about the origin; water at zero."""
+class KindBlock:
+    """A block of one of `KINDS`, about the origin; water at zero.
+
+    True cameras with GNSS positions, true points, and image places with noise.
+    """
 
     def __init__(self, kind: str, seed: int, points: int = 900, cloud: int = 3000):
         rng = np.random.default_rng([seed, *kind.encode()])
@@ -106,8 +119,43 @@ class KindBlock(TrueBlock):
         swell = 0.4 * np.sin(xy[:, 0] / 9) * np.sin(xy[:, 1] / 7)
         z = ground(*xy.T, reach)
         xyz = np.column_stack([xy, z + np.where(z < 0.0, swell * np.minimum(1.0, -z), swell)])
-        self._look(xyz, lens, N, rng)
+        self._look(xyz, lens, rng)
         self.ties = int(points * len(self.xyz) / len(xyz))
+
+    def _look(self, xyz: FloatArray, lens: Lens, rng: np.random.Generator) -> None:
+        point, camera = (a.ravel() for a in np.indices((len(xyz), len(self.cameras))))
+        centres = self.cameras.centres[camera]
+        straight = piercing_points(xyz[point], centres, 0.0, N) - centres
+        local = np.einsum("oij,oj->oi", self.cameras.rotations[camera], straight)
+        uv = lens.focal * local[:, :2] / local[:, 2:] + [lens.principal_x, lens.principal_y]
+        inside = (local[:, 2] > 0) & (uv > 0).all(axis=1) & (uv < SIZE).all(axis=1)
+        inside &= np.bincount(point[inside], minlength=len(xyz))[point] >= 3
+        number = np.cumsum(np.bincount(point[inside], minlength=len(xyz)) > 0) - 1
+        seen = np.unique(point[inside])
+        self.xyz, self.camera = xyz[seen], camera[inside]
+        counts = np.bincount(number[point[inside]], minlength=len(seen))
+        self.start = np.concatenate([[0], np.cumsum(counts)])
+        self.image_xy = uv[inside] + rng.normal(0.0, NOISE_PX, (inside.sum(), 2))
+
+    def block(
+        self, cameras: Cameras, water: WaterPlane | None = None, wet: BoolArray | None = None
+    ) -> Block:
+        """Return what was measured as a block with given cameras."""
+        ties = TiePoints(self.xyz, Views(self.start, self.camera), self.image_xy)
+        return plain_block(cameras, ties, water, N, wet)
+
+    def adjusted(
+        self, cameras: Cameras, unknowns: Unknowns, water: WaterPlane | None = None, *,
+        weighs_gnss: bool = True,
+    ) -> Cameras:  # fmt: skip
+        """Return cameras after an adjustment, with water, or with straight rays."""
+        gnss = self.cameras.gnss.xyz
+        block = self.block(cameras, water, np.full(len(self.xyz), water is not None))
+        block = replace(block, sigma_px=np.full(len(block.camera), NOISE_PX))
+        if weighs_gnss:
+            block = replace(block, gnss_xyz=gnss, gnss_sigma_m=np.full(gnss.shape, 0.1))
+        problem, start = prepare(block, unknowns)
+        return solved_cameras(problem, solve(problem, start))
 
     def unaware(self, *, weighs_gnss: bool) -> Cameras:
         """Return the cameras as an adjustment with straight rays leaves them.
@@ -115,19 +163,15 @@ class KindBlock(TrueBlock):
         One with a full lens and GNSS positions of 10 cm; or one with focal length and k1, the
         principal point in the middle of the image, that is laid onto the positions afterwards.
         """
-        gnss, lens = self.cameras.gnss.xyz, self.cameras.lenses[0]
-        middle = replace(lens, principal_x=SIZE[0] / 2.0, principal_y=SIZE[1] / 2.0)
+        middle = replace(self.cameras.lenses[0], principal_x=SIZE[0] / 2, principal_y=SIZE[1] / 2)
         cameras = replace(self.cameras, lenses=(middle,) * len(self.cameras))
-        block = self.part(slice(0, self.ties)).block(cameras, None)
-        block = replace(block, sigma_px=np.full(len(block.camera), NOISE_PX))
         unknowns = Unknowns(lens=("f", "k1"), free_network=True)
         if weighs_gnss:
             unknowns = Unknowns(lens=("f", "cx", "cy", "k1", "k2", "p1", "p2"))
-            block = replace(block, gnss_xyz=gnss, gnss_sigma_m=np.full(gnss.shape, 0.1))
-        problem, start = prepare(block, unknowns)
-        found = solved_cameras(problem, solve(problem, start))
+        ties = self.part(slice(0, self.ties))
+        found = ties.adjusted(cameras, unknowns, weighs_gnss=weighs_gnss)
         if not weighs_gnss:
-            scale, turn, shift = similarity(found.centres, gnss)
+            scale, turn, shift = similarity(found.centres, self.cameras.gnss.xyz)
             found = replace(
                 found, centres=scale * found.centres @ turn.T + shift,
                 rotations=found.rotations @ turn.T,
@@ -164,10 +208,10 @@ def write_kind(
     old = made.unaware(weighs_gnss=seed % 2 == 0)
     ties, cloud = made.part(slice(0, made.ties)), made.part(slice(made.ties, None))
     tracks = TiePoints(ties.apparent(old) + ORIGIN_M, Views(ties.start, ties.camera), ties.image_xy)
-    placed = replace(old, centres=old.centres + ORIGIN_M)
-    write_colmap(folder / "model", placed, tracks, crs=EPSG)
-    true = replace(made.cameras, centres=made.cameras.centres + ORIGIN_M, gnss=None)
-    write_colmap(folder / "true", true, crs=EPSG)
+    placed = replace(old, centres=old.centres + ORIGIN_M, crs=EPSG)
+    write_colmap(folder / "model", placed, tracks)
+    true = replace(made.cameras, centres=made.cameras.centres + ORIGIN_M, gnss=None, crs=EPSG)
+    write_colmap(folder / "true", true)
     write_las(folder / "cloud.las", cloud.apparent(old) + ORIGIN_M)
     gnss = made.cameras.gnss
     write_gnss(folder / "gnss.csv", made.cameras.labels, gnss.xyz + ORIGIN_M, gnss.sigma_m)

@@ -1,15 +1,10 @@
 """A real browser without a screen: Chromium, where it is installed."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 PROGRAM = shutil.which("chromium") or shutil.which("google-chrome")
 

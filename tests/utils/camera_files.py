@@ -1,17 +1,12 @@
 """Read camera files as a user does; what they warn of stays in their notes."""
 
-from __future__ import annotations
-
 import warnings
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pcfix
 from pcfix.io.cameras import read_tie_points
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcfix.model import Cameras, TiePoints
+from pcfix.model import Cameras, TiePoints
 
 
 def read(path: Path, *args: Any, **options: Any) -> Cameras:

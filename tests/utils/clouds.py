@@ -1,10 +1,9 @@
 """Clouds that use all that LAS allows, and a reader of LAS files that knows only the standard."""
 
-from __future__ import annotations
-
 import struct
 from datetime import date
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 from uuid import UUID
 
 import laspy
@@ -13,9 +12,6 @@ from laspy.vlrs.vlrlist import VLRList
 from pyproj import CRS
 
 from pcfix import Cameras, Lens
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 WATER_M = 12.40005
 """No coordinate of `random_cloud` lies on it."""
@@ -245,6 +241,35 @@ def write_cloud(path: Path, point_format: int, **choices: object) -> Path:
     las = random_cloud(point_format, **choices)
     if path.suffix == ".laz" and point_format in (9, 10):
         las.scanner_channel[:] = 2
+    las.write(path)
+    return path
+
+
+def write_las(
+    path: Path,
+    xyz: np.ndarray,
+    classes: object = 0,
+    *,
+    crs: object = 32633,
+    withheld: object = 0,
+    scale: float = 0.001,
+    offsets: object = None,
+    **extra: np.ndarray,
+) -> Path:
+    """Write points, by default in steps of a millimetre, and return the path."""
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales = np.full(3, scale)
+    header.offsets = np.floor(np.min(xyz, axis=0)) if offsets is None else np.array(offsets)
+    for name in extra:
+        header.add_extra_dim(laspy.ExtraBytesParams(name, "float64"))
+    if crs is not None:
+        header.add_crs(CRS.from_user_input(crs))
+    las = laspy.LasData(header)
+    las.xyz = np.asarray(xyz)
+    las.classification = np.broadcast_to(classes, len(xyz))
+    las.withheld = np.broadcast_to(withheld, len(xyz))
+    for name, values in extra.items():
+        las[name] = values
     las.write(path)
     return path
 

@@ -1,16 +1,12 @@
 """Refusals and warnings by their codes, which programs may rely on; sentences may change."""
 
-from __future__ import annotations
-
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
 from pcfix.errors import PcfixError, PcfixWarning
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 @contextmanager

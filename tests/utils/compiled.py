@@ -1,7 +1,5 @@
 """Call device functions from Python, which only kernels can do otherwise."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

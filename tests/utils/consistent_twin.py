@@ -45,16 +45,6 @@ def triangulated_straight(seen, cameras, mine, start):
     return start + found.x
 
 
-def found_by_full_triangulation(apparent, cameras, mine, planes, n, start):
-    """Return Q with F(Q) = P: every step triangulates anew, and scipy looks for the root."""
-
-    def miss(shift):
-        seen = seen_through_water(start + shift, cameras, mine, planes, n)
-        return triangulated_straight(seen, cameras, mine, apparent) - apparent
-
-    return start + root(miss, np.zeros(3), tol=1e-9).x
-
-
 def path_under(surface, point, centre, n, step=1e-5):
     """Return where light leaves the water under a smooth z = surface(x, y): Fermat by scipy."""
 
@@ -81,40 +71,33 @@ def path_under(surface, point, centre, n, step=1e-5):
     return crossing(found.x)
 
 
-def refractive_least_squares(pixels, start_of, camera, cameras, level_m, n, guess):
-    """Return the points whose images through level water are nearest to the given ones.
+def least_squares_points(images, seen, start, guess):
+    """Return the points whose images are nearest to the given ones, shape (n, 3).
 
     The floor for noisy images: nothing unbiased is better. Gauss-Newton for all points at once,
-    with derivatives from differences over 0.1 mm; one lens without distortion.
+    with derivatives from differences over 0.1 mm.
 
     Parameters
     ----------
-    pixels : array, shape (rays, 2)
-    start_of : array, shape (n + 1,)
+    images : callable
+        Of points, shape (n, 3): their images, shape (rays, 2), the rays of a point in turn.
+    seen : array, shape (rays, 2)
+    start : array, shape (n + 1,)
         First ray of each point.
-    camera : array, shape (rays,)
     guess : array, shape (n, 3)
     """
-    owner = np.repeat(np.arange(len(guess)), np.diff(start_of))
-    points, step = guess.copy(), 1e-4
-    for _ in range(8):
-        residual = pixels - images_through_level(points[owner], cameras, camera, level_m, n)
-        slopes = []
-        for axis in range(3):
-            aside = np.zeros(3)
-            aside[axis] = step
-            ends = [
-                images_through_level(points[owner] + way * aside, cameras, camera, level_m, n)
-                for way in (1, -1)
-            ]
-            slopes.append((ends[0] - ends[1]) / (2 * step))
-        slope = np.stack(slopes, axis=2)
-        normal = np.add.reduceat(np.einsum("rki,rkj->rij", slope, slope), start_of[:-1])
-        right = np.add.reduceat(np.einsum("rki,rk->ri", slope, residual), start_of[:-1])
-        moved = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
-        points += moved
-    assert np.abs(moved).max() < 1e-6
-    return points
+    points, aside = guess.copy(), 1e-4
+    for _ in range(10):
+        steps = aside * np.eye(3)
+        slopes = [(images(points + d) - images(points - d)) / (2.0 * aside) for d in steps]
+        slope, residual = np.stack(slopes, axis=2), seen - images(points)
+        left = np.add.reduceat(np.einsum("rki,rkj->rij", slope, slope), start[:-1])
+        right = np.add.reduceat(np.einsum("rki,rk->ri", slope, residual), start[:-1])
+        step = np.linalg.solve(left, right[:, :, None])[:, :, 0]
+        points += step
+        if np.abs(step).max() < 1e-6:
+            return points
+    raise ArithmeticError("the triangulation does not converge")
 
 
 def images_through_level(points, cameras, camera, level_m, n):

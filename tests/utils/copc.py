@@ -1,15 +1,9 @@
 """COPC files of three levels, written by copclib."""
 
-from __future__ import annotations
+from pathlib import Path
 
-from typing import TYPE_CHECKING
-
+import laspy
 import numpy as np
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import laspy
 
 
 def write_copc(path: Path, las: laspy.LasData) -> Path:

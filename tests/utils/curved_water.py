@@ -5,18 +5,13 @@ where it passes the surface. Nothing here is shared with the adjustment, which g
 tangent plane and Snell's law.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pcfix.model import FloatArray
 from pcfix.simulate.tracing import project
-
-if TYPE_CHECKING:
-    from pcfix.model import FloatArray
-    from tests.utils.tie_points import TieScene
+from tests.utils.tie_points import TieScene
 
 STEP_M, NEWTON_STEPS, CONVERGED = 1e-3, 40, 1e-13
 LEAST_DEPTH_M = 1e-7

@@ -1,24 +1,16 @@
 """A block whose nadir images cover one half of the bed: obliques alone see the other."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import laspy
 import numpy as np
 
 from pcfix.adjust.transfer import renumbered
 from pcfix.io.scenes import write_scene
-from pcfix.model import Cameras
-from pcfix.simulate.scene import simulate_scene
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pcfix.model import BoolArray, FloatArray, WaterPlane
-    from pcfix.simulate.scene import Scene
+from pcfix.model import BoolArray, Cameras, FloatArray, WaterPlane
+from pcfix.simulate.scene import Scene, simulate_scene
 
 
 @cache

@@ -4,10 +4,8 @@ The errors are those of a lens with a term that its formula lacks, of wrong matc
 water level. Poses are those that an adjustment without water has left.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,16 +14,12 @@ from pcfix.adjust.block import Material, usable_ties
 from pcfix.adjust.methods import adjust_block
 from pcfix.adjust.normal import CAUCHY, SQUARES
 from pcfix.adjust.problem import intersect_fixed
-from pcfix.model import TiePoints, WaterPlane
+from pcfix.adjust.result import Adjusted
+from pcfix.model import Cameras, FloatArray, TiePoints, WaterPlane
 from pcfix.options.survey import AdjustRules
 from tests.utils.tie_blocks import block_of
-from tests.utils.tie_points import simulate_tie_points
+from tests.utils.tie_points import TieScene, simulate_tie_points
 from tests.utils.unaware_blocks import unaware
-
-if TYPE_CHECKING:
-    from pcfix.adjust.result import Adjusted
-    from pcfix.model import Cameras, FloatArray
-    from tests.utils.tie_points import TieScene
 
 KINDS = ("lens", "mismatches", "level")
 SIGMA_LEVEL_M = 0.03

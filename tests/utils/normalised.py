@@ -1,20 +1,14 @@
 """A scene of a few points in which every input of a correction can be wrong by a known amount."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.model import Cameras, Lens, Views
+from pcfix.model import Cameras, FloatArray, Lens, Views
+from pcfix.options.correct import BudgetOptions
 from pcfix.simulate.tracing import project, triangulate
 from tests.utils.bed_rays import piercing_points
-
-if TYPE_CHECKING:
-    from pcfix.model import FloatArray
-    from pcfix.options.correct import BudgetOptions
 
 LENS = Lens(3600.0, 5400.0, 3600.0, 2700.0, 1800.0)
 HEIGHT_M = 60.0

@@ -3,8 +3,6 @@
 python -m tests.utils.option_tables     writes them again
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

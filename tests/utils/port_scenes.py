@@ -10,18 +10,13 @@ All arrays of `fermat_directions` are flat over (point, camera) pairs.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.model import Cameras, Lens, Views
+from pcfix.model import Cameras, FloatArray, Lens, Views
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
-from pcfix.port.shapes import DomePort, FlatPort
+from pcfix.port.shapes import DomePort, FlatPort, Port
 from pcfix.simulate.tracing import triangulate
-
-if TYPE_CHECKING:
-    from pcfix.model import FloatArray
-    from pcfix.port.shapes import Port
 
 _NEWTON_STEPS = 60
 _CONVERGED_M = 1e-13

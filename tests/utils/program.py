@@ -1,20 +1,15 @@
 """``pcfix`` on the command line, run in this process: what a shell sees, but sooner."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import sys
 import warnings
+from pathlib import Path
 from subprocess import CompletedProcess
-from typing import TYPE_CHECKING
 from unittest import mock
 
 from pcfix import cli
 from pcfix.errors import PcfixError, PcfixWarning, show_warning
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 class Done(CompletedProcess[str]):

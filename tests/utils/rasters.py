@@ -1,7 +1,5 @@
 """A raster in memory, for tests."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A real PDAL: the program, and its Python package in processes of their own."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import subprocess

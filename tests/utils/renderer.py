@@ -4,8 +4,6 @@ Its own geometry: rays go forward from the camera, bend at a level surface by th
 angles, and march to a bilinear ground. Nothing of it is shared with the mapping of photographs.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

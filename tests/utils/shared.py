@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
+SCENE = ROOT / "samples" / "scene"
 SHARED = Path(os.environ.get("PCFIX_SHARED", ROOT.parent / "shared"))
 if not SHARED.is_absolute():
     SHARED = ROOT / SHARED

@@ -1,9 +1,6 @@
 """Blocks for an adjustment, made of the simulator's scenes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,9 +8,7 @@ from pcfix.adjust.block import Block
 from pcfix.adjust.problem import prepare
 from pcfix.adjust.solve import solve
 from pcfix.model import TiePoints
-
-if TYPE_CHECKING:
-    from tests.utils.tie_points import TieScene
+from tests.utils.tie_points import TieScene
 
 
 def block_of(

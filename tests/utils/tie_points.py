@@ -8,18 +8,23 @@ noise, and `TieScene.measured` draws the noise anew.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from pcfix.model import Cameras, GnssPositions, GroundControl, TiePoints, Views
+from pcfix.model import (
+    BoolArray,
+    Cameras,
+    FloatArray,
+    GnssPositions,
+    GroundControl,
+    TiePoints,
+    Views,
+    WaterPlane,
+)
 from pcfix.simulate.scene import ORIGIN_M, cameras_in_world, lay_out, plane_in_world, points_on
 from pcfix.simulate.settings import SceneSettings
-from pcfix.simulate.sight import see
-
-if TYPE_CHECKING:
-    from pcfix.model import BoolArray, FloatArray, WaterPlane
-    from pcfix.simulate.sight import Sight, Site
+from pcfix.simulate.sight import Sight, Site, see
 
 _CANDIDATES = 4000
 _LEAST_TIES = 8

@@ -4,9 +4,7 @@ import laspy
 import numpy as np
 
 from pcfix.io.files import read_tally
-from tests.utils.shared import ROOT
-
-SCENE = ROOT / "samples" / "scene"
+from tests.utils.shared import SCENE
 
 
 def cut(folder, count, *, cloud=SCENE / "cloud.laz", suffix=".laz", **changes):

@@ -1,16 +1,11 @@
 """The slow twin of the backward tracers: brentq on planes, Fermat's principle on any surface."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import brentq, minimize
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pcfix.model import FloatArray
+from pcfix.model import FloatArray
 
 
 def through_plane(

@@ -4,29 +4,18 @@ Images are made by `pcfix.simulate`. The unaware adjustment is an ordinary one, 
 with a free focal length and no datum but its start, laid onto the GNSS positions by a similarity.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize._numdiff import approx_derivative
 
 from pcfix.adjust.block import Unknowns
 from pcfix.adjust.normal import SQUARES
 from pcfix.adjust.problem import prepare, solved_cameras
 from pcfix.adjust.solve import solve
-from pcfix.model import TiePoints, WaterPlane
+from pcfix.model import Cameras, FloatArray, TiePoints
 from pcfix.simulate.tracing import triangulate
-from tests.utils.adjust_twin import Twin
 from tests.utils.tie_blocks import block_of, some_ties
-
-if TYPE_CHECKING:
-    from pcfix.model import Cameras, FloatArray
-    from tests.utils.tie_points import TieScene
-
-FAR_BELOW = WaterPlane(-1e3)
-"""Water that no point reaches."""
+from tests.utils.tie_points import TieScene
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,21 +25,6 @@ class Unaware:
     scene: TieScene
     cameras: Cameras
     ties: TiePoints
-
-    def normal_vector(self, residual_px: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-        """Return J'r and |J||r| at the old solution: of poses, focal length and points.
-
-        J is that of straight rays, by differences of the simulator's projection; r is the old
-        adjustment's own unless others, shape (o, 2), are given.
-        """
-        block = replace(
-            block_of(self.scene, gnss=False, water=FAR_BELOW, cameras=self.cameras, sigma_px=1.0),
-            xyz=self.ties.xyz, image_xy=self.ties.image_xy,
-        )  # fmt: skip
-        twin = Twin(block, ("f",))
-        r = twin.residuals(twin.start()) if residual_px is None else residual_px.ravel()
-        jacobian = approx_derivative(twin.residuals, twin.start(), method="3-point")
-        return jacobian.T @ r, np.linalg.norm(jacobian, axis=0) * np.linalg.norm(r)
 
 
 def unaware(scene: TieScene, *, exact: bool = False, loss: int = SQUARES) -> Unaware:

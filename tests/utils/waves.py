@@ -5,8 +5,6 @@ repeated substitution, the ray bent by the sines of its angles about
 the surface's normal. Nothing of it is shared with what is tested.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 GRAVITY = 9.81

@@ -18,9 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import InputError, SettingError, bad_file
+from pcfix.errors import SettingError, bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Angles, Source, reading
+from pcfix.io.cameras.sensor import read_sensor, sensor_file
 from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
@@ -106,18 +107,17 @@ def read_cameras(
     try:
         with reading(path):
             cameras: Cameras = reader_of(form).read(source)
-            if source.sensor is not None and len(cameras):
-                has_read_it = form in TAKE_SENSOR
-                if cameras.rotations is None or not (has_read_it or cameras.lenses is None):
-                    why = "no angles" if cameras.lenses is None else "its own lenses"
+            sensor_path = sensor_file(source)
+            if cameras.rotations is not None and cameras.lenses is None and sensor_path:
+                lenses = (read_sensor(sensor_path),) * len(cameras)
+                cameras = replace(cameras, lenses=lenses)
+            elif cameras.rotations is None or form not in TAKE_SENSOR:
+                if source.sensor is not None and len(cameras):
+                    why = "no angles" if cameras.rotations is None else "its own lenses"
                     sentence = f"has {why}, so --sensor {sensor} has no use. Leave it out."
                     raise bad_file(source.path, "cameras.sensor_unused", sentence, sensor=sensor)
-                if not has_read_it:
-                    from pcfix.io.cameras.sensor import read_sensor
-
-                    notes = tuple(one for one in cameras.notes if one.code != checks.NO_LENS)
-                    lenses = (read_sensor(source.sensor),) * len(cameras)
-                    cameras = replace(cameras, lenses=lenses, notes=notes)
+            elif cameras.lenses is None and form == "table":
+                raise checks.no_sensor(source.path, "focal,sensor_x,sensor_y (mm)")
             cameras = checks.checked(source.path, cameras)
     except SettingError as error:  # numbers that are finite in the file and not in the world
         raise checks.damaged(path, str(error).rstrip(".")) from error
@@ -148,6 +148,8 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
         raise checks.no_tie_points(source.path, f"the format ({FORMATS[form]}) has none")
     with reading(path):
         ties: TiePoints = reader_of(form).tie_points(source, cameras)
+    if not len(ties.views.camera):
+        raise checks.no_tie_points(source.path, "its images saw no points")
     return ties
 
 
@@ -195,7 +197,7 @@ def _format_of(source: Source) -> str | None:
     """
     is_part = reader_of(UNSUPPORTED).is_part(source)
     for form in [UNSUPPORTED] if is_part else FORMATS:
-        with suppress(InputError, *checks.DAMAGES), np.errstate(all="ignore"):
+        with suppress(Exception), np.errstate(all="ignore"):
             if reader_of(form).recognises(source):
                 return form
     return None

@@ -42,6 +42,7 @@ from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import ZIP_MAGIC, Source, damaged, note, number, read_xml, text_of
 from pcfix.io.cameras.lenses import lens_by_name
+from pcfix.io.crs import Topocentric
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
 from pcfix.model import Cameras, FloatArray, Lens, TiePoints
 
@@ -53,6 +54,8 @@ SRS_OF_ALL = re.compile(rb"<SRSId>\s*([^<]*?)\s*</SRSId>")
 MAIN_COMPONENT = "1"
 CENTRE = [f"Pose/Center/{axis}" for axis in "xyz"]
 DEGREES = ["Longitude", "Latitude", "Altitude"]
+EXIF = "EPSG:4326"
+"""The CRS of positions in ExifData."""
 FIRST_PIXEL = 0.5
 """The centre of the first pixel, seen from its corner."""
 DIRECTIONS = {"Right": (1, 0, 0), "Left": (-1, 0, 0), "Down": (0, 1, 0), "Up": (0, -1, 0)}
@@ -84,21 +87,22 @@ class Photogroup(NamedTuple):
     """What the photos of a group share.
 
     `axes` is the matrix from camera axes to x right, y down, z forward; `middle` the principal
-    point in pixels from the corner. Of `pixel_mm` and `lens` None is unknown.
+    point in pixels from the corner. A `pixel_mm` of 0 and a `lens` of None are
+    unknown.
     """
 
     name: str
     has_poses: bool
     axes: FloatArray
     middle: FloatArray
-    pixel_mm: float | None
+    pixel_mm: float
     lens: Lens | None
 
     def place(self, mark: Element) -> FloatArray:
         """Return u, v in pixels from the corner, of a measurement in pixels or in mm."""
         if mark.find("x") is not None and mark.find("y") is not None:
             return np.array([float(text_of(mark, axis)) for axis in "xy"]) + FIRST_PIXEL
-        if self.pixel_mm is None:
+        if not self.pixel_mm > 0.0:
             raise ValueError("a measurement is in mm, but its photogroup has no pixel size")
         mm = np.array([float(text_of(mark, name)) for name in ("xmm", "ymm")])
         return self.middle + self.axes[:2, :2] @ mm / self.pixel_mm
@@ -139,7 +143,13 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
                     continue
                 centre = _numbers(path, f"image {label}", photo, CENTRE)
                 turn = _rotation(path, label, photo.find("Pose/Rotation"), group.axes)
-                prior = _prior(path, label, photo, srs)
+                metadata, gps, prior = photo.find("Pose/Metadata"), photo.find("ExifData/GPS"), None
+                if metadata is not None and metadata.find("Center") is not None:
+                    axes = [f"Center/{axis}" for axis in "xyz"]
+                    place = _numbers(path, f"image {label}, Metadata", metadata, axes)
+                    prior = text_of(metadata, "SRSId") or srs, place
+                elif gps is not None and all(gps.findtext(name) for name in DEGREES):
+                    prior = EXIF, _numbers(path, f"image {label}, GPS", gps, DEGREES)
                 is_main = text_of(photo, "Component") in ("", MAIN_COMPONENT)
                 one = Photo(key, label, group, centre, turn, srs, prior)
                 (main if is_main else outside).append(one)
@@ -160,19 +170,13 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
     if priors:  # positions in the CRS that the first of them has
         of = next(iter(priors.values()))[0]
         places = {k: (xyz, np.full(3, np.nan)) for k, (srs, xyz) in priors.items() if srs == of}
-        crs = "EPSG:4326" if of == "exif" else _crs_of(path, root, of)
+        crs = EXIF if of == EXIF else _crs_of(path, root, of)
         gnss = checks.measured([photo.key for photo in photos], places, crs)
     lenses = [photo.group.lens for photo in photos if photo.group.lens is not None]
     has_lenses, notes = bool(turned) and len(lenses) == len(photos), []
     if ignored:
         sentence = f"photogroup {', '.join(ignored[:10])} is skipped (its ManualPose is false)."
         notes.append(note(path, "cameras.poses_ignored", sentence, photogroups=ignored))
-    if not turned:
-        notes.append(note(path, "cameras.no_rotations", "no photo has a rotation, only positions."))
-    elif not has_lenses:
-        bare = next(photo.label for photo in photos if photo.group.lens is None)
-        why = f"the photogroup of {bare} has no frame or focal length"
-        notes.append(checks.without_lens(path, why))
     chosen = {photo.key for photo in photos}
     cameras = Cameras(
         labels=tuple(photo.label for photo in photos),
@@ -190,17 +194,6 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
         i = data.count(b"<Block>", 0, match.start()) - 1
         texts.append((i, text_of(blocks[i], "SRSId"), match[1]))
     return cameras, photos, texts
-
-
-def _prior(path: Path, label: str, photo: Element, srs: str) -> tuple[str, FloatArray] | None:
-    """Return the GNSS position of a photo, and its SRS id, which is "exif" for WGS 84."""
-    metadata, gps = photo.find("Pose/Metadata"), photo.find("ExifData/GPS")
-    if metadata is not None and metadata.find("Center") is not None:
-        place = _numbers(path, f"image {label}, Metadata", metadata, [f"Center/{a}" for a in "xyz"])
-        return text_of(metadata, "SRSId") or srs, place
-    if gps is not None and all(gps.findtext(name) for name in DEGREES):
-        return "exif", _numbers(path, f"image {label}, GPS", gps, DEGREES)
-    return None
 
 
 def _rotation(
@@ -233,11 +226,8 @@ def _crs_of(path: Path, root: Element, srs_id: str) -> str:
     definition = definitions[srs_id].strip()
     if not definition.upper().startswith("ENU:"):
         return checks.crs(path, definition)
-    words = [word.strip() for word in [*definition[4:].split(","), "0"][:3]]
-    latitude, longitude, _ = map(float, words)
-    if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0):
-        raise damaged(path, f"'{definition[:80]}' is not ENU:latitude,longitude in degrees")
-    return "ENU:" + ",".join(words)
+    Topocentric.from_text(definition, str(path))  # checks it
+    return "ENU:" + ",".join(word.strip() for word in [*definition[4:].split(","), "0"][:3])
 
 
 def _numbers(path: Path, where: str, element: Element, names: Sequence[str]) -> FloatArray:
@@ -295,7 +285,7 @@ def _photogroup(path: Path, element: Element) -> Photogroup:
     else:
         given |= {k.lower(): value(f"Distortion/{k}") for k in ("K1", "K2", "K3", "P1", "P2")}
     given |= {"cx": middle[0], "cy": middle[1]}
-    more: dict[str, Any] = {"sensor": name, "pixel_size_mm": pixel_mm if pixel_mm > 0.0 else None}
+    more: dict[str, Any] = {"sensor": name}
     if is_fisheye:
         shape = [value(f"FisheyeDistortion/P{i}") for i in range(5)]
         has_shape = element.find("FisheyeDistortion") is not None
@@ -304,7 +294,7 @@ def _photogroup(path: Path, element: Element) -> Photogroup:
     if is_used and min(width, height) > 0.0 and not math.isnan(given.get("f", given.get("fx", 0))):
         lens = lens_by_name(given, width, height, **more)
     has_poses = text_of(element, "ManualPose").lower() != "false"
-    return Photogroup(name, has_poses, axes, middle, more["pixel_size_mm"], lens)
+    return Photogroup(name, has_poses, axes, middle, pixel_mm, lens)
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:

@@ -47,7 +47,7 @@ from pcfix.io.cameras.checks import Seen, Source, damaged, note
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_photogrammetric
-from pcfix.model import Cameras, FloatArray, IntArray, TiePoints
+from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, TiePoints
 
 _BUNDLER, _MVE = re.compile(r"#\s*Bundle file v(\d+\.\d+)"), re.compile(r"drews 1\.0")
 _VERSION = "0.3"
@@ -62,8 +62,6 @@ _FAR_PX = 5.0
 _LARGEST_PX = 1e6
 _LEAST_VIEWS = 10
 """Views of one camera from which the middle of its frame is estimated."""
-_SAME_CAMERA = 1.1
-"""Largest ratio between the focal lengths of neighbours among images of one camera."""
 
 
 class Model(NamedTuple):
@@ -90,15 +88,15 @@ class Model(NamedTuple):
 
 def recognises(source: Source) -> bool:
     """Whether the first line is that of Bundler, of any version, of MVE or VisualSFM."""
-    text = source.text
-    return bool(_BUNDLER.match(text) or _MVE.match(text) or _NVM.match(text.lstrip()))
+    text = source.text.lstrip()
+    return any(form.match(text) for form in (_BUNDLER, _MVE, _NVM))
 
 
 def read(source: Source) -> Cameras:
     """Read the poses of the largest model, and its lenses where sizes are known."""
     path, model = source.path, _read(source)
     labels = tuple(model.names[i] for i in model.posed)
-    frames, notes = _frame_sizes(path, labels, model)
+    frames, notes = _frame_sizes(path, labels, model.least_px)
     lenses = []
     for (f, k1, k2), (w, h) in zip(model.lenses.tolist(), frames.tolist(), strict=False):
         given = {"f": f * max(w, h) if model.software == "MVE" else f, "k1": k1, "k2": k2}
@@ -121,19 +119,17 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     model = _read(source)
     if model.software == "MVE":
         raise checks.no_tie_points(source.path, "MVE writes no image coordinates")
-    if not len(model.points.camera) or cameras.lenses is None:
-        raise checks.no_tie_points(source.path, "it lists no points")
     row = np.full(len(model.names), -1)
     row[model.posed] = np.arange(len(cameras))
     camera = row[model.points.camera]
-    middle = np.array([(lens.principal_x, lens.principal_y) for lens in cameras.lenses])
-    uv = middle[camera] + model.points.uv
+    middles = [(one.principal_x, one.principal_y) for one in cameras.lenses or ()]
+    uv = np.array(middles).reshape(-1, 2)[camera] + model.points.uv
     return checks.tie_points(model.points._replace(camera=camera, uv=uv))
 
 
 def _read(source: Source) -> Model:
     is_nvm = _NVM.match(source.text.lstrip()) is not None
-    return _read_nvm(source.path) if is_nvm else _read_bundler(source.path)
+    return (_read_nvm if is_nvm else _read_bundler)(source.path)
 
 
 def _read_bundler(path: Path) -> Model:
@@ -146,19 +142,11 @@ def _read_bundler(path: Path) -> Model:
     values = np.array(" ".join(body).split(), np.float64)
     count, end = int(values[0]), 2 + _CAMERA_NUMBERS * int(values[0])
     points = _points(path, values[end:], int(values[1]), count, 4 if version else 3)
-    names = [f"{'camera' if version else 'view'} {i}" for i in range(count)]
-    stem = path.name.removesuffix(".out")
-    own = (stem, path.name, stem.removesuffix(".bundle"))
-    places = [path.with_name(name) for name in (*(f"{one}.list.txt" for one in own), "list.txt")]
-    for place in (path.parent.parent / "list.txt", *places[::-1]):  # the last that fits counts
-        if place.is_file():
-            lines = [line.strip() for line in read_lines(place) if line.strip()]
-            if len(lines) == len(names):
-                names = [_FOCAL_OF_LIST.sub("", line) for line in lines]
+    names = _listed_names(path, count)
+    if not names:
+        names = [f"{'camera' if version else 'view'} {i}" for i in range(count)]
     rows = values[2:end].reshape(count, _CAMERA_NUMBERS)
-    posed = np.flatnonzero(rows[:, 0] != 0.0)
-    if not len(posed):
-        raise checks.no_pose(path, "no image has a pose (all focal lengths are 0)")
+    posed = _posed(path, rows[:, 0] != 0.0)
     rows = rows[posed]
     rotations = checks.rotations(path, [names[i] for i in posed], rows[:, 3:12])
     centres, least = checks.centres(rotations, rows[:, 12:]), np.zeros((count, 2))
@@ -167,8 +155,26 @@ def _read_bundler(path: Path) -> Model:
         points = points._replace(uv=points.uv * (1.0, -1.0))
         np.maximum.at(least, points.camera, 2.0 * np.abs(points.uv))
     software = f"Bundler v{_VERSION}" if version else "MVE"
-    lenses = rows[:, :3]
-    return Model(software, names, posed, rotations, centres, lenses, least[posed], points, {})
+    return Model(software, names, posed, rotations, centres, rows[:, :3], least[posed], points, {})
+
+
+def _posed(path: Path, has_focal: BoolArray) -> IntArray:
+    """Return the rows of images with a pose."""
+    if not has_focal.any():
+        raise checks.no_pose(path, "no image has a pose (all focal lengths are 0)")
+    return np.flatnonzero(has_focal)
+
+
+def _listed_names(path: Path, count: int) -> list[str]:
+    """Return the names in the first list next to a file that has one for each image."""
+    stem = path.name.removesuffix(".out")
+    own = (f"{one}.list.txt" for one in (stem, path.name, stem.removesuffix(".bundle")))
+    for place in (*map(path.with_name, (*own, "list.txt")), path.parent.parent / "list.txt"):
+        if place.is_file():
+            lines = [line.strip() for line in read_lines(place) if line.strip()]
+            if len(lines) == count:
+                return [_FOCAL_OF_LIST.sub("", line) for line in lines]
+    return []
 
 
 def _read_nvm(path: Path) -> Model:
@@ -191,30 +197,32 @@ def _read_nvm(path: Path) -> Model:
         at += 1 + views
     if not models:
         raise checks.no_pose(path, "has no model")
-    with_points = [model for model in models if len(model[2].xyz)]
-    names, rows, points = max(with_points or models, key=lambda model: (model[1][:, 0] > 0.0).sum())
-    posed = np.flatnonzero(rows[:, 0] > 0.0)
-    if not len(posed):
-        raise checks.no_pose(path, "no image has a pose (all focal lengths are 0)")
+    among = [model for model in models if len(model[2].xyz)] or models
+    names, rows, points = max(among, key=lambda model: (model[1][:, 0] > 0.0).sum())
+    posed = _posed(path, rows[:, 0] > 0.0)
     labels, own = [names[i] for i in posed], rows[posed]
     if matrix:
         rotations = checks.rotations(path, labels, own[:, 1:10])
         centres = checks.centres(rotations, own[:, 10:13])
     else:
         rotations, centres = checks.quaternions(path, labels, own[:, 1:5]), own[:, 5:8]
-    count = len(with_points or models)
-    notes = (checks.several(path, count, len(labels)),) if count > 1 else ()
     least = np.zeros((len(rows), 2))
     if fixed:
         least[:] = 2.0 * fixed["cx"], 2.0 * fixed["cy"]
     else:
-        points, least = _from_the_middle(points, rows[:, 0], posed, rotations, centres)
+        row = np.full(len(rows), -1)
+        row[posed] = np.arange(len(posed))
+        row = row[points.camera]
+        x, y, z = np.einsum("nij,nj->in", rotations[row], points.xyz[points.point] - centres[row])
+        z = np.where((row >= 0) & (z > 0.0), z, np.nan)
+        expected = rows[points.camera, :1] * np.column_stack([x / z, y / z])
+        points, least = _from_the_middle(points, expected, rows[:, 0])
     lenses = np.column_stack([own[:, 0], own[:, -2], np.zeros(len(own))])
-    listed = tuple(name for model in models for name in model[0])
     return Model(
-        "VisualSFM", names, posed, rotations, centres, lenses, least[posed], points, fixed, listed,
-        notes,
-    )  # fmt: skip
+        *("VisualSFM", names, posed, rotations, centres, lenses, least[posed], points, fixed),
+        elsewhere=tuple(name for model in models for name in model[0]),
+        notes=(checks.several(path, len(among), len(labels)),) if len(among) > 1 else (),
+    )
 
 
 def _points(path: Path, body: FloatArray, count: int, images: int, width: int) -> Seen:
@@ -223,48 +231,42 @@ def _points(path: Path, body: FloatArray, count: int, images: int, width: int) -
     `count` is the number of points that the file announces, `images` that of its images, which the
     first number of a view counts from 0; its last two are x and y.
     """
-    starts: list[tuple[int, int]] = []  # where a point begins, and its number of views
-    at = 0
+    xyz, parts, at = [], [], 0
     for i in range(count):
         n = int(body[at + _BEFORE_VIEWS - 1]) if at + _BEFORE_VIEWS <= len(body) else -1
-        if n < 0 or at + _BEFORE_VIEWS + width * n > len(body):
+        end = at + _BEFORE_VIEWS + width * n
+        if n < 0 or end > len(body):
             raise damaged(path, f"it ends at point {i} of {count}")
-        starts.append((at, n))
-        at += _BEFORE_VIEWS + width * n
-    first, views = np.array(starts, np.int64).reshape(-1, 2).T
-    point = np.repeat(np.arange(count), views)
-    within = np.arange(len(point)) - np.repeat(np.cumsum(views) - views, views)
-    at_view = np.repeat(first + _BEFORE_VIEWS, views) + width * within
-    image = body[at_view]
+        xyz.append(body[at : at + 3])
+        parts.append(body[at + _BEFORE_VIEWS : end].reshape(n, width))
+        at = end
+    point = np.repeat(np.arange(count), [len(part) for part in parts])
+    views = np.concatenate([np.empty((0, width)), *parts])
+    image = views[:, 0].astype(np.int64)
     bad = ~((image >= 0) & (image < images))
     if bad.any():
-        raise damaged(path, f"point {point[np.argmax(bad)]} is in image {image[np.argmax(bad)]:g}")
-    uv = body[at_view[:, None] + np.arange(width - 2, width)]
-    return Seen(body[first[:, None] + np.arange(3)], point, image.astype(np.int64), uv)
+        raise damaged(path, f"point {point[np.argmax(bad)]} is in image {image[np.argmax(bad)]}")
+    return Seen(np.array(xyz).reshape(-1, 3), point, image, views[:, -2:])
 
 
 def _from_the_middle(
-    points: Seen, focal: FloatArray, posed: IntArray, rotations: FloatArray, centres: FloatArray
+    points: Seen, expected: FloatArray, focal: FloatArray
 ) -> tuple[Seen, FloatArray]:
-    """Return views from the principal point, and the least frame of each of the images."""
+    """Return views from the principal point, and the least frame of each of the images.
+
+    `expected` are the places without distortion, `focal` is that of each image.
+    """
     image, seen, least = points.camera, points.uv.copy(), np.zeros((len(focal), 2))
-    expected = np.full_like(seen, np.nan)  # where points project without distortion
-    if len(seen) and ((seen >= 0.0) & (seen < _LARGEST_PX)).all():
-        row_of = np.full(len(focal), -1)
-        row_of[posed] = np.arange(len(posed))
-        row = row_of[image]
-        x, y, z = np.einsum("nij,nj->in", rotations[row], points.xyz[points.point] - centres[row])
-        z = np.where((row >= 0) & (z > 0.0), z, np.nan)
-        places = focal[image][:, None] * np.column_stack([x / z, y / z])
-        expected = np.where(np.abs(places) < _LARGEST_PX, places, np.nan)
-    apart = np.abs(seen - expected)
-    if not (np.isfinite(apart).any() and np.nanmedian(apart) > _FAR_PX):
+    expected = np.where(np.abs(expected) < _LARGEST_PX, expected, np.nan)
+    known = np.isfinite(expected).all(axis=1)
+    is_from_corner = ((seen >= 0.0) & (seen < _LARGEST_PX)).all() and known.any()
+    if not (is_from_corner and np.median(np.abs(seen - expected)[known]) > _FAR_PX):
         np.maximum.at(least, image, 2.0 * np.abs(seen))
         return points, least
-    for f in np.unique(focal[posed]):  # OpenSfM's, from the corner
+    for f in np.unique(focal[image[known]]):  # OpenSfM's, from the corner
         rows = focal[image] == f
-        if np.isfinite(expected[rows]).all(axis=1).sum() >= _LEAST_VIEWS:
-            squeeze, frame = _squeeze_and_frame(expected[rows], seen[rows])
+        if (rows & known).sum() >= _LEAST_VIEWS:
+            squeeze, frame = _squeeze_and_frame(expected[rows & known], seen[rows & known])
             seen[rows] = (seen[rows] - frame / 2.0) / squeeze
             least[focal == f] = frame
     return points._replace(uv=seen), least
@@ -277,8 +279,7 @@ def _squeeze_and_frame(expected: FloatArray, seen: FloatArray) -> tuple[FloatArr
     whichever is nearer.
     """
     slopes, offsets = np.empty((2, 2))
-    there = np.isfinite(expected).all(axis=1)
-    for axis, (e, s) in enumerate(zip(expected[there].T, seen[there].T, strict=True)):
+    for axis, (e, s) in enumerate(zip(expected.T, seen.T, strict=True)):
         good = np.full(len(e), True)
         for _ in range(2):
             offsets[axis], slopes[axis] = np.polynomial.polynomial.polyfit(e[good], s[good], 1)
@@ -291,28 +292,20 @@ def _squeeze_and_frame(expected: FloatArray, seen: FloatArray) -> tuple[FloatArr
 
 
 def _frame_sizes(
-    path: Path, labels: tuple[str, ...], model: Model
+    path: Path, labels: tuple[str, ...], least_px: FloatArray
 ) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
     """Return width and height of images, from the images themselves or from their tie points.
 
-    Where an image cannot be opened, its frame is the smallest that holds all tie points that
-    images of about the same focal length have, about the middle of the frame. Where neither is
-    known there are no sizes.
+    Where an image cannot be opened, its frame is the smallest that holds the tie points of all
+    images, about the middle of the frame. Where neither is known there are no sizes.
     """
     sizes = np.array([checks.image_size(path.parent, one) or (0, 0) for one in labels], float)
     missing = sizes[:, 0] == 0
     if not missing.any():
         return sizes, ()
-    why = f"the size of {missing.sum()} images is unknown. Put the images beside the file"
-    least, focal = model.least_px, model.lenses[:, 0]
-    if not least.any():
-        return np.empty((0, 2)), (checks.without_lens(path, why),)
-    order = np.argsort(focal)
-    steps = focal[order][1:] > _SAME_CAMERA * focal[order][:-1]
-    for members in np.split(order, np.flatnonzero(steps) + 1):  # images of about one focal length
-        bound = least[members].max(axis=0)
-        bound = bound if bound.all() else least.max(axis=0)
-        sizes[members] = np.where(missing[members, None], bound, sizes[members])
-    first = sizes[missing][0].tolist()
-    sentence = f"{why}; until then they are estimated (first {first[0]:.0f} x {first[1]:.0f} px)."
-    return sizes, (note(path, "cameras.frames_estimated", sentence, size_px=first),)
+    if not least_px.any():
+        return np.empty((0, 2)), ()
+    first = sizes[missing] = least_px.max(axis=0)
+    sentence = f"the size of {missing.sum()} images is unknown. Put the images next to the file;"
+    sentence += f" until then they are estimated as {first[0]:.0f} x {first[1]:.0f} px."
+    return sizes, (note(path, "cameras.frames_estimated", sentence, size_px=first.tolist()),)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import lzma
 import re
-import struct
 import zipfile
-import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property
@@ -37,13 +34,6 @@ LARGEST_RATIO = 200
 """Of an archive: XML packs 10 to 30 times smaller, a bomb a thousand times."""
 ROUNDING = 1e-3
 """Of a rotation's elements: files with four decimals pass, a mirrored or scaled one does not."""
-NO_LENS = "cameras.no_lens"
-DAMAGES = (
-    *(ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError),
-    *(SyntaxError, TypeError, ValueError, lzma.LZMAError, struct.error),
-    *(zipfile.BadZipFile, zlib.error),
-)
-"""What readers run into where a file is cut off, or holds something else than it should."""
 
 Angles = Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"]
 
@@ -97,11 +87,6 @@ def unsupported(path: Path, what: str, remedy: str, **values: Any) -> InputError
     return bad_file(path, "cameras.unsupported", f"{what} is not supported. {remedy}.", **values)
 
 
-def missing(path: Path, remedy: str = "Keep all files of the project together") -> InputError:
-    """Return the error for a file of a project that is not there."""
-    return bad_file(path, "cameras.missing_file", f"is missing. {remedy}.")
-
-
 def note(path: object, code: str, sentence: str, **values: Any) -> PcfixWarning:
     """Return a note on what was done on reading a file."""
     return PcfixWarning(code, f"{path}: {sentence}", path=path, **values)
@@ -113,10 +98,10 @@ def several(path: Path, count: int, images: int) -> PcfixWarning:
     return note(path, "cameras.several_models", sentence, models=count, images=images)
 
 
-def without_lens(path: Path, why: str) -> PcfixWarning:
-    """Return a note on images without a frame."""
-    sentence = f"{why}, so every point in front of a camera counts as inside its frame."
-    return note(path, NO_LENS, sentence)
+def no_sensor(path: Path, columns: str) -> InputError:
+    """Return the error for a table of poses without a lens."""
+    sentence = f"has angles but no sensor. Give --sensor a table with the columns {columns}."
+    return bad_file(path, "cameras.sensor_missing", sentence, columns=columns)
 
 
 def repeated(path: Path, labels: Sequence[str], dropped: int = 0) -> tuple[PcfixWarning, ...]:
@@ -139,10 +124,11 @@ def reading(path: object) -> Iterator[None]:
     except PcfixError:
         raise
     except FileNotFoundError as error:
-        raise missing(Path(error.filename or str(path))) from error
+        sentence = "is missing. Keep all files of the project together."
+        raise bad_file(error.filename or path, "cameras.missing_file", sentence) from error
     except KeyError as error:
         raise damaged(path, f"{error} is missing") from error
-    except DAMAGES as error:
+    except Exception as error:  # whatever a reader runs into where a file is cut off
         raise damaged(path, error or type(error).__name__) from error
 
 
@@ -326,11 +312,6 @@ class AffineFrame(NamedTuple):
 # ---- tie points ----
 
 
-NO_TIE_POINTS = TiePoints(
-    np.empty((0, 3)), Views(np.zeros(1, np.int64), np.empty(0, np.int64)), np.empty((0, 2))
-)
-
-
 def no_tie_points(path: Path, why: str) -> NoTiePointsError:
     """Return the error for a file without tie points."""
     sentence = f"{path}: has no tie points, as {why}."
@@ -378,12 +359,6 @@ def tie_points(*parts: Seen) -> TiePoints:
     return TiePoints(xyz, Views(start, camera[kept]), uv[kept])
 
 
-def are_seen(tie_points: TiePoints) -> BoolArray:
-    """Return which points have a position and a view."""
-    seen = np.diff(tie_points.views.start) > 0
-    return np.asarray(np.isfinite(tie_points.xyz).all(axis=1) & seen)
-
-
 def image_size(folder: Path, name: str) -> tuple[int, int] | None:
     """Return width and height of an image, None when it is not there or cannot be opened.
 
@@ -406,17 +381,11 @@ def image_size(folder: Path, name: str) -> tuple[int, int] | None:
 # ---- what writers share ----
 
 
-def block_to_write(
-    path: Path, cameras: Cameras, label_fits: Callable[[str], bool]
-) -> tuple[FloatArray, tuple[Lens, ...]]:
-    """Return rotations and lenses of cameras, with labels that a format can hold."""
+def block_to_write(path: Path, cameras: Cameras) -> tuple[FloatArray, tuple[Lens, ...]]:
+    """Return rotations and lenses of cameras."""
     if cameras.rotations is None or cameras.lenses is None:
         sentence = "the cameras have no rotations or no lenses, so they cannot be written."
         raise bad_file(path, "output.no_lenses", sentence)
-    label = next((one for one in cameras.labels if not label_fits(one)), None)
-    if label is not None:
-        sentence = f"the format cannot hold the image name {label!r}. Take another format."
-        raise bad_file(path, "output.label", sentence, image=label)
     return cameras.rotations, cameras.lenses
 
 

@@ -39,12 +39,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError
+from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import NO_TIE_POINTS, Source, are_seen, damaged
+from pcfix.io.cameras.checks import Source, damaged
 from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
 from pcfix.io.crs import is_topocentric
-from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
+from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints, Views
 from pcfix.options.declare import File
 
 _PART = re.compile(r"(cameras|images|points3D|rigs|frames)\.(bin|txt)")
@@ -62,23 +62,21 @@ def read(source: Source) -> Cameras:
     listed, *others = _models_at(source.path)
     path, folder = listed.with_stem("images"), listed.parent
     cameras, images = read_list(listed), read_images(path, points=False)
-    posed = [image for image in images if image.posed]
-    if not posed:
+    if not images:
         raise checks.no_pose(path)
-    poses = np.array([image.pose for image in posed])
-    labels = tuple(image.name for image in posed)
+    poses = np.array([image.pose for image in images])
+    labels = tuple(image.name for image in images)
     rotations = checks.quaternions(path, labels, poses[:, :4])
-    used = dict.fromkeys(image.camera for image in posed)
+    used = dict.fromkeys(image.camera for image in images)
     lenses = {number: lens_of(listed, number, cameras[number]) for number in used}
     offset, crs = read_place(folder)
     return Cameras(
         labels=labels,
         centres=checks.centres(rotations, poses[:, 4:]) + offset,
         rotations=rotations,
-        lenses=tuple(lenses[image.camera] for image in posed),
+        lenses=tuple(lenses[image.camera] for image in images),
         crs=crs,
-        notes=(checks.several(folder, len(others) + 1, len(posed)),) if others else (),
-        unposed=tuple(image.name for image in images if not image.posed),
+        notes=(checks.several(folder, len(others) + 1, len(images)),) if others else (),
         source="COLMAP",
     )
 
@@ -90,10 +88,8 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     if not path.is_file():
         raise checks.no_tie_points(path, "there is no such file")
     identifiers, xyz = read_points(path)
-    images = [i for i in read_images(listed.with_stem("images"), points=True) if i.posed]
+    images = read_images(listed.with_stem("images"), points=True)
     seen = np.concatenate([image.seen for image in images])
-    if not len(identifiers) or not len(seen):
-        raise checks.no_tie_points(path, "the model has no points that its images saw")
     camera = np.repeat(np.arange(len(cameras)), [len(image.seen) for image in images])
     xyz = xyz + read_place(listed.parent)[0]
     row = checks.rows_of(seen["point"], identifiers)
@@ -207,15 +203,11 @@ class Image(NamedTuple):
     name: str
     seen: np.ndarray
 
-    @property
-    def posed(self) -> bool:
-        """Whether it has a pose at all; COLMAP itself writes no others."""
-        return bool(np.isfinite(self.pose).all())
-
 
 OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _COUNT, _CAMERA, _IMAGE = struct.Struct("<Q"), struct.Struct("<IiQQ"), struct.Struct("<I7dI")
-_POINT_BYTES, _POINT_TO_COUNT, _POINT_TO_COLOUR, _VIEW_BYTES = 51, 43, 32, 8
+_POINT, _VIEW_BYTES = struct.Struct("<Q3d11xQ"), 8
+"""Of a point its number, place and count of views, without colour and error."""
 _STATED = re.compile(r"^#.*Number of (?:cameras|images|points): (\d{1,15})\b", re.MULTILINE)
 _HEAD_CHARACTERS = 4096
 
@@ -314,19 +306,15 @@ def read_points(path: Path) -> tuple[IntArray, FloatArray]:
             _check_count(path, len(lines))
             values = np.array([line[1:] for line in lines], float).reshape(-1, 3)
             return np.array([int(line[0]) for line in lines], np.int64), values
-        data, starts = _open(path), []
-        (count,), at = _take(data, _COUNT), _COUNT.size
-        for _ in range(count):  # millions, so without a function call each
-            starts.append(at)
-            at += _POINT_BYTES + _VIEW_BYTES * _COUNT.unpack_from(data, at + _POINT_TO_COUNT)[0]
+        data, at, rows = _open(path), _COUNT.size, []
+        for _ in range(*_take(data, _COUNT)):
+            *row, views = _POINT.unpack_from(data, at)
+            rows.append(row)
+            at += _POINT.size + _VIEW_BYTES * views
         if at > len(data):
             raise damaged(path, "its last point has too few views")
-        if not starts:
-            return np.empty(0, np.int64), np.empty((0, 3))
-        every_byte = np.frombuffer(data, np.uint8)
-        rows = np.lib.stride_tricks.sliding_window_view(every_byte, _POINT_TO_COLOUR)[starts]
-        numbers = np.ascontiguousarray(rows).view([("id", "<i8"), ("xyz", "<f8", 3)])[:, 0]
-        return numbers["id"].copy(), numbers["xyz"].copy()
+        places = np.array([row[1:] for row in rows], float).reshape(-1, 3)
+        return np.array([row[0] for row in rows], np.int64), places
 
 
 WRITTEN = {k: model for k, model in BY_NAME.items() if k not in ("SIMPLE_FISHEYE", "FISHEYE")}
@@ -335,15 +323,8 @@ GREY = (128, 128, 128)
 ROUND_M = 100.0
 
 
-def write_colmap(
-    folder: File,
-    cameras: Cameras,
-    tie_points: TiePoints | None = None,
-    *,
-    offset_m: tuple[float, float, float] | None = None,
-    crs: str | None = None,
-) -> None:
-    """Write a block as a binary COLMAP model.
+def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = None) -> None:
+    """Write a block as a binary COLMAP model, positions minus the middle of the block.
 
     Parameters
     ----------
@@ -353,30 +334,30 @@ def write_colmap(
         With rotations and lenses in pixels.
     tie_points : TiePoints, optional
         In the frame of the cameras; those without a position or without a view are left out.
-    offset_m : tuple of 3 float, optional
-        Taken off all positions. Default: the middle of the block, to `ROUND_M`.
-    crs : str, optional
-        Default: that of the cameras.
     """
     from scipy.spatial.transform import Rotation
 
     target = Path(folder)
-    rotations, lenses = checks.block_to_write(  # a file would cut off other names
-        target, cameras, lambda name: name == name.strip() != "" and not {"\0", "\n"} & {*name}
-    )
+    rotations, lenses = checks.block_to_write(target, cameras)
+    for label in cameras.labels:  # of other names a file would cut off a part
+        if not label == label.strip() != "" or {"\0", "\n"} & {*label}:
+            sentence = f"the format cannot hold the image name {label!r}. Rename the image."
+            raise bad_file(target, "output.label", sentence, image=label)
     middle = np.median(cameras.centres, axis=0)
     middle[2] = 0.0  # heights are small, and easier to read as they are
-    offset = np.asarray(np.round(middle / ROUND_M) * ROUND_M if offset_m is None else offset_m)
+    offset = np.round(middle / ROUND_M) * ROUND_M
     distinct = list(dict.fromkeys(lenses))
     number = {lens: i for i, lens in enumerate(distinct, start=1)}
-    ties = tie_points or NO_TIE_POINTS
-    kept, counts = are_seen(ties), np.diff(ties.views.start)
-    of_kept = np.repeat(kept, counts)
-    camera = ties.views.camera[of_kept]
+    nothing = Views(np.zeros(1, np.int64), np.empty(0, np.int64))
+    ties = tie_points or TiePoints(np.empty((0, 3)), nothing, np.empty((0, 2)))
+    counts = np.diff(ties.views.start)
+    used = np.isfinite(ties.xyz).all(axis=1) & (counts > 0)
+    of_used = np.repeat(used, counts)
+    camera = ties.views.camera[of_used]
     order = np.argsort(camera, kind="stable")  # COLMAP lists the image points image by image
     seen = np.empty(len(camera), OBSERVATION)
-    seen["xy"] = ties.image_xy[of_kept][order]
-    seen["point"] = np.repeat(np.cumsum(kept), counts)[of_kept][order]
+    seen["xy"] = ties.image_xy[of_used][order]
+    seen["point"] = np.repeat(np.cumsum(used), counts)[of_used][order]
     start = np.concatenate([[0], np.cumsum(np.bincount(camera, minlength=len(cameras)))])
     listed = [struct.pack("<Q", len(distinct))]
     for i, lens in enumerate(distinct, start=1):
@@ -395,8 +376,8 @@ def write_colmap(
     contents = {
         "cameras.bin": b"".join(listed),
         "images.bin": b"".join(images),
-        "points3D.bin": _points(ties.xyz[kept] - offset, seen["point"], start),
-        FILE: place_text(offset, crs or cameras.crs).encode(),
+        "points3D.bin": _points(ties.xyz[used] - offset, seen["point"], start),
+        FILE: place_text(offset, cameras.crs).encode(),
     }
     checks.write_new(target, contents)
 

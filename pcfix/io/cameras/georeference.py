@@ -29,7 +29,6 @@ from pcfix.model import Cameras, FloatArray
 if TYPE_CHECKING:
     from pyproj import CRS
 
-EARTH_RADIUS_M = 6.371e6
 CENTRE_DISTANCE_M = (6.2e6, 7.0e6)
 """Cameras are at no other distance from the centre of the earth."""
 STEP_M = 10.0
@@ -47,20 +46,6 @@ class Frame(NamedTuple):
     enter: Callable[[FloatArray], FloatArray]
     direct: bool = False
     topocentric: bool = False
-
-    def metres(self, xyz: FloatArray) -> FloatArray:
-        """Return how many metres one unit of each number is, at points (n, 3).
-
-        Degrees are those of a sphere, as only the directions of the steps count.
-        """
-        size, up = systems.plan_unit(self.crs)[1], abs(systems.metres_up(self.crs))
-        if not self.direct:
-            return np.ones_like(xyz)
-        if self.crs.is_projected:
-            return np.tile([size, size, up], (len(xyz), 1))
-        parallel = np.maximum(np.cos(xyz[:, [1]] * size), 1e-9)
-        meridian_m = np.full((len(xyz), 1), EARTH_RADIUS_M * size)
-        return np.hstack([meridian_m * parallel, meridian_m, np.full_like(parallel, up)])
 
     def check(self, xyz: FloatArray, labels: Sequence[str], name: str) -> None:
         """Raise InputError for numbers that are no place on the earth."""
@@ -102,6 +87,19 @@ def frame_of(text: str, name: str) -> Frame:
 
 def _same(xyz: FloatArray) -> FloatArray:
     return xyz
+
+
+def _metres(crs: CRS, xyz: FloatArray) -> FloatArray:
+    """Return how many metres one unit of each number is, at points (n, 3) of a CRS."""
+    unit, up = systems.plan_unit(crs)[1], np.full(len(xyz), abs(systems.metres_up(crs)))
+    if crs.is_projected or crs.ellipsoid is None:
+        return np.column_stack([np.full((len(xyz), 2), unit), up])
+    # radii of curvature of the ellipsoid across and along the meridian
+    a, b = crs.ellipsoid.semi_major_metre, crs.ellipsoid.semi_minor_metre
+    latitude = unit * xyz[:, 1]
+    across = a**2 / np.hypot(a * np.cos(latitude), b * np.sin(latitude))
+    parallel = across * np.maximum(np.cos(latitude), 1e-9)
+    return np.column_stack([unit * parallel, unit * across**3 * (b / a**2) ** 2, up])
 
 
 def is_tied(crs: str | None, name: str) -> bool:
@@ -162,7 +160,8 @@ class Georeference:
         if self.frame is None:
             return np.broadcast_to(np.eye(3), (len(xyz), 3, 3))
         at = xyz + self.offset
-        steps = STEP_M * np.eye(3) / self.frame.metres(at)[:, None, :]
+        metres = _metres(self.frame.crs, at) if self.frame.direct else np.ones_like(at)
+        steps = STEP_M * np.eye(3) / metres[:, None, :]
         ahead, behind = (self.forward((at[:, None] + s).reshape(-1, 3)) for s in (steps, -steps))
         if not (np.isfinite(ahead).all() and np.isfinite(behind).all()):
             return np.full((len(xyz), 3, 3), np.nan)
@@ -233,9 +232,7 @@ def georeference(
     if cloud is not None:
         return _into(cloud, frame, project, cameras, offset, name, trusted=trusted)
     if frame.topocentric or (frame.direct and frame.crs.is_projected):
-        unit, size = systems.plan_unit(frame.crs)
-        words = frame.crs.name + ("" if size == 1.0 else f", unit {unit},")
-        words = systems.shortened(crs) if frame.topocentric else words
+        words = systems.shortened(crs) if frame.topocentric else frame.crs.name
         found = Georeference(_same, None, offset, stated, (), name)
     elif frame.direct or project is None or not project.is_projected:
         kind = "degrees" if frame.direct else "geocentric coordinates"
@@ -348,12 +345,6 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatA
         reason = str(error).partition("; or, if")[0].rstrip(".") + "; only plan is compared."
         forward, _ = systems.transformation(other.crs, own.crs, measured, name, heights=False)
     measured = forward(measured)
-    unit, up = systems.plan_unit(own.crs)[1], abs(systems.metres_up(own.crs))
-    off = (adjusted - measured) * [unit, unit, up]
-    if own.crs.is_geographic and (geod := own.crs.get_geod()) is not None:
-        ends = (np.degrees(unit * one[:, :2]).T for one in (measured, adjusted))
-        geodesic, _, distance = geod.inv(*(x for end in ends for x in end))
-        azimuth = np.radians(geodesic)
-        off[:, :2] = np.column_stack([distance * np.sin(azimuth), distance * np.cos(azimuth)])
-    found[rows] = off if not reason else off * [1.0, 1.0, np.nan]
+    off = (adjusted - measured) * _metres(own.crs, measured)
+    found[rows] = off * [1.0, 1.0, np.nan] if reason else off
     return found, reason

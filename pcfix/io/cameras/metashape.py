@@ -34,7 +34,7 @@ from __future__ import annotations
 import io
 import re
 import zipfile
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -44,7 +44,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import (
     ZIP_MAGIC,
@@ -59,7 +59,7 @@ from pcfix.io.cameras.checks import (
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.crs import LOCAL, METRES, crs_text, is_local, parse_crs, shortened, unbound
 from pcfix.io.ply import parse_header
-from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, Projection, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
 
 Spreads: TypeAlias = "tuple[tuple[str, tuple[int, ...]], ...]"
 """Names of stated standard deviations and the axes that they are of."""
@@ -72,7 +72,6 @@ DEFAULTS: Spreads = (
     ("accuracy_cameras_xy", (0, 1)),
     ("accuracy_cameras_z", (2,)),
 )
-POINTS, MARKS = ("x", "y", "z", "id"), ("x", "y", "id")
 PARAMETERS = {
     *("f", "fx", "fy", "cx", "cy", "b1", "b2", "skew"),
     *("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4"),
@@ -84,9 +83,11 @@ PROJECTIONS: dict[str, Projection] = {
     "equisolid_fisheye": "equisolid",
 }
 """Kinds of sensors that a lens can describe: not spherical, cylindrical or RPC."""
-ROOT = re.compile(r"\s*(?:<\?.*?\?>\s*|<!--.*?-->\s*)*<(\w+)", re.DOTALL)
-OF_CHUNKS = re.compile(r"<chunks?\b|\bpath=")
-INSIDE = {"document": OF_CHUNKS, "collection": OF_CHUNKS, "chunk": re.compile(r"<sensors\b")}
+ROOT = re.compile(  # a project, chunks or a chunk, after the declaration and comments
+    r"\s*(<\?.*?\?>\s*|<!--.*?-->\s*)*"
+    r"(<(document|collection)\b.*?(<chunks?\b|\bpath=)|<chunk\b.*?<sensors\b)",
+    re.DOTALL,
+)
 
 
 def recognises(source: Source) -> bool:
@@ -95,11 +96,9 @@ def recognises(source: Source) -> bool:
         return "project.zip" in source.names
     text = source.text
     if source.head.startswith(ZIP_MAGIC):
-        with suppress(*checks.DAMAGES), zipfile.ZipFile(source.path) as archive:
+        with suppress(Exception), zipfile.ZipFile(source.path) as archive:
             text = archive.open("doc.xml").read(len(source.head)).decode("utf-8", "replace")
-    root = ROOT.match(text)
-    inside = INSIDE.get(root[1]) if root else None
-    return bool(root and inside and inside.search(text, root.end()))
+    return bool(ROOT.match(text))
 
 
 def read(source: Source) -> Cameras:
@@ -172,8 +171,13 @@ class Chunk(NamedTuple):
     @property
     def settings(self) -> dict[str, str]:
         """The settings of the chunk by their names."""
-        entries = self.element.iterfind("settings/property")
-        return {entry.get("name") or "": entry.get("value") or "" for entry in entries}
+        return _properties(self.element, "settings")
+
+
+def _properties(element: Element, path: str = ".") -> dict[str, str]:
+    """Return the names and values of the properties in an element."""
+    entries = element.iterfind(f"{path}/property")
+    return {entry.get("name") or "": entry.get("value") or "" for entry in entries}
 
 
 def open_chunk(path: Path) -> Chunk:
@@ -181,19 +185,12 @@ def open_chunk(path: Path) -> Chunk:
     top, notes = _top(path), list[PcfixWarning]()
     chosen = top
     if top.root.tag != "chunk":
-        candidates = top.root.findall("chunk") or top.root.findall("chunks/chunk")
         chunks = top.root.find("chunks")
         active = None if chunks is None else chunks.get("active_id")
-        candidates.sort(key=lambda chunk: chunk.get("id") != active)
-        found, lost = [], []
-        for candidate in candidates:
-            try:
-                found.append(top.follow(candidate))
-            except InputError as error:
-                lost.append(error)
+        listed = top.root.findall("chunk") or top.root.findall("chunks/chunk")
+        listed.sort(key=lambda chunk: chunk.get("id") != active)
+        found = [top.follow(chunk) for chunk in listed]
         posed = [one for one in found if one.root.find("cameras//camera/transform") is not None]
-        if not posed and lost:
-            raise lost[0]
         if not found:
             raise checks.no_pose(path, "has no chunk")
         chosen, *others = posed or found[:1]
@@ -202,32 +199,28 @@ def open_chunk(path: Path) -> Chunk:
             sentence = f"several chunks have aligned images; {names[0]} is read. Activate another"
             values = {"chunk": names[0], "others": names[1:]}
             notes = [note(path, "cameras.several_chunks", f"{sentence} for that.", **values)]
-    entries = (*top.root.iterfind("meta/property"), *chosen.root.iterfind("meta/property"))
-    about = {entry.get("name"): entry.get("value", "") for entry in entries}
-    last, first = (about.get(f"Info/{one}SoftwareVersion") for one in ("LastSaved", "Original"))
-    document = top.root.get("version") or chosen.root.get("version")
-    software = f"Agisoft Metashape, document {document}" if document else "Agisoft Metashape"
-    if last or first:
-        program = about.get("Info/OriginalSoftwareName") or "Agisoft Metashape"
-        software = f"{program} {last or first}"
-    return Chunk(path, chosen, software, notes)
+    about = _properties(top.root, "meta") | _properties(chosen.root, "meta")
+    name = about.get("Info/OriginalSoftwareName", "Agisoft Metashape")
+    version = about.get("Info/LastSavedSoftwareVersion") or about.get(
+        "Info/OriginalSoftwareVersion", ""
+    )
+    return Chunk(path, chosen, f"{name} {version}".strip(), notes)
 
 
 def _top(path: Path) -> Document:
     """Return the outermost document; that of a .psx is in the folder beside it."""
     if path.is_dir():
         return _unpacked(path / "project.zip")
-    with path.open("rb") as stream:
-        if stream.read(len(ZIP_MAGIC)) == ZIP_MAGIC:
-            return _unpacked(path)
+    if zipfile.is_zipfile(path):
+        return _unpacked(path)
     root = read_xml(path)
     inside = root.get("path")
-    if root.tag == "document" and inside is not None:
-        archive = Path(inside.replace("{projectname}", path.stem))
-        if archive.is_absolute():
-            raise damaged(path, f"its path '{inside}' leads out of its folder")
-        return _unpacked(path.parent / archive)
-    return Document(root, path)
+    if root.tag != "document" or inside is None:
+        return Document(root, path)
+    archive = Path(inside.replace("{projectname}", path.stem))
+    if archive.is_absolute():
+        raise damaged(path, f"its path '{inside}' leads out of its folder")
+    return _unpacked(path.parent / archive)
 
 
 def _unpacked(path: Path) -> Document:
@@ -264,70 +257,61 @@ def aligned_images(chunk: Chunk) -> tuple[list[Image], tuple[str, ...], list[Pcf
     path, element = chunk.path, chunk.element
     places, _ = _places(path, element)
     sensors = {sensor.get("id"): sensor for sensor in element.iterfind("sensors/sensor")}
-    homes: dict[str, str | None] = {
+    homes: dict[str, str | None] = {  # the component of each image
         number: component.get("id")
         for component in element.iterfind("components/component")
         for ids in component.iter("camera_ids")
         for number in (ids.text or "").split()
     }
-    photos = [
-        (camera.get("id") or f"#{i}", camera)
-        for i, camera in enumerate(
-            one
-            for one in element.iterfind("cameras//camera")
-            if one.get("type", "regular") == "regular"
-        )
-    ]
-    own = {name: _matrix(path, camera) for name, camera in photos if text_of(camera, "transform")}
-    images, why, others = list[Image](), Counter[str](), list[str]()
-    for name, camera in photos:
+    photos = {
+        camera.get("id") or f"#{i}": camera
+        for i, camera in enumerate(element.iterfind("cameras//camera"))
+        if camera.get("type", "regular") == "regular"
+    }
+    own = dict[str, FloatArray]()
+    for name, camera in photos.items():
+        if text := text_of(camera, "transform"):
+            where = f"image {camera.get('label')}"
+            matrix = numbers(path, f"{where}, transform", text, 16).reshape(4, 4)
+            own[name] = _rigid(path, where, matrix[:3, :3], matrix[:3, 3])
+    images, others, unused = list[Image](), list[str](), 0
+    for name, camera in photos.items():
         label = camera.get("label") or f"number {name}"
-        others.append(label)
         master = camera.get("master_id") or ""
-        homes[name] = camera.get("component_id") or homes.get(name) or homes.get(master)
+        home = camera.get("component_id") or homes.get(name) or homes.get(master)
+        homes[name] = home
         sensor, pose = sensors.get(camera.get("sensor_id")), own.get(name)
         if pose is None and master in own and sensor is not None:  # a slave
-            pose = own[master] @ _offset(path, sensor)
-        place = places.get(homes[name], places[None])
-        kind = "frame" if sensor is None else _kind(sensor)
+            where = f"sensor {name_of(sensor)}"  # its place on the master, in the chunk's unit
+            turn, shift = text_of(sensor, "rotation"), text_of(sensor, "location")
+            rotation = numbers(path, where, turn, 9) if turn else np.eye(3)
+            location = numbers(path, where, shift, 3) if shift else np.zeros(3)
+            pose = own[master] @ _rigid(path, where, rotation, location)
+        place = places.get(home, places[None])
         if pose is None:
-            why["not aligned"] += 1
-        elif camera.get("enabled") == "false":
-            why["aligned but disabled"] += 1
-        elif kind not in PROJECTIONS:
-            why[f"of a {kind} sensor, for which there is no lens"] += 1
-        elif place is None:
-            why["in a component that has no transform to the frame of the others"] += 1
+            others.append(label)
         elif sensor is None:
             raise damaged(path, f"sensor {camera.get('sensor_id')} is missing")
+        elif place is None or camera.get("enabled") == "false" or _kind(sensor) not in PROJECTIONS:
+            others.append(label)
+            unused += 1
         else:
-            images.append(Image(name, others.pop(), camera, sensor, homes[name], pose, place))
-    lacking = [f"{why.pop('not aligned', 0)} are not aligned"]
-    lost = [f"{count} images are {reason}" for reason, count in why.items()]
+            images.append(Image(name, label, camera, sensor, home, pose, place))
+    why = "disabled, of a sensor that is no frame or fisheye, or in a component without transform"
     if not images:
-        reasons = ", ".join(lacking + lost)
         named = element.get("label") or "without a name"
-        raise checks.no_pose(path, f"of the {len(photos)} images of chunk {named} {reasons}")
-    notes = [note(path, "cameras.left_out", f"{one}; left out.") for one in lost]
-    return images, tuple(others), notes
+        reason = f"{len(others) - unused} are not aligned, {unused} {why}"
+        raise checks.no_pose(path, f"of the {len(photos)} images of chunk {named} {reason}")
+    left_out = note(path, "cameras.left_out", f"{unused} aligned images are skipped: {why}.")
+    return images, tuple(others), [left_out] if unused else []
 
 
-def _matrix(path: Path, camera: Element) -> FloatArray:
-    """Return camera to chunk, 4x4."""
-    where = f"image {camera.get('label')}"
-    matrix = numbers(path, f"{where}, transform", camera.findtext("transform"), 16).reshape(4, 4)
-    matrix[:3, :3] = checks.rotations(path, [where], matrix[:3, :3])[0]
+def _rigid(path: Path, where: str, rotation: FloatArray, shift: FloatArray) -> FloatArray:
+    """Return the 4x4 matrix of a rotation, rounded in the file, and a translation."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = checks.rotations(path, [where], rotation)[0]
+    matrix[:3, 3] = shift
     return matrix
-
-
-def _offset(path: Path, sensor: Element) -> FloatArray:
-    """Return the matrix from a slave's sensor to its master, in the unit of the chunk."""
-    where, offset = f"sensor {name_of(sensor)}", np.eye(4)
-    if rotation := text_of(sensor, "rotation"):
-        offset[:3, :3] = checks.rotations(path, [where], numbers(path, where, rotation, 9))[0]
-    if location := text_of(sensor, "location"):
-        offset[:3, 3] = numbers(path, where, location, 3)
-    return offset
 
 
 def _places(path: Path, chunk: Element) -> tuple[dict[str | None, FloatArray | None], bool]:
@@ -339,15 +323,17 @@ def _places(path: Path, chunk: Element) -> tuple[dict[str | None, FloatArray | N
     world is the frame of the chunk.
     """
     of_chunk = _similarity(path, chunk.find("transform"))
-    components, parent = chunk.findall("components/component"), chunk.find("components")
-    places = {one.get("id"): _similarity(path, one.find("transform")) for one in components}
+    places: dict[str | None, FloatArray | None] = {
+        one.get("id"): _similarity(path, one.find("transform"))
+        for one in chunk.iterfind("components/component")
+    }
+    has_place = of_chunk is not None or any(place is not None for place in places.values())
+    parent = chunk.find("components")
     active = None if parent is None else parent.get("active_id")
     main = active if active in places else next(iter(places), None)
-    has_place = of_chunk is not None or any(place is not None for place in places.values())
-    of_main = of_chunk if has_place else np.eye(4)
-    if places.get(main) is None:
-        places[main] = of_main
-    places[None] = of_main
+    places[None] = of_chunk if has_place else np.eye(4)
+    if places[main] is None:
+        places[main] = places[None]
     return places, has_place
 
 
@@ -359,13 +345,13 @@ def _similarity(path: Path, element: Element | None) -> FloatArray | None:
     scale, rotation, translation = map(element.findtext, ("scale", "rotation", "translation"))
     if (element.text or "").strip():
         matrix = numbers(path, where, element.text, 16).reshape(4, 4)
-    elif scale is None and rotation is None and translation is None:
+    elif scale is rotation is translation is None:
         return None
     if rotation is not None:
         matrix[:3, :3] = numbers(path, where, rotation, 9).reshape(3, 3)
     if translation is not None:
         matrix[:3, 3] = numbers(path, where, translation, 3)
-    inside = float(np.cbrt(np.linalg.det(matrix[:3, :3]))) if scale is None else 1.0
+    inside = np.cbrt(np.linalg.det(matrix[:3, :3])) if scale is None else 1.0
     size = inside if scale is None else number(path, where, scale)
     if not size > 0.0:
         raise damaged(path, f"{where}: the scale {size:g} is not positive")
@@ -385,21 +371,16 @@ def _world(chunk: Chunk) -> tuple[str, str | None, list[PcfixWarning]]:
         foreign = note(chunk.path, "cameras.local_unit", sentence, unit=unit)
         return LOCAL, None, [] if unit in METRES else [foreign]
     if crs.geodetic_crs is None:
-        remedy = "Set it again in Metashape's reference settings"
-        what = f"the CRS {shortened(text)}, which has no datum,"
-        raise checks.unsupported(chunk.path, what, remedy)
-    base = unbound(crs.geodetic_crs).to_json_dict()
+        raise damaged(chunk.path, f"the CRS {shortened(text)} has no datum")
     axes = [
         {"name": f"Geocentric {a}", "abbreviation": a, "direction": f"geocentric{a}"}
         | {"unit": "metre"}
         for a in "XYZ"
     ]
-    geocentric = {  # on the datum of the CRS, as PROJJSON
-        **{key: base[key] for key in ("$schema", "name", "datum", "datum_ensemble") if key in base},
-        "type": "GeodeticCRS",
-        "coordinate_system": {"subtype": "Cartesian", "axis": axes},
-    }
-    frame = crs_text(type(crs).from_json_dict(geocentric))
+    geocentric = unbound(crs.geodetic_crs).to_json_dict()  # on the datum of the CRS
+    geocentric |= {"coordinate_system": {"subtype": "Cartesian", "axis": axes}}
+    geocentric |= {"type": "GeodeticCRS", "id": None}
+    frame = crs_text(type(crs).from_json_dict({k: v for k, v in geocentric.items() if v}))
     return frame, frame if crs.is_geocentric else text, []
 
 
@@ -436,9 +417,7 @@ def _calibrated(
         given |= {"fx": value["f"] + value["b1"], "fy": value["f"], "skew": value["b2"]}
         given |= {"cx": width / 2.0 + value["cx"], "cy": height / 2.0 + value["cy"]}
     else:  # PhotoScan's
-        focal = given.get("fy", value["fx"])
-        given |= {"fx": given.get("fx", focal), "fy": focal}
-        given |= {"p1": value["p2"], "p2": value["p1"]}
+        given |= {"fy": given.get("fy", value["fx"]), "p1": value["p2"], "p2": value["p1"]}
     return lens_by_name(given, width, height, projection=PROJECTIONS[kind], sensor=sensor)
 
 
@@ -465,7 +444,7 @@ def _lens(path: Path, sensor: Element, image: str) -> tuple[Lens, list[PcfixWarn
     label, found, notes = name_of(sensor), _calibration(sensor), list[PcfixWarning]()
     sizes = [one.find("resolution") for one in (found, sensor) if one is not None]
     resolution = next((one for one in sizes if one is not None), None)
-    stated = {entry.get("name"): entry.get("value") for entry in sensor.iterfind("property")}
+    stated = _properties(sensor)
     pixel_mm, focal_mm = (
         number(path, f"sensor {label}, {name}", stated.get(name, "0"))
         for name in ("pixel_width", "focal_length")
@@ -487,7 +466,7 @@ def _lens(path: Path, sensor: Element, image: str) -> tuple[Lens, list[PcfixWarn
         lens = lens_by_name(given, *size, projection=PROJECTIONS[_kind(sensor)], sensor=label)
         sentence = f"sensor {label} has no calibration; the lens of its data sheet is used."
         notes.append(note(path, "cameras.data_sheet_lens", sentence, sensor=label))
-    return replace(lens, pixel_size_mm=pixel_mm if pixel_mm > 0.0 else None), notes
+    return lens, notes
 
 
 # ---- what was measured ----
@@ -502,31 +481,29 @@ def _gnss_positions(
     when only control points determine the block.
     """
     path, given = chunk.path, [image.element.find("reference") for image in images]
-    ticked = [None if r is None or r.get("enabled") == "false" else r for r in given]
-    used = given if all(reference is None for reference in ticked) else ticked
+    stated = {i: one.attrib for i, one in enumerate(given) if one is not None}
+    ticked = {i: of for i, of in stated.items() if of.get("enabled") != "false"}
     settings = {name.replace("/", "_"): value for name, value in chunk.settings.items()}
     start = spreads(path, "settings of the chunk", settings, DEFAULTS, np.full(3, np.nan))
-    xyz, sigma = np.full((2, len(used), 3), np.nan)
-    for i, reference in enumerate(used):
+    places = {}
+    for i, of in (ticked or stated).items():
         where = f"image {images[i].label}, reference"
-        stated = {} if reference is None else reference.attrib
-        for j, axis in enumerate("xyz"):
-            if axis in stated:
-                xyz[i, j] = number(path, where, stated[axis])
-        sigma[i] = spreads(path, where, stated, SPREADS, start)
-    if not np.isfinite(xyz[:, :2]).all(axis=1).any():
-        return None, []
-    sigma = np.where(np.isfinite(xyz) & (sigma > 0.0), sigma, np.nan)
+        xyz = [number(path, where, of[axis]) if axis in of else np.nan for axis in "xyz"]
+        sigma = spreads(path, where, of, SPREADS, start)
+        places[i] = xyz, np.where(np.isfinite(xyz) & (sigma > 0.0), sigma, np.nan)
     # the CRS of the cameras may differ from that of the chunk
     own, notes = text_of(chunk.element, "camera_reference"), list[PcfixWarning]()
     crs = own or text_of(chunk.element, "reference") or "LOCAL"
-    are_degrees = bool((np.nanmax(np.abs(xyz[:, :2]), axis=0) <= [180.0, 90.0]).all())
+    found = checks.measured(range(len(images)), places, crs)
+    if found is None:
+        return None, []
+    are_degrees = bool((np.nanmax(np.abs(found.xyz[:, :2]), axis=0) <= [180.0, 90.0]).all())
     if crs.upper() == "LOCAL" or is_local(parsed := parse_crs(crs, str(path))):
         crs = LOCAL
     elif are_degrees and not own and not parsed.is_geographic:
         sentence = "the camera positions are degrees in a CRS in metres; WGS 84 is assumed."
         crs, notes = "EPSG:4979", [note(path, "cameras.gnss_in_degrees", sentence)]
-    return GnssPositions(xyz, sigma, crs), notes
+    return replace(found, crs=crs), notes
 
 
 def spreads(
@@ -560,17 +537,12 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """
     chunk = open_chunk(source.path)
     images, frame, seen = aligned_images(chunk)[0], chunk.frame, list[checks.Seen]()
-    if len(images) != len(cameras):
-        raise damaged(chunk.path, f"{len(images)} aligned images, {len(cameras)} cameras")
     if frame is not None:
         row_of = {image.id: i for i, image in enumerate(images)}
         marks = [mark for mark in measured_marks(frame) if mark[1] in row_of]
         names = {name: i for i, name in enumerate(dict.fromkeys(name for name, _, _ in marks))}
-        point, camera = (
-            np.array([(names[name], row_of[one]) for name, one, _ in marks], np.int64)
-            .reshape(-1, 2)
-            .T
-        )
+        point = np.array([names[name] for name, _, _ in marks], np.int64)
+        camera = np.array([row_of[one] for _, one, _ in marks], np.int64)
         uv = np.array([uv for _, _, uv in marks]).reshape(-1, 2)
         markers = checks.Seen(np.full((len(names), 3), np.nan), point, camera, uv)
         seen = [*_tie_points(frame, images), markers]
@@ -604,29 +576,25 @@ def _tie_points(frame: Document, images: list[Image]) -> Iterator[checks.Seen]:
             ]
             if not rows:
                 continue
-            vertices, place = _vertices(archive, points.get("path"), POINTS), images[rows[0]].place
-            xyz = _columns(vertices, "xyz") @ place[:3, :3].T + place[:3, 3]
-            marks = [_vertices(archive, files[images[row].id], MARKS) for row in rows]
-            tracks = np.concatenate([one["id"].astype(np.int64) for one in marks])
-            point = checks.rows_of(tracks, vertices["id"].astype(np.int64))
-            camera = np.repeat(rows, [len(one) for one in marks])
-            uv = np.concatenate([_columns(one, "xy") for one in marks])
-            yield checks.Seen(xyz, point, camera, uv)
+            xyz, tracks = _vertices(archive, points.get("path"), "xyz")
+            place = images[rows[0]].place
+            marks = [_vertices(archive, files[images[row].id], "xy") for row in rows]
+            point = checks.rows_of(np.concatenate([of_track for _, of_track in marks]), tracks)
+            camera = np.repeat(rows, [len(uv) for uv, _ in marks])
+            uv = np.concatenate([uv for uv, _ in marks])
+            yield checks.Seen(xyz @ place[:3, :3].T + place[:3, 3], point, camera, uv)
 
 
-def _columns(vertices: np.ndarray, names: str) -> FloatArray:
-    return np.column_stack([vertices[name] for name in names]).astype(np.float64)
-
-
-def _vertices(archive: zipfile.ZipFile, name: str | None, needed: tuple[str, ...]) -> np.ndarray:
-    """Return the vertices of a binary PLY in an archive, with the properties that are needed."""
+def _vertices(archive: zipfile.ZipFile, name: str | None, axes: str) -> tuple[FloatArray, IntArray]:
+    """Return the coordinates and tracks (id) of a binary PLY in an archive."""
     where, data = f"{archive.filename}: {name}", checks.unpacked(archive, name or "")
     header = parse_header(where, data)
-    kinds = [(p.name, header.order + p.item) for p in header.properties if not p.length]
-    if not header.order or header.skipped or not {*needed} <= dict(kinds).keys():
-        raise damaged(where, f"it is not a binary PLY of vertices with {', '.join(needed)}")
+    kinds = {p.name: header.order + p.item for p in header.properties if not p.length}
+    if not header.order or header.skipped or not {*axes, "id"} <= kinds.keys():
+        raise damaged(where, f"it is not a binary PLY of vertices with {', '.join(axes)}, id")
     with checks.reading(where):
-        vertices = np.frombuffer(data, np.dtype(kinds), header.records, header.end)
-        if vertices["id"].dtype.kind not in "iu":
+        rows = np.frombuffer(data, np.dtype([*kinds.items()]), header.records, header.end)
+        if rows["id"].dtype.kind not in "iu":
             raise damaged(where, "the id is not a whole number")
-    return vertices
+        columns = np.column_stack([rows[axis] for axis in axes]).astype(np.float64)
+    return columns, rows["id"].astype(np.int64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -56,15 +57,12 @@ def likely_mistake(
     for words, moved in _readings(centres, cloud_crs):
         if is_over(moved):
             return f"The cameras would lie over the cloud {words}."
-    span, wide = np.ptp(centres[:, :2], axis=0).max(), max(size[:2].max(), 1e-9)
-    if (np.abs(centres[:, :2]) <= 360.0).all() and 10.0 * span < 1e-2 * wide:
-        return "The cameras look like degrees, the cloud like metres; give --cameras-crs EPSG:4326."
     x, y = (low + high)[:2] / 2.0 - np.median(centres[:, :2], axis=0)
-    apart = np.hypot(x, y)
-    far = f"{apart / 1000.0:,.1f} km" if apart >= 1e4 else f"{apart:.0f} m"
+    span, apart = np.ptp(centres[:, :2], axis=0).max(), float(np.hypot(x, y))
     advice = "check the CRS of both."
-    if 0.2 < span / wide < 5.0:
+    if 0.2 < span / max(size[:2].max(), 1e-9) < 5.0:
         advice = f"perhaps by an offset of {x:.0f}, {y:.0f} m; see --cameras-offset."
+    far = f"{apart / 1000.0:,.1f} km" if apart >= 1e4 else f"{apart:.0f} m"
     return f"The cameras are {far} from the cloud in plan; {advice}"
 
 
@@ -93,12 +91,10 @@ def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str,
                 words = f"UTM zone {near}{side} (the cloud is in {plan.utm_zone}){say}"
                 others.append((words, first + near, centres))
     for words, code, numbers in others:
-        try:
+        with suppress(ProjError):  # of a CRS that is no single map, as all zones of UTM in one
             to_cloud = Transformer.from_crs(code, plan, always_xy=True)
-        except ProjError:  # a CRS that is no single map, as all zones of UTM in one
-            return
-        x, y = to_cloud.transform(numbers[:, 0], numbers[:, 1])  # infinite outside of the CRS
-        yield f"read as {words}", np.column_stack([x, y])
+            x, y = to_cloud.transform(numbers[:, 0], numbers[:, 1])  # infinite outside of the CRS
+            yield f"read as {words}", np.column_stack([x, y])
 
 
 def _wrong_height(middle: float, low: FloatArray, high: FloatArray) -> str | None:
@@ -107,13 +103,14 @@ def _wrong_height(middle: float, low: FloatArray, high: FloatArray) -> str | Non
     limit = ABSURD_HEIGHTS * max(float((high - low)[:2].max()), MARGIN_M)
     if below <= 0.0 and above <= limit:
         return None
-    off = below if below > 0.0 else above - limit
     what = f"{above:.0f} m above the cloud, which is {limit / ABSURD_HEIGHTS:.0f} m wide"
     if below > 0.0:
         what = f"{below:.0f} m below the lowest point of the cloud"
-    if off <= UNDULATION_M[1]:
-        return f"The cameras are {what}: heights above the ellipsoid and geoid are mixed."
-    for words, moved in (("feet", middle * FOOT_M), ("metres, not feet", middle / FOOT_M)):
-        if high[2] < moved < high[2] + limit:
-            return f"The cameras are {what}: their heights are likely in {words}."
-    return f"The cameras are {what}: their heights have another origin; see --cameras-offset."
+    why = "their heights have another origin; see --cameras-offset"
+    if max(below, above - limit) <= UNDULATION_M[1]:
+        why = "heights above the ellipsoid and geoid are mixed"
+    elif high[2] < middle * FOOT_M < high[2] + limit:
+        why = "their heights are likely in feet"
+    elif high[2] < middle / FOOT_M < high[2] + limit:
+        why = "their heights are likely in metres, not feet"
+    return f"The cameras are {what}: {why}."

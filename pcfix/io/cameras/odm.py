@@ -32,7 +32,6 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import bad_file
 from pcfix.io.cameras import checks, opensfm
 from pcfix.io.cameras.checks import AffineFrame, Source, damaged, load_json, note, triple
 from pcfix.io.cameras.lenses import lens_by_name
@@ -130,39 +129,31 @@ def _crs_of(files: Files) -> str | None:
 def named_crs(path: Path) -> str:
     """Return the CRS in the first line of a file: a PROJ string, EPSG:n or WGS84 UTM 16N."""
     text = path.read_bytes()[:4096].decode("utf-8-sig", errors="replace").strip()
-    line = text.partition("\n")[0].strip()
-    crs = checks.utm_as_code(line)
-    if not checks.names_crs(crs):
-        sentence = f"'{line[:80]}' names no CRS. Put its EPSG code there."
-        raise bad_file(path, "cameras.crs", sentence, crs=line)
-    return crs
+    return checks.crs(path, checks.utm_as_code(text.partition("\n")[0].strip()))
 
 
 def _frame(files: Files, found: opensfm.Reconstruction) -> AffineFrame | None:
     """Decide the frame, see the top of this module for the rules; None for OpenSfM's own."""
     crs, reference = _crs_of(files), found.reference
-    whole = None if reference is None else _whole_metres(*reference[:2], crs)
+    whole = None if reference is None else _located(*reference[:2], crs)
     if not (whole or files.keys() & {*_OF_CRS, SHOTS, TOPOCENTRIC}):
         return None
     unmoved = AffineFrame(np.eye(3), np.zeros(3), found.cameras.crs or "", crs)
     if reference is None or found.path.name == TOPOCENTRIC:
         return unmoved
-    path = files.get(TRANSFORMATION)
-    if path is not None:
+    if path := files.get(TRANSFORMATION):
         with checks.reading(path):
             rows = [row.split()[:4] for row in read_lines(path) if row.strip()]
             matrix = np.array(rows, float).reshape(4, 4)
         turn, shift = matrix[:3, :3], matrix[:3, 3]
         if not (np.abs(turn.T @ turn - np.eye(3)).max() <= SCALE_TOLERANCE):
             raise damaged(path, "it does not turn and shift the reconstruction")
-        lat, lon, _ = reference
-        named = _crs_of_place(lon, lat, shift[:2], [crs] if crs else _zones(lat, lon))
-        if named is not None:  # else the file is of another origin
-            return AffineFrame(turn, shift, named)
+        if named := _located(*reference[:2], crs, shift[:2]):  # else the file is of another origin
+            return AffineFrame(turn, shift, named[0])
     if whole is None:
         return unmoved
-    crs, east, north = whole
-    moved = AffineFrame(np.eye(3), np.array([east, north, 0.0]), crs)
+    crs, place = whole
+    moved = AffineFrame(np.eye(3), np.array([*place, 0.0]), crs)
     # centres of shots.geojson, else the GNSS, which stays topocentric, show whether it was moved:
     # the two readings differ by the meridian convergence and the scale
     labels, there = found.cameras.labels, _shots(files[SHOTS]) if SHOTS in files else {}
@@ -182,23 +173,23 @@ def _frame(files: Files, found: opensfm.Reconstruction) -> AffineFrame | None:
     return unmoved._replace(project_crs=crs) if still_m < 0.5 * moved_m else moved
 
 
-def _whole_metres(lat: float, lon: float, crs: str | None) -> tuple[str, float, float] | None:
-    """Return CRS, easting and northing where a reference is at whole metres of both.
+def _located(
+    lat: float, lon: float, crs: str | None, place: FloatArray | None = None
+) -> tuple[str, FloatArray] | None:
+    """Return the CRS in which a place has these coordinates to a metre, and the coordinates.
 
-    The CRS is the one named, or else UTM, the zone of the reference or one beside it.
+    Without `place` they are whole metres. The CRS is the one that is named, or else UTM, the zone
+    of the place or a neighbouring one.
     """
-    for candidate in [crs] if crs else _zones(lat, lon):
-        place = _projected(candidate, lon, lat)
-        east, north = np.round(place).tolist()
-        if np.linalg.norm(place - [east, north]) < WHOLE_M:
-            return candidate, east, north
+    zone = int((lon + 180.0) // 6.0) if np.isfinite(lon) else 0
+    first = 32601 if lat >= 0.0 else 32701
+    zones = [f"EPSG:{first + (zone + step) % 60}" for step in (0, -1, 1)]
+    for candidate in [crs] if crs else zones:
+        there = _projected(candidate, lon, lat)
+        expected, within_m = (np.round(there), WHOLE_M) if place is None else (place, 1.0)
+        if np.linalg.norm(there - expected) < within_m:
+            return candidate, expected
     return None
-
-
-def _crs_of_place(lon: float, lat: float, place: FloatArray, candidates: list[str]) -> str | None:
-    """Return the CRS in which a place has these coordinates, to a metre."""
-    there = ((one, _projected(one, lon, lat) - place) for one in candidates)
-    return next((one for one, off in there if np.linalg.norm(off) < 1.0), None)
 
 
 def _from_topocentric(
@@ -207,12 +198,6 @@ def _from_topocentric(
     """Return topocentric points in a projected CRS, heights on the ellipsoid, shape (n, 3)."""
     degrees = Topocentric(*reference).to_degrees(xyz)
     return np.column_stack([*_projected(crs, *degrees[:, :2].T), degrees[:, 2]])
-
-
-def _zones(lat: float, lon: float) -> list[str]:
-    zone = int((lon + 180.0) // 6.0) if np.isfinite(lon) else 0
-    first = 32601 if lat >= 0.0 else 32701
-    return [f"EPSG:{first + (zone + step) % 60}" for step in (0, -1, 1)]
 
 
 def _projected(crs: str, lon: float | FloatArray, lat: float | FloatArray) -> FloatArray:
@@ -228,7 +213,8 @@ def _read_shots(files: Files) -> Cameras:
     centres = np.array([triple(shot["translation"]) for shot in each])
     if crs is None and (place := (next(iter(each))["geometry"] or {}).get("coordinates")):
         lon, lat, _ = triple(place).tolist()  # a project without GNSS has made-up coordinates
-        crs = _crs_of_place(lon, lat, centres[0, :2], _zones(lat, lon))
+        named = _located(lat, lon, None, centres[0, :2])
+        crs = None if named is None else named[0]
     # the lens is that of the camera that the shot names, or else of the only one that is alike
     known = {}
     if beside := files.get("cameras.json"):

@@ -17,37 +17,24 @@ Of the interior orientation, `focal`, `focal_x`, `focal_y`, `c_x` and `c_y` are 
 larger side too, from the centre of the image. The tangential terms follow OpenCV (p1 with 2 x y in
 x). Distortion acts on the projected coordinates, which are angles for the fisheye models.
 
-When a block is written, cameras in a projected CRS are taken to the axes east, north, up at the
-middle of the block, at height 0, by the inverse of what `georeference` does on reading. Heights are
-taken as ellipsoidal where the CRS does not say what they are. Cameras in no CRS keep their numbers,
-and no reference is written.
-
 References: "Reconstruction file", "Coordinate Systems" and "Rig Models" in the manual,
 https://opensfm.org/docs.
 """
 
 from __future__ import annotations
 
-import json
 import re
-from collections import Counter
-from dataclasses import astuple, replace
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import bad_file
-from pcfix.io import crs as systems
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import NO_TIE_POINTS, are_seen
-from pcfix.io.cameras.georeference import frame_of, georeference, is_tied
-from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
+from pcfix.io.cameras.lenses import LensModel, lens_by_name
 from pcfix.io.labels import unnamed
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
-from pcfix.options.declare import File
 
 _KEYS = "cameras|shots|points|pano_shots|reference_lla|biases|rig_cameras|rig_instances"
 HEAD = re.compile(rf'\[\s*\{{\s*"({_KEYS})"\s*:\s*\{{')
@@ -249,115 +236,3 @@ def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
     given |= {"cx": width / 2.0 + value("c_x") * scale, "cy": height / 2.0 + value("c_y") * scale}
     projection = _MODELS[model].projection
     return lens_by_name(given, width, height, projection=projection, sensor=name)
-
-
-TRACKS_HEADER = "OPENSFM_TRACKS_VERSION_v2"
-GREY = (128, 128, 128)
-FEATURE_SCALE = 0.001
-"""Of a feature, in units of the larger side; OpenSfM wants some number."""
-
-
-def write_opensfm(path: File, cameras: Cameras, tie_points: TiePoints | None = None) -> None:
-    """Write a block as an OpenSfM reconstruction.
-
-    Parameters
-    ----------
-    path : path
-        Of the reconstruction, usually ``reconstruction.json``; ``tracks.csv`` (with tie points)
-        and ``reference_lla.json`` (with a CRS) go beside it.
-    cameras : Cameras
-        With rotations, lenses in pixels, and labels that are all different; in a projected CRS,
-        topocentric, or in none.
-    tie_points : TiePoints, optional
-        In the frame of the cameras; those without a position or without a view are left out.
-    """
-    target = Path(path)
-    times = Counter(cameras.labels)  # they are keys in the file
-    _, lenses = checks.block_to_write(
-        target, cameras, lambda label: times[label] == 1 and not {"\t", "\n"} & {*label}
-    )
-    models = {each: opensfm_camera(target, each) for each in dict.fromkeys(lenses)}
-    names = {each: f"pcfix {i}" for i, each in enumerate(models, start=1)}
-    ties = tie_points or NO_TIE_POINTS
-    kept = np.flatnonzero(are_seen(ties))
-    from scipy.spatial.transform import Rotation
-
-    there, points, place = _world(cameras, ties.xyz[kept], str(target))
-    rotations = np.asarray(there.rotations)
-    turns = Rotation.from_matrix(rotations).as_rotvec()
-    shifts = -np.einsum("kij,kj->ki", rotations, there.centres)
-    chosen: dict[str, Any] = {
-        "cameras": {names[each]: model for each, model in models.items()},
-        "shots": {
-            label: {"rotation": turn, "translation": shift, "camera": names[one]}
-            for label, turn, shift, one in zip(
-                cameras.labels, turns.tolist(), shifts.tolist(), lenses, strict=True
-            )
-        },
-        "points": {
-            str(i): {"color": list(GREY), "coordinates": row}
-            for i, row in enumerate(points.tolist())
-        },
-    }
-    texts = {}
-    if place is not None:
-        keys = ("latitude", "longitude", "altitude")
-        chosen["reference_lla"] = dict(zip(keys, astuple(place), strict=True))
-        texts["reference_lla.json"] = json.dumps(chosen["reference_lla"], indent=2) + "\n"
-    if tie_points is not None:
-        views, feature = tie_points.views, np.zeros(len(cameras), np.int64)
-        size = np.array([(lens.width, lens.height) for lens in lenses])[views.camera]
-        xy = (tie_points.image_xy - size / 2.0) / size.max(axis=1, initial=1.0)[:, None]
-        rest = "\t".join(map(str, (FEATURE_SCALE, *GREY, -1, -1)))
-        lines = [TRACKS_HEADER]
-        for track, row in enumerate(kept.tolist()):
-            for i in range(views.start[row], views.start[row + 1]):
-                camera, (x, y) = views.camera[i], xy[i].tolist()
-                image = f"{cameras.labels[camera]}\t{track}\t{feature[camera]}"
-                lines.append(f"{image}\t{x!r}\t{y!r}\t{rest}")
-                feature[camera] += 1  # features count from 0 in each image
-        texts["tracks.csv"] = "\n".join(lines) + "\n"
-    texts[target.name] = json.dumps([chosen]) + "\n"
-    checks.write_new(target.parent, {name: text.encode() for name, text in texts.items()})
-
-
-def opensfm_camera(path: Path, given: Lens) -> dict[str, Any]:
-    """Return the simplest entry of `cameras` that is exactly this lens."""
-    written = {k: model for k, model in _MODELS.items() if k not in ("simple_radial", "radial")}
-    model, values = model_of(path, given, written, whole=True)
-    scale, start = max(given.width, given.height), {"cx": given.width / 2, "cy": given.height / 2}
-    for name in values.keys() & {"f", "fx", "fy", "cx", "cy"}:
-        values[name] = (values[name] - start.get(name, 0.0)) / scale
-    size = {"width": int(given.width), "height": int(given.height)}
-    named = {_NAMES.get(name, name): value for name, value in values.items()}
-    return {"projection_type": model, **size, **named}
-
-
-def _world(
-    cameras: Cameras, points: FloatArray, name: str
-) -> tuple[Cameras, FloatArray, systems.Topocentric | None]:
-    """Return cameras and points in the world of the file, and its origin where it has one.
-
-    From a projected CRS they go to axes east, north, up at the middle of the block.
-    """
-    if cameras.crs is None or not is_tied(cameras.crs, name):
-        return cameras, points, None
-    if systems.is_topocentric(cameras.crs):
-        return cameras, points, systems.Topocentric.from_text(cameras.crs, name)
-    source = frame_of(cameras.crs, name).crs
-    if not systems.parse_crs(cameras.crs, name).is_projected:
-        sentence = f"the cameras are in {systems.shortened(cameras.crs)}."
-        sentence += " Bring them to a projected CRS."
-        raise bad_file(name, "output.crs", sentence, crs=cameras.crs)
-    geographic = systems.parse_crs(systems.GEOGRAPHIC_WGS84, name)
-    stated = systems.heights_of(source) != "unstated"
-    to_degrees, _ = systems.transformation(
-        source, geographic, cameras.centres, name, heights=stated
-    )
-    longitude, latitude, _ = to_degrees(np.median(cameras.centres, axis=0)[None])[0].tolist()
-    place = systems.Topocentric(latitude, longitude, 0.0)
-    centres, points = (place.from_degrees(to_degrees(xyz)) for xyz in (cameras.centres, points))
-    text = "ENU:" + ",".join(map(repr, astuple(place)))
-    there = replace(cameras, centres=centres, crs=text, project_crs=None, gnss=None)
-    turns = georeference(there, cameras.crs, name=name).turns(centres)
-    return replace(there, rotations=np.asarray(cameras.rotations) @ turns), points, place

@@ -59,7 +59,7 @@ def read(source: Source) -> Cameras:
     project = _open_project(source.path)
     path, calibrated = project.part("calibration", "calibrated-cameras")
     _, given = project.part("input_cameras", "input-cameras", needed=False)
-    (frame, of_frame), names = _frame_of(project), dict[int, str]()
+    (frame, notes), names = _frame_of(project), dict[int, str]()
     for listed in project.files("camera_list", FORMAT.format("camera-list")):
         for camera in load_json(listed)["cameras"] if listed.is_file() else []:
             name = camera["uri"].replace("\\", "/").rpartition("/")[2]
@@ -74,25 +74,20 @@ def read(source: Source) -> Cameras:
         for sensor in calibrated["sensors"]
         if "image_size_px" in sensors.get(sensor["id"], {})
     }
-    used, notes = [shot["sensor_id"] for shot in calibrated["cameras"]], []
-    lost = [i for i in used if i not in known]
-    if lost:
-        why = f"the input cameras have no frame of sensor {lost[0]}"
-        notes.append(checks.without_lens(path, why))
-    captured = [
-        shot["id"] for capture in given.get("captures", []) for shot in capture.get("cameras", [])
-    ]
+    lenses = [known.get(shot["sensor_id"]) for shot in shots.values()]
+    captures = given.get("captures", [])
+    captured = [shot["id"] for capture in captures for shot in capture.get("cameras", [])]
     return Cameras(
         labels=labels,
         centres=frame.points(xyz),
         rotations=from_omega_phi_kappa(*angles.T) if len(shots) else None,
-        lenses=None if lost else tuple(known[i] for i in used) or None,
+        lenses=tuple(one for one in lenses if one) if lenses and all(lenses) else None,
         crs=frame.crs,
         project_crs=frame.project_crs,
-        notes=(*of_frame, *notes, *checks.repeated(path, labels)),
-        gnss=_gnss(path, given, list(shots)),
+        notes=(*notes, *checks.repeated(path, labels)),
+        gnss=_gnss(path, captures, list(shots)),
         unposed=tuple(names.get(i, f"camera {i}") for i in captured if i not in shots),
-        source=" ".join(["OPF", *project.generator]),
+        source=project.generator,
     )
 
 
@@ -101,7 +96,7 @@ class Project(NamedTuple):
 
     path: Path
     items: list[Part]
-    generator: tuple[str, ...]
+    generator: str
 
     def files(self, kind: str, form: str) -> list[Path]:
         """Return the files of a format that items of a kind have."""
@@ -131,8 +126,8 @@ def _open_project(path: Path) -> Project:
         content = load_json(path)
         if content.get("format") == PROJECT:
             generator = content.get("generator", {})
-            said = tuple(str(generator[name]) for name in ("name", "version") if name in generator)
-            return Project(path, content["items"], said)
+            words = ("OPF", generator.get("name", ""), generator.get("version", ""))
+            return Project(path, content["items"], " ".join(map(str, words)).strip())
         above = path.resolve().parent
         found = [*sorted(above.glob("*.opf")), *sorted(above.parent.glob("*.opf"))]
     if len(found) != 1 or found[0] == path:
@@ -181,29 +176,28 @@ def _lens(path: Path, sensor: Part, given: Part) -> Lens:
         values |= zip(("p2", "p1"), map(float, inner["tangential_distortion"]), strict=True)
         lens = lens_by_name(values, *frame)
     elif inner.get("type") == "fisheye":
-        affine, polynomial = (tuple(map(float, inner[k])) for k in ("affine", "polynomial"))
-        lens = fisheye(values, affine, polynomial, *frame)
+        values |= zip(("fx", "skew", "b3", "fy"), map(float, inner["affine"]), strict=True)
+        lens = fisheye(values, [float(one) for one in inner["polynomial"]], *frame)
     else:
         what = f"the type {inner.get('type')!r:.40} of sensor {name}"
         remedy = "Leave its images out and calibrate again"
         raise checks.unsupported(path, what, remedy, sensor=name)
-    pixel_um = float(given.get("pixel_size_um", 0))
-    return replace(lens, sensor=name, pixel_size_mm=pixel_um / 1000.0 if pixel_um > 0.0 else None)
+    return replace(lens, sensor=name)
 
 
-def _gnss(path: Path, given: Part, ids: list[int]) -> GnssPositions | None:
+def _gnss(path: Path, captures: list[Part], ids: list[int]) -> GnssPositions | None:
     """Return where captures were taken, at their reference cameras, in the CRS of the first."""
     found = {
         capture["reference_camera_id"]: capture["geolocation"]
-        for capture in given.get("captures", [])
+        for capture in captures
         if capture.get("geolocation") and capture.get("reference_camera_id") in ids
     }
     text = next((place["crs"]["definition"] for place in found.values()), "local")
     if checks.crs(path, text) == "local":
         return None
-    crs = parse_crs(text, str(path))
-    order = [1, 0, 2] if crs.axis_info[0].direction.lower() == "north" else [0, 1, 2]
     said, up_m = _with_heights(text, str(path))
+    crs = parse_crs(said, str(path))
+    order = [1, 0, 2] if crs.axis_info[0].direction.lower() == "north" else [0, 1, 2]
     unit_m = 1.0 if crs.is_geographic else plan_unit(crs)[1]
     places = {
         i: (triple(p["coordinates"])[order] * [1.0, 1.0, up_m], triple(p["sigmas"])[order] * unit_m)
@@ -225,8 +219,8 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     row_of = {shot["id"]: i for i, shot in enumerate(calibrated["cameras"])}
     models = project.files("calibration", "model/gltf+json")
     found = [node for model in models for node in _nodes(model, row_of)]
-    if not any((node.camera >= 0).any() for node in found):
-        raise checks.no_tie_points(project.path, "its calibration has no tracks in its images")
+    if not found:
+        raise checks.no_tie_points(project.path, "its calibration has no tracks")
     frame, _ = _frame_of(project)
     return checks.tie_points(*(node._replace(xyz=frame.points(node.xyz)) for node in found))
 

@@ -25,7 +25,6 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import NamedTuple
 
@@ -33,7 +32,7 @@ import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Source, damaged, note, number, read_xml
+from pcfix.io.cameras.checks import Source, damaged, note, number, numbers, read_xml
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_omega_phi_kappa
@@ -57,26 +56,26 @@ HEADERS = (
     ["imagename", "x", "y", "z", "omega", "phi", "kappa"],
     ["imagename", "longitude", "latitude", "altitude", "omega", "phi", "kappa"],
 )
-FOLDERS = ("params", "1_initial/params", "*/params", "*/1_initial/params")
-"""Where a project may have its files, if not in its folder itself."""
+FOLDERS = ("", "params", "1_initial/params", "*/params", "*/1_initial/params")
+"""Where a project may have its files, seen from its folder."""
 Files = dict[str, Path]
 """The files of a project that are there, by the names in `NAMES`, and ``project``."""
 FIELDS = {
-    "camera matrix": "matrix",
-    "radial": "radial",
-    "tangential": "tangential",
-    "affine": "affine",
+    "camera matrix": "fx skew cx b3 fy cy - - -",
+    "radial": "k1 k2 k3",
+    "tangential": "p2 p1",
+    "affine": "fx skew b3 fy",
     "polynomial": "polynomial",
-    "principal": "principal",
+    "principal": "cx cy",
     "position": "centre",
     "rotation": "rotation",
 }
+"""What the header of the camera parameters says, and the names of the numbers in `lenses`."""
 SHAPE = re.compile(r"^(.*?)\s*\[\s*(\d{1,2})\s*x\s*(\d{1,2})\s*\]\s*$")
 SENSOR = re.compile(r"sensor width of\s*([-+.\deE]+)\s*x\s*([-+.\deE]+)")
+CALIBRATION = re.compile(r"(?im)^pix4d camera calibration file.*$")
 PRIORS = {"xyz": ("x", "y", "z"), "gps": ("lng", "lat", "alt")}
 """Elements with the initial position of an image, and their attributes."""
-SAME_FOCAL = 1e-6
-"""Relative: the two files write the same number in pixels and in millimetres."""
 
 
 def recognises(source: Source) -> bool:
@@ -90,35 +89,37 @@ def read(source: Source) -> Cameras:
     """Read poses and lenses, in the CRS of the project."""
     files = _find(source)
     calibrations = read_calibrations(files["calibration"]) if "calibration" in files else []
+    calibration = calibrations[0] if len(calibrations) == 1 else None
     notes: tuple[PcfixWarning, ...] = ()
     if "parameters" in files:
-        path, images = files["parameters"], read_parameters(files["parameters"])
-        labels = [image.label for image in images]
+        images = read_parameters(files["parameters"])
+        labels = names = [image.label for image in images]
         turns = np.array([image.fields["rotation"] for image in images]).reshape(-1, 3, 3)
-        turns = checks.rotations(path, labels, turns)
+        rotations = checks.rotations(files["parameters"], labels, turns)
         if "external" in files:
             names, there, turned = read_external(files["external"])
-            rows = _rows(labels, names, (turns, turned))
+            rows = _rows(labels, names, (rotations, turned))
             if max(rows) < 0:
                 raise damaged(files["external"], f"names none of the images of {PARAMETERS}")
             centres, rotations = there[rows], turned[rows]
             centres[np.array(rows) < 0] = np.nan
         else:
-            names, (centres, notes) = labels, _absolute(files, images)
-            rotations = turns
+            centres = np.array([image.fields["centre"] for image in images])
+            if "offset" in files:
+                centres += _offset(files["offset"])
+            else:
+                sentence = "there is no offset.xyz next to it. Give the offset by --cameras-offset."
+                notes = (note(files["parameters"], "cameras.no_offset", sentence),)
         posed = np.flatnonzero(np.isfinite(centres).all(axis=1))
         given = [*labels, *names]
         labels, centres, rotations = [labels[i] for i in posed], centres[posed], rotations[posed]
-        own = [lens_of_image(images[i], calibrations) for i in posed]
+        own = [lens_of_image(images[i], calibration) for i in posed]
     elif "external" in files:
         labels, centres, rotations = read_external(files["external"])
-        lens = lens_of_calibration(calibrations[0]) if len(calibrations) == 1 else None
-        own, given = [lens] * len(labels), labels
-        why = f"there is no {PARAMETERS} beside it"
-        notes = () if lens else (checks.without_lens(files["external"], why),)
+        own, given = [lens_of_calibration(calibration)] * len(labels), labels
     else:
-        remedy = "Give the params folder of the project; the table in WGS 84 does not suffice"
-        raise checks.missing(source.path.with_name(PARAMETERS), remedy)
+        sentence = f"{PARAMETERS} is missing. Give the params folder of the project."
+        raise bad_file(source.path, "cameras.missing_file", sentence)
     lenses = tuple(lens for lens in own if lens is not None)
     gnss, enabled = _priors(files["project"], labels) if "project" in files else (None, [])
     wkt = " ".join(read_lines(files["wkt"])).strip() if "wkt" in files else ""
@@ -148,21 +149,21 @@ def _find(source: Source) -> Files:
     path, columns = source.path, _columns(source)
     is_project = b"<pix4uav" in source.head
     if is_project or path.is_dir():
-        tables_there = _tables_in(path.with_suffix("") if is_project else path)
+        tables = _tables_in(path.with_suffix("") if is_project else path)
     else:
         found = TABLE.fullmatch(path.name)
-        tables_there = [(path.parent, found[1] if found else "")]
-    if not tables_there:
+        tables = [(path.parent, found[1] if found else "")]
+    if not tables:
         return {}
-    folder, prefix = tables_there[0]
-    prefixes = {one for where, one in tables_there if where == folder}
+    folder, prefix = tables[0]
+    prefixes = {one for where, one in tables if where == folder}
     if len(prefixes) > 1:
         sentence = f"holds several projects ({', '.join(sorted(prefixes))}). Give one file."
         raise bad_file(folder, "cameras.several_projects", sentence, projects=len(prefixes))
     root = folder.resolve().parent.parent
     files = {kind: folder / (prefix + name) for kind, name in NAMES.items()}
-    project = root / f"{prefix.rstrip('_')}.p4d"
-    files["project"] = project if project.is_file() else root.parent / f"{root.name}.p4d"
+    inside = root / f"{prefix.rstrip('_')}.p4d"
+    files["project"] = inside if inside.is_file() else root.parent / f"{root.name}.p4d"
     if is_project:
         files["project"] = path
     elif columns[:1] == ["filename"]:
@@ -174,7 +175,7 @@ def _find(source: Source) -> Files:
 
 def _tables_in(root: Path) -> list[tuple[Path, str]]:
     """Return folders with tables of poses, and the name of the project before that of each."""
-    folders = [root, *(folder for pattern in FOLDERS for folder in sorted(root.glob(pattern)))]
+    folders = [f for one in FOLDERS for f in (sorted(root.glob(one)) if one else [root])]
     return [
         (folder, found[1])
         for folder in folders
@@ -203,18 +204,13 @@ def _rows(
     return found
 
 
-def _absolute(files: Files, images: list[Image]) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
-    """Return the centres with the offset added."""
-    local = np.array([image.fields["centre"] for image in images])
-    if "offset" not in files:
-        sentence = "there is no offset.xyz beside it. Give the offset with --cameras-offset."
-        return local, (note(files["parameters"], "cameras.no_offset", sentence),)
-    # one line, or one for each group of images
-    lines = [line.replace(",", " ").split()[-3:] for line in read_lines(files["offset"])]
-    offsets = {tuple(_numbers(files["offset"], "the offset", line)) for line in lines if line}
-    if len(offsets) != 1 or len(offset := offsets.pop()) != 3:
-        raise damaged(files["offset"], "it should have one offset x y z")
-    return local + offset, ()
+def _offset(path: Path) -> FloatArray:
+    """Read the offset: one line, or the same one for each group of images."""
+    lines = [line.replace(",", " ").split()[-3:] for line in read_lines(path) if line.strip()]
+    offsets = np.array([numbers(path, "the offset", " ".join(line), 3) for line in lines])
+    if not len(offsets) or (offsets != offsets[0]).any():
+        raise damaged(path, "it should have one offset x y z")
+    return offsets[0]
 
 
 def _priors(path: Path, labels: list[str]) -> tuple[GnssPositions | None, list[str]]:
@@ -229,27 +225,25 @@ def _priors(path: Path, labels: list[str]) -> tuple[GnssPositions | None, list[s
         if image.get("path") and image.get("enabled", "true").lower() != "false"
     ]
     names = [PureWindowsPath(image.get("path", "")).name for image in images]
-    rows = _rows(labels, names)
-    known = [images[row] for row in rows if row >= 0]
-    kinds = [kind for image in known for kind in PRIORS if image.find(kind) is not None]
-    if not kinds:
-        return None, names
-    kind, axes = kinds[0], PRIORS[kinds[0]]
-    xyz, sigma_m = np.full((2, len(labels), 3), np.nan)
-    for i, row in enumerate(rows):
-        position = images[row].find(kind) if row >= 0 else None
-        if position is None:
-            continue
-        where = f"image {labels[i]}, "
-        xyz[i] = [number(path, where + kind, position.get(axis)) for axis in axes]
-        for tag, columns in (("toleranceXY", slice(2)), ("toleranceZ", slice(2, 3))):
-            if (tolerance := images[row].find(tag)) is not None:
-                sigma_m[i, columns] = number(path, where + tag, tolerance.get("value"))
-    if kind == "gps":
-        return GnssPositions(xyz, sigma_m, "EPSG:4326"), names
-    wkt = next((e for e in root.iter() if str(e.tag).lower() in ("wktimage", "wktimages")), None)
-    text = "" if wkt is None else wkt.get("value") or wkt.text or ""
-    return GnssPositions(xyz, sigma_m, checks.crs(path, text) if text.strip() else None), names
+    of_row = {i: images[row] for i, row in enumerate(_rows(labels, names)) if row >= 0}
+    kinds = [kind for image in of_row.values() for kind in PRIORS if image.find(kind) is not None]
+    places = {}
+    for i, image in of_row.items():
+        position = image.find(kinds[0]) if kinds else None
+        if position is not None:
+            where = f"image {labels[i]}, "
+            stated = [image.find(f"tolerance{axes}") for axes in ("XY", "XY", "Z")]
+            sigma = [
+                np.nan if e is None else number(path, where + e.tag, e.get("value")) for e in stated
+            ]
+            axes = PRIORS[kinds[0]]
+            places[i] = [number(path, where + axis, position.get(axis)) for axis in axes], sigma
+    crs: str | None = "EPSG:4326"
+    if kinds and kinds[0] == "xyz":
+        found = [e for e in root.iter() if str(e.tag).lower() in ("wktimage", "wktimages")]
+        text = (found[0].get("value") or found[0].text or "").strip() if found else ""
+        crs = checks.crs(path, text) if text else None
+    return checks.measured(range(len(labels)), places, crs), names
 
 
 class Image(NamedTuple):
@@ -283,10 +277,9 @@ def read_parameters(path: Path) -> list[Image]:
         while len(words_of) < ends[-1] and row < len(lines):
             words_of += lines[row].split()
             row += 1
-        if len(words_of) != ends[-1]:
-            raise damaged(path, f"image {label}: {len(words_of)} numbers instead of {ends[-1]}")
-        width, height = _numbers(path, f"image {label}", size)
-        parts = np.split(_numbers(path, f"image {label}", words_of), ends[:-1])
+        width, height = numbers(path, f"image {label}", " ".join(size), 2)
+        values = numbers(path, f"image {label}", " ".join(words_of), ends[-1])
+        parts = np.split(values, ends[:-1])
         fields = {name: part for (name, _), part in zip(layout, parts, strict=True) if name}
         images.append(Image(label.strip(), float(width), float(height), fields))
     if not images:
@@ -294,96 +287,76 @@ def read_parameters(path: Path) -> list[Image]:
     return images
 
 
-def _numbers(path: Path, where: str, words: list[str]) -> FloatArray:
-    return np.array([number(path, where, word) for word in words])
-
-
 def read_external(path: Path) -> tuple[list[str], FloatArray, FloatArray]:
     """Read the absolute table: labels, centres (k, 3) and rotations (k, 3, 3)."""
     rows = [line.rsplit(None, 6) for line in read_lines(path)[1:] if line.strip()]
     if not rows:
         raise damaged(path, "has a header but no images")
-    values = np.array([_numbers(path, f"image {row[0]}", row[1:]) for row in rows])
+    values = np.array([numbers(path, f"image {row[0]}", " ".join(row[1:]), 6) for row in rows])
     rotations = from_omega_phi_kappa(*values[:, 3:].T)
     return [row[0].strip() for row in rows], values[:, :3], rotations
 
 
 Calibration = dict[str, float]
+"""The first number of each line by its name, and `width`, `height` of the sensor, mm."""
 
 
 def read_calibrations(path: Path) -> list[Calibration]:
-    """Read the cameras of a ``pix4d_..._internal_camera_parameters.cam``.
-
-    Of each come the first number of each line by its name, and `width`, `height` of the sensor, mm.
-    """
+    """Read the cameras of a ``pix4d_..._internal_camera_parameters.cam``."""
     cameras: list[Calibration] = []
-    for line in read_lines(path):
-        words = line.split()
-        if line.lower().startswith("pix4d camera calibration file"):
-            cameras.append({"width": 0.0, "height": 0.0})
-        elif cameras and (match := SENSOR.search(line)):
-            width, height = _numbers(path, "the sensor size", [match[1], match[2]]).tolist()
-            cameras[-1] |= {"width": width, "height": height}
-        elif cameras and len(words) > 1 and not line.startswith("#"):
-            value = number(path, f"camera {len(cameras) - 1}, {words[0]}", words[1])
-            cameras[-1][words[0].lower()] = value
+    for text in CALIBRATION.split("\n".join(read_lines(path)))[1:]:
+        size, rows = SENSOR.search(text), [line.split() for line in text.splitlines()]
+        sides = " ".join(size.groups()) if size else "0 0"
+        given = dict(zip(("width", "height"), numbers(path, "sensor", sides, 2), strict=True))
+        for name, *values in filter(None, rows):
+            if values and not name.startswith("#"):
+                given[name.lower()] = number(path, f"camera {len(cameras)}, {name}", values[0])
+        cameras.append(given)
     return cameras
 
 
-def lens_of_image(image: Image, calibrations: list[Calibration]) -> Lens | None:
+def lens_of_image(image: Image, calibration: Calibration | None) -> Lens | None:
     """Return the lens in pixels, from the block of the image or the only calibration."""
-    fields: dict[str, list[float]] = {k: v.tolist() for k, v in image.fields.items()}
-    given, frame = {}, (image.width, image.height)
-    if "matrix" in fields:
-        given = dict(zip(("fx", "skew", "cx", "b3", "fy", "cy"), fields["matrix"], strict=False))
-    given |= dict(zip(("cx", "cy"), fields.get("principal", ()), strict=False))
-    if {"affine", "polynomial"} <= fields.keys() and given:
-        lens = fisheye(given, fields["affine"], fields["polynomial"], *frame)
-    elif "matrix" in fields:
-        given |= {f"k{i}": k for i, k in enumerate(fields.get("radial", ()), start=1)}
-        given |= dict(zip(("p2", "p1"), fields.get("tangential", ()), strict=False))
-        lens = lens_by_name(given, *frame)
-    else:
-        return lens_of_calibration(calibrations[0], image) if len(calibrations) == 1 else None
-    for calibration in calibrations:  # the pixel size is that of the one with the focal length
-        pixel, focal_mm = calibration["width"] / lens.width, calibration.get("f", 0.0)
-        is_fisheye = "c" in calibration
-        expected = focal_mm if is_fisheye else focal_mm / pixel if pixel > 0.0 else 0.0
-        if abs(expected - lens.focal) <= SAME_FOCAL * lens.focal:
-            return replace(lens, pixel_size_mm=pixel)
-    return lens
+    given: dict[str, float] = {}
+    for names, values in image.fields.items():
+        if names in FIELDS.values():
+            given |= dict(zip(names.split(), values.tolist(), strict=False))
+    size = image.width, image.height
+    if "polynomial" in image.fields and "fx" in given:
+        return fisheye(given, image.fields["polynomial"].tolist(), *size)
+    return lens_by_name(given, *size) if "fx" in given else lens_of_calibration(calibration, size)
 
 
-def fisheye(
-    middle: dict[str, float], affine: Sequence[float], shape: Sequence[float], *frame: float
-) -> Lens:
-    """Return the lens (u, v) = (cx, cy) + [c d; e f] rho, rho a polynomial of 2 theta / pi."""
-    given = middle | dict(zip(("fx", "skew", "b3", "fy"), affine, strict=True))
+def fisheye(given: dict[str, float], shape: Sequence[float], *frame: float) -> Lens:
+    """Return the lens (u, v) = (cx, cy) + [c d; e f] rho, rho a polynomial of 2 theta / pi.
+
+    The matrix is given as fx, skew, b3, fy.
+    """
     return lens_by_name(given, *frame, projection="polynomial", shape=tuple(shape))
 
 
-def lens_of_calibration(calibration: Calibration, image: Image | None = None) -> Lens | None:
-    """Return the lens of a calibration: in pixels where an image tells how many, else in mm.
+def lens_of_calibration(
+    calibration: Calibration | None, size: tuple[float, float] | None = None
+) -> Lens | None:
+    """Return the lens of a calibration: in pixels where the size of the image is known, else in mm.
 
-    A fisheye needs the image, as its matrix is in pixels and its principal point in mm. None
-    where the calibration does not say enough.
+    None where the calibration does not say enough: a fisheye needs the size of the image, as its
+    matrix is in pixels and its principal point in mm.
     """
-    value, is_fisheye = defaultdict(float, {"p1": 1.0} | calibration), "c" in calibration
-    size_mm = value["width"], value["height"]
-    known = {"px", "py", "f"} <= calibration.keys() and min(size_mm) > 0.0
-    if not known or (is_fisheye and image is None):
+    if calibration is None or not {"px", "py", "f"} <= calibration.keys():
         return None
-    scale, size = 1.0, size_mm
-    if image is not None:
-        scale, size = image.width / size_mm[0], (image.width, image.height)
+    value, size_mm = defaultdict(float, calibration), (calibration["width"], calibration["height"])
+    if not min(size_mm) > 0.0 or ("c" in value and size is None):
+        return None
+    scale = 1.0 if size is None else size[0] / size_mm[0]
     given = {"cx": value["px"] * scale, "cy": value["py"] * scale}
-    if is_fisheye:
-        affine, shape = ([value[n] for n in t.split()] for t in ("c d e f", "p0 p1 p2 p3 p4"))
-        lens = fisheye(given, affine, shape, *size)
-    else:
-        given |= {"f": value["f"] * scale, "p1": value["t2"], "p2": value["t1"]}
-        lens = lens_by_name(given | {k: value[k] for k in ("k1", "k2", "k3")}, *size)
-    return replace(lens, unit="mm") if image is None else replace(lens, pixel_size_mm=1.0 / scale)
+    if "c" in value:
+        given |= {"fx": value["c"], "skew": value["d"], "b3": value["e"], "fy": value["f"]}
+        shape = [value["p0"], calibration.get("p1", 1.0), *(value[f"p{i}"] for i in (2, 3, 4))]
+        return fisheye(given, shape, *(size or size_mm))
+    given |= {"f": value["f"] * scale, "p1": value["t2"], "p2": value["t1"]}
+    given |= {k: value[k] for k in ("k1", "k2", "k3")}
+    return lens_by_name(given, *(size or size_mm), unit="mm" if size is None else "px")
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:

@@ -36,7 +36,7 @@ import numpy as np
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, image_size, number, numbers, read_xml
 from pcfix.io.cameras.lenses import lens_by_name
-from pcfix.io.cameras.sensor import read_sensor
+from pcfix.io.cameras.sensor import read_frame, sensor_file
 from pcfix.model import Cameras, Lens
 
 NAMESPACE = "http://www.capturingreality.com/ns/xcr/"
@@ -73,14 +73,10 @@ def read(source: Source) -> Cameras:
     posed = {f: of for f, of in images.items() if {"Rotation", "Position"} <= of.keys()}
     if not posed:
         raise checks.no_pose(path, "has no xcr:Rotation and xcr:Position")
-    sensor = source.sensor or folder / "sensor.csv"
-    given = read_sensor(sensor) if source.sensor or sensor.is_file() else None
-    lenses = []
-    for file, of in posed.items():
-        frame = image_size(folder, names[file]) or (given and (given.width, given.height))
-        lenses += [_lens(file, of, *frame)] if frame else []
-    known = len(lenses) == len(posed)
-    why = "the size of the images is not in XMP files; put the images beside them or give --sensor"
+    sensor = sensor_file(source)
+    given = None if sensor is None else read_frame(sensor)
+    frames = {file: image_size(folder, names[file]) or given for file in posed}
+    lenses = [_lens(file, posed[file], *frame) for file, frame in frames.items() if frame]
     relative = any(of.get("Coordinates", "absolute") != "absolute" for of in posed.values())
     rotations = [numbers(f, "xcr:Rotation", of["Rotation"], 9) for f, of in posed.items()]
     return Cameras(
@@ -89,9 +85,8 @@ def read(source: Source) -> Cameras:
             [numbers(f, "xcr:Position", of["Position"], 3) for f, of in posed.items()]
         ),
         rotations=np.array(rotations).reshape(-1, 3, 3),
-        lenses=tuple(lenses) if known else None,
+        lenses=tuple(lenses) if len(lenses) == len(posed) else None,
         crs="local" if relative else None,
-        notes=() if known else (checks.without_lens(path, why),),
         unposed=tuple(names[file] for file in images if file not in posed),
         source="RealityCapture",
     )

@@ -37,6 +37,13 @@ FILM_MM = 36.0
 """Larger side of the film that 35 mm focal lengths mean."""
 
 
+def sensor_file(source: checks.Source) -> Path | None:
+    """Return the file with the lens of all images: that of the user, or the one next to them."""
+    folder = source.path if source.path.is_dir() else source.path.parent
+    default = folder / "sensor.csv"
+    return source.sensor or (default if default.is_file() else None)
+
+
 def read_sensor(path: Path) -> Lens:
     """Read the lens of all images.
 
@@ -112,7 +119,7 @@ def write_table(folder: File, cameras: Cameras) -> None:
     from scipy.spatial.transform import Rotation
 
     target = Path(folder)
-    rotations, lenses = checks.block_to_write(target, cameras, lambda _: True)
+    rotations, lenses = checks.block_to_write(target, cameras)
     if cameras.crs is not None and is_topocentric(cameras.crs):
         sentence = f"a table cannot hold the axes {cameras.crs}. Use a projected CRS."
         raise bad_file(target, "output.crs", sentence, crs=cameras.crs)

@@ -6,8 +6,7 @@ projection centre (longitude and latitude in degrees of WGS 84 are EPSG:4326, or
 header says that the heights are ellipsoidal), and how it is turned, or nothing:
 
 - omega, phi, kappa: photogrammetric camera axes (x right, y up, z back) go to the world by
-  Rx(omega) Ry(phi) Rz(kappa). Beside them r11 ... r33, rows of the matrix from the world to
-  those axes, must agree (Metashape's export of omega, phi, kappa).
+  Rx(omega) Ry(phi) Rz(kappa); a matrix next to them is ignored.
 - yaw, pitch, roll, 0 for a view straight down: those axes go to the world by
   Rz(-yaw) Rx(pitch) Ry(roll). So are Metashape's reference angles, ODM's, and the heading,
   pitch, roll of RealityCapture.
@@ -45,7 +44,7 @@ from pcfix.io import tables
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Angles, Source, note
 from pcfix.io.cameras.lenses import lens_by_name
-from pcfix.io.cameras.sensor import DISTORTION, FILM_MM, read_frame, read_sensor
+from pcfix.io.cameras.sensor import DISTORTION, FILM_MM, read_frame, sensor_file
 from pcfix.io.crs import shortened
 from pcfix.io.tables import Table
 from pcfix.lens import rotations
@@ -115,34 +114,33 @@ def read(source: Source) -> Cameras:
         columns = replace(columns, place=adjusted | {"label": place["label"]})
     by_gnss = any(name in tables.EXIF for name in columns.header)  # measured, not adjusted
     by_gnss |= columns.has("sigma_x")
-    xyz, rows = centres(columns), np.arange(len(columns.rows))
-    unposed = tuple[str, ...]()
-    if has_both or by_gnss:  # else a position that is not there is a mistake
-        lost = np.isnan(xyz).any(axis=1)
-        if lost.all():
-            raise checks.no_pose(source.path, "no image has a position")
-        unposed = tuple(columns.labels[i] for i in np.flatnonzero(lost))
-        rows = np.flatnonzero(~lost)
-    labels, first = [columns.labels[i] for i in rows], dict[tuple[str, bytes], int]()
-    for i in rows.tolist():
-        first.setdefault((columns.labels[i], xyz[i].tobytes()), i)  # an exact copy counts once
+    xyz, unposed = centres(columns), list[str]()
+    first = dict[tuple[str, bytes], int]()  # an exact copy of a row counts once
+    for i, label in enumerate(columns.labels):
+        if (has_both or by_gnss) and np.isnan(xyz[i]).any():  # else it is a mistake
+            unposed.append(label)
+        else:
+            first.setdefault((label, xyz[i].tobytes()), i)
+    if not first:
+        raise checks.no_pose(source.path, "no image has a position")
     rows = np.array(list(first.values()))
+    repeated = [label for label in columns.labels if label not in set(unposed)]
     columns, measured = columns.take(rows), measured.take(rows)
     turns = _rotations(columns, source.angles)
     system, notes = crs(measured)
     if by_gnss:
         sentence = "its positions are those of the GNSS, not adjusted ones."
         notes += (note(columns.path, "cameras.not_adjusted", sentence),)
-    copies = len(labels) - len(first)
+    has_lens = turns is not None and columns.has("f", "px", "py")
     return Cameras(
         labels=tuple(columns.labels),
         centres=centres(columns, needed=True),
         rotations=turns,
-        lenses=None if turns is None else read_lenses(columns, source.sensor),
+        lenses=_own_lenses(columns, source) if has_lens else None,
         crs=system,
-        notes=(*checks.repeated(columns.path, labels, copies), *notes),
+        notes=(*checks.repeated(columns.path, repeated, len(repeated) - len(rows)), *notes),
         gnss=gnss_positions(measured) if has_both else None,
-        unposed=unposed,
+        unposed=tuple(unposed),
         source="CSV table",
     )
 
@@ -154,17 +152,26 @@ _GEO_CRS = re.compile(r"(EPSG:\d+|\+proj=.+|WGS84 UTM \d\d?\s*[NS])\s*", re.IGNO
 
 
 def open_table(path: Path) -> Table:
-    """Read a table with a header, or ODM's geo.txt, which has none."""
+    """Read a table with a header, which may be a comment, or ODM's geo.txt, which has none."""
     lines = tables.read_lines(path)
-    if not is_geo(lines):
-        return read_columns(path)
-    split = [(i, line.split()) for i, line in enumerate(lines[1:], start=2)]
-    rows = [[*fields, *[""] * len(GEO)][: len(GEO)] for _, fields in split if fields]
-    lines_of = [i for i, fields in split if fields]
-    place = {name: GEO.index(name) for name in ("label", "x", "y", "z")}
-    place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
-    crs = checks.utm_as_code(lines[0].strip())
-    return Table(path, list(GEO), rows, lines_of, place, [""] * len(GEO), crs=crs)
+    if is_geo(lines):
+        split = [(i, line.split()) for i, line in enumerate(lines[1:], start=2) if line.strip()]
+        rows = [[*fields, *[""] * len(GEO)][: len(GEO)] for _, fields in split]
+        place = {name: GEO.index(name) for name in ("label", "x", "y", "z")}
+        place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
+        crs = checks.utm_as_code(lines[0].strip())
+        return Table(path, [*GEO], rows, [i for i, _ in split], place, [""] * len(GEO), crs=crs)
+    kinds = [("label", *three) for three in (*AXES, ("x_est", "y_est", "z_est"), TRANSLATION)]
+    table = tables.read_table(path, *kinds, spellings=SPELLINGS)
+    for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
+        alike = [name for name in table.header if name in spellings]
+        if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
+            sentence = f"the columns {', '.join(alike)} may all be {role}. Take out all but one."
+            raise bad_file(path, "table.columns_alike", sentence, columns=alike)
+    if table.has(*TRANSLATION) and axes(table.place) is None:
+        sentence = "tx, ty, tz may be translations. Give the projection centres as x, y, z."
+        raise bad_file(path, "table.translations", sentence)
+    return table
 
 
 def gnss_positions(columns: Table) -> GnssPositions | None:
@@ -182,22 +189,6 @@ def gnss_positions(columns: Table) -> GnssPositions | None:
 def axes(place: Iterable[str]) -> tuple[str, str, str] | None:
     """Return the three columns of a position: x, y, z or longitude, latitude, z."""
     return next((three for three in AXES if {*three} <= {*place}), None)
-
-
-def read_columns(path: Path) -> Table:
-    """Read a table with a header line, which may be a comment."""
-    kinds = [("label", *three) for three in (*AXES, ("x_est", "y_est", "z_est"), TRANSLATION)]
-    table = tables.read_table(path, *kinds, spellings=SPELLINGS)
-    names = table.header
-    for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
-        alike = [name for name in names if name in spellings]
-        if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
-            sentence = f"the columns {', '.join(alike)} may all be {role}. Take out all but one."
-            raise bad_file(path, "table.columns_alike", sentence, columns=alike)
-    if table.has(*TRANSLATION) and axes(table.place) is None:
-        sentence = "tx, ty, tz may be translations. Give the projection centres as x, y, z."
-        raise bad_file(path, "table.translations", sentence)
-    return table
 
 
 def centres(columns: Table, *, needed: bool = False) -> FloatArray:
@@ -259,8 +250,12 @@ OMEGA_PHI_KAPPA = ("omega", "phi", "kappa")
 YAW_PITCH_ROLL = ("yaw", "pitch", "roll")
 QUATERNION = ("qw", "qx", "qy", "qz")
 MATRIX = tuple(f"r{i}{j}" for i in "123" for j in "123")
-AGREEMENT_DEG = 0.05
-"""Of angles with the matrix beside them; angles with two decimals pass."""
+CONVERSIONS = {
+    "omega-phi-kappa": (OMEGA_PHI_KAPPA, rotations.from_omega_phi_kappa),
+    "yaw-pitch-roll": (YAW_PITCH_ROLL, rotations.from_yaw_pitch_roll),
+    "aircraft": (YAW_PITCH_ROLL, rotations.from_aircraft),
+}
+LARGEST_DEG = 360.0
 LOOKS_DOWN_DEG = 80.0
 """Largest tilt from the vertical of a camera that looks at the ground."""
 
@@ -270,54 +265,43 @@ def _rotations(columns: Table, angles: Angles | None) -> FloatArray | None:
 
     `angles` is what the user says that they are.
     """
-    opk, ypr = OMEGA_PHI_KAPPA, YAW_PITCH_ROLL
-    for kind in (opk, ypr, QUATERNION, MATRIX):
-        there = [role for role in kind if columns.has(role)]
+    wanted, convert = ((), None) if angles is None else CONVERSIONS[angles]
+    for kind in (OMEGA_PHI_KAPPA, YAW_PITCH_ROLL, QUATERNION, MATRIX):
         missing = [role for role in kind if not columns.has(role)]
-        if there and missing:
+        if len(missing) < len(kind) or kind == wanted:
             tables.check_columns(columns.path, columns.header, kind, missing)
-    if angles is not None:
-        roles, convert = {
-            "omega-phi-kappa": (opk, rotations.from_omega_phi_kappa),
-            "yaw-pitch-roll": (ypr, rotations.from_yaw_pitch_roll),
-            "aircraft": (ypr, rotations.from_aircraft),
-        }[angles]
-        missing = [role for role in roles if not columns.has(role)]
-        tables.check_columns(columns.path, columns.header, roles, missing)
-        return convert(*columns.of(roles).T)
-    if columns.has(*opk):
-        place = columns.place
+    if convert is not None:
+        return convert(*_degrees(columns, wanted))
+    if columns.has(*OMEGA_PHI_KAPPA):
         reality_capture = columns.after_hash and columns.name("label") == "name"
-        if place[opk[1]] < place[opk[0]] or reality_capture:
+        if columns.place["phi"] < columns.place["omega"] or reality_capture:
             sentence = "omega, phi, kappa may be turns in another order here. Export heading,"
             sentence += " pitch, roll, or give --angles omega-phi-kappa."
             raise bad_file(columns.path, "cameras.angles", sentence)
-        found = rotations.from_omega_phi_kappa(*columns.of(opk).T)
-        if columns.has(*MATRIX):  # they must be the same turn
-            half_chord = np.linalg.norm(found - _from_matrix(columns), axis=(1, 2)) / np.sqrt(8.0)
-            apart_deg = np.degrees(2.0 * np.arcsin(np.minimum(half_chord, 1.0)))
-            worst, apart = int(np.argmax(apart_deg)), float(apart_deg.max())
-            if apart > AGREEMENT_DEG:
-                sentence = f"omega, phi, kappa and r11 to r33 are {apart:.3g} degrees apart."
-                raise columns.error(worst, "cameras.angles_differ", sentence, degrees=apart)
-        return found
+        return rotations.from_omega_phi_kappa(*_degrees(columns, OMEGA_PHI_KAPPA))
     if columns.has(*QUATERNION):
         return checks.quaternions(columns.path, columns.labels, columns.of(QUATERNION))
     if columns.has(*MATRIX):
         return _from_matrix(columns)
-    return _from_yaw_pitch_roll(columns) if columns.has(*ypr) else None
+    return _from_yaw_pitch_roll(columns) if columns.has(*YAW_PITCH_ROLL) else None
 
 
-def read_lenses(columns: Table, sensor: Path | None) -> tuple[Lens, ...]:
-    """Return the lens of each row: that of the sensor, or RealityCapture's own columns."""
-    own = columns.has("f", "px", "py")
-    path = sensor or columns.path.with_name("sensor.csv")
-    if sensor is None and not path.is_file():
-        needed = "width_px,height_px" if own else "focal,sensor_x,sensor_y (mm)"
-        sentence = f"has angles but no sensor. Give --sensor a table with the columns {needed}."
-        raise bad_file(columns.path, "cameras.sensor_missing", sentence, columns=needed)
-    if not own:
-        return (read_sensor(path),) * len(columns.labels)
+def _degrees(columns: Table, roles: tuple[str, ...]) -> FloatArray:
+    """Return angles, shape (3, k), none of which is larger than a full turn."""
+    values = columns.of(roles)
+    for i, k in np.argwhere(np.abs(values) > LARGEST_DEG)[:1].tolist():
+        name, value = columns.name(roles[k]), float(values[i, k])
+        sentence = f"{name} = {value:g} is no angle in degrees. Name its unit, as in {name}[gon] or"
+        sentence += f" {name}[rad], or check the columns."
+        raise columns.error(i, "cameras.angle_range", sentence, column=name, value=value)
+    return values.T
+
+
+def _own_lenses(columns: Table, source: Source) -> tuple[Lens, ...]:
+    """Return the lens of each row from RealityCapture's columns, with the size of a sensor."""
+    path = sensor_file(source)
+    if path is None:
+        raise checks.no_sensor(columns.path, "width_px,height_px")
     width, height = read_frame(path)
     side = max(width, height)
     roles = columns.of(("f", "px", "py")), np.nan_to_num(columns.where_there(DISTORTION))
@@ -349,7 +333,7 @@ def _from_yaw_pitch_roll(columns: Table) -> FloatArray:
 
     Refused are angles that are more likely those of a gimbal, which are -90 straight down.
     """
-    values = columns.of(YAW_PITCH_ROLL).T
+    values = _degrees(columns, YAW_PITCH_ROLL)
     found, aircraft = rotations.from_yaw_pitch_roll(*values), rotations.from_aircraft(*values)
     if columns.name("yaw").startswith("gimbal"):
         return aircraft

@@ -29,7 +29,6 @@ OPENMVG = "a scene of OpenMVG", COLMAP
 ALICEVISION = "a scene of AliceVision (Meshroom)", COLMAP
 NERF = "a scene of nerfstudio or instant-ngp", "Give the model from which it was converted"
 RC = "a project of RealityCapture", "Export Internal/External camera parameters or XMP files"
-BARE = "a table without a header", "Write one, for example label,x,y,z,omega,phi,kappa"
 SOCET = "a support file of SOCET SET", OPK
 GCPS = "a list of ground control points (ODM)", POSES
 CONTENTS: tuple[tuple[bytes, Refusal], ...] = (
@@ -103,16 +102,15 @@ def _refusal(source: Source) -> Refusal | None:
         return found and (f"a folder with {found[1]}: {found[0][0]}", found[0][1])
     by_name = (found for name, found in PARTS if re.fullmatch(name, source.path.name))
     by_head = (found for head, found in CONTENTS if re.search(head, source.head, re.MULTILINE))
-    found_one = next(by_name, None) or next(by_head, None)
-    return found_one or (None if b"\0" in source.head else _bare_numbers(source.text))
-
-
-def _bare_numbers(text: str) -> Refusal | None:
-    """Return what a text is whose lines are numbers, but for the name of the image."""
-    rows = []
-    for line in (text.rpartition("\n")[0] or text).splitlines():  # the last may be cut off
+    known = next(by_name, None) or next(by_head, None)
+    if known or b"\0" in source.head:
+        return known
+    counts = []  # of numbers in a line, after at most one name; the last line may be cut off
+    for line in (source.text.rpartition("\n")[0] or source.text).splitlines():
         if line.strip() and not line.startswith("#"):
             values = [number(word) for word in re.split(r"[,;\s]+", line.strip())]
-            values = values[1:] if np.isnan(values[0]) else values  # after at most one name
-            rows.append(0 if np.isnan(values).any() else len(values))
-    return BARE if rows and min(rows[:20]) >= 2 else None
+            values = values[1:] if np.isnan(values[0]) else values
+            counts.append(0 if np.isnan(values).any() else len(values))
+    is_bare = bool(counts) and min(counts[:20]) >= 2
+    header = "Write one, for example label,x,y,z,omega,phi,kappa"
+    return ("a table without a header", header) if is_bare else None

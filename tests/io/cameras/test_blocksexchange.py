@@ -125,7 +125,6 @@ def test_perspective_lens(tmp_path, focal):
     xd, yd = brown(x, y, (0.1, -0.2, 0.3), (0.01, 0.02))
     expected = (3010.5 + 4000 * xd + 5 * yd, 1990.5 + 4400 * yd)
     assert project(lens, np.array([[x, y, 1.0]]))[0] == pytest.approx(expected)
-    assert (lens.pixel_size_mm is None) == ("Pixels" in focal)
 
 
 @pytest.mark.parametrize(

@@ -9,13 +9,12 @@ import pytest
 from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
-from pcfix.errors import InputError
 from pcfix.io.cameras.georeference import adjusted_minus_gnss, georeference
 from pcfix.model import Cameras, GnssPositions
+from tests.utils import geodesy
 from tests.utils.codes import refused
+from tests.utils.geodesy import axes_at as east_north_up
 from tests.utils.nightly import mostly_nightly
-from tests.utils.pose_files import block
-from tests.utils.pose_files.block import axes_at as east_north_up
 from tests.utils.reprojection import bring_to
 
 pytestmark = pytest.mark.quick_but(
@@ -43,7 +42,7 @@ def cameras(centres, crs, rotations=None, **more):
 
 
 def geocentric(lon, lat, h, f=1 / 298.257222101):
-    return block.geocentric(lon, lat, h, 6378137.0, f)
+    return geodesy.geocentric(lon, lat, h, 6378137.0, f)
 
 
 def image_px(rotation, centre, points):
@@ -92,21 +91,6 @@ def test_tie_points_go_the_same_way_and_unknown_ones_stay_unknown():
 
 
 # ---- rotations ----
-
-
-def convergence_rad(lon, lat, meridian):
-    """Return the angle from true to grid north on a transverse Mercator map (sphere)."""
-    return np.arctan(np.tan(np.radians(lon - meridian)) * np.sin(np.radians(lat)))
-
-
-@pytest.mark.parametrize(("lon", "lat"), [(-0.5, 39.4), (-5.0, 60.0), (-1.0, -33.0), (-3.0, 10.0)])
-def test_north_turns_by_the_meridian_convergence(lon, lat):
-    code = "EPSG:32630" if lat > 0 else "EPSG:32730"
-    found = bring_to(cameras([lon, lat, 100.0], "EPSG:4326", NADIR[None]), code)
-    gamma = convergence_rad(lon, lat, -3.0)
-    true_north = -found.rotations[0][1]  # the top of the image was true north
-    assert true_north == pytest.approx([-np.sin(gamma), np.cos(gamma), 0.0], abs=5e-6)
-    assert found.rotations[0] @ found.rotations[0].T == pytest.approx(np.eye(3), abs=1e-12)
 
 
 def frames_of_a_place(kind, lon, lat, h):
@@ -163,28 +147,6 @@ def test_points_below_a_camera_fall_on_the_same_pixels(kind, lon, lat, tilt_deg)
     assert np.hypot(*left.T).max() < 1.2 * FOCAL_PX * drop_m / BELOW_M
 
 
-def test_pixels_are_kept_between_two_maps():
-    """From one zone to the next: 4.5 degrees of convergence, another scale."""
-    lon, lat = 0.0, 45.0
-    to_30, to_31 = (
-        Transformer.from_crs("EPSG:4326", code, always_xy=True)
-        for code in ("EPSG:32630", "EPSG:32631")
-    )
-    centre = np.array([*to_30.transform(lon, lat), 150.0])
-    looks = NADIR @ Rotation.from_euler("z", 25.0, degrees=True).as_matrix()
-    x, y = np.meshgrid(*[np.linspace(-0.5, 0.5, 5) * FRAME_PX / FOCAL_PX * BELOW_M] * 2)
-    points = centre + np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -BELOW_M)])
-    degrees = to_30.transform(points[:, 0], points[:, 1], direction="INVERSE")
-    there = np.column_stack([*to_31.transform(*degrees), points[:, 2]])
-    found = bring_to(cameras(centre, "EPSG:32630", looks[None]), "EPSG:32631")
-    moved = image_px(found.rotations[0], found.centres[0], there) - image_px(looks, centre, points)
-    assert np.hypot(*moved.T).max() < 0.01  # half way between them the scales are equal
-    turn = convergence_rad(lon, lat, 3.0) - convergence_rad(lon, lat, -3.0)
-    old_top, new_top = -looks[1], -found.rotations[0][1]
-    angle = np.arctan2(*new_top[[1, 0]]) - np.arctan2(*old_top[[1, 0]])
-    assert angle == pytest.approx(turn, abs=2e-5)
-
-
 def test_left_handed_axes_are_refused():
     crs = CRS("EPSG:5513")  # south, west
     x, y = Transformer.from_crs("EPSG:4156", crs, always_xy=True).transform(15.0, 50.0)
@@ -195,22 +157,6 @@ def test_left_handed_axes_are_refused():
 
 
 # ---- heights ----
-
-
-def test_a_missing_geoid_is_refused_and_named():
-    ecef = geocentric(*VALENCIA_LON_LAT)
-    read = cameras(ecef, "EPSG:4936", project_crs=UTM30_ALICANTE)
-    for cloud in (UTM30, UTM30_ALICANTE):  # a LAS often states the plan alone
-        with pytest.raises(InputError) as caught:
-            bring_to(read, cloud, name="cameras.xml")
-        message = str(caught.value)
-        assert message.startswith(
-            "cameras.xml: ellipsoidal heights (ETRS89) cannot be transformed to"
-        )
-        assert "es_ign_egm08-rednap.tif" in message
-        assert "pyproj sync" in message
-        assert "PROJ_NETWORK=ON" in message
-        assert message.endswith("agree, give --cameras-crs EPSG:25830.")
 
 
 @pytest.mark.parametrize(("undulation_m", "agree"), [(51.5, False), (0.2, True)])
@@ -437,12 +383,3 @@ def test_heights_that_cannot_be_compared_leave_the_plan(crs, gnss_crs, reason):
     assert np.isnan(enu_m[:, 2]).all()
     lengths = np.hypot(*enu_m[:2, :2].T)
     assert lengths == pytest.approx(np.hypot(*ENU_M[:2, :2].T), rel=5e-4)
-
-
-@pytest.mark.parametrize("crs", [None, "local"])
-def test_a_local_block_cannot_be_compared(crs):
-    gnss = GnssPositions(np.array([[LON, LAT, H]]), np.full((1, 3), np.nan), "EPSG:4326")
-    cameras = Cameras(("a",), np.zeros((1, 3)), crs=crs, gnss=gnss)
-    enu_m, why = adjusted_minus_gnss(cameras, "a.xml")
-    assert np.isnan(enu_m).all()
-    assert "they are not compared" in why

@@ -14,18 +14,13 @@ from pcfix.lens.imaging import project
 from pcfix.model import Lens
 from tests.utils.camera_files import brown, notes, read, read_ties
 from tests.utils.codes import refused
-from tests.utils.shared import needs
 
 pytestmark = pytest.mark.quick_but(
     "test_fisheyes_have_the_distortion_of_a_frame_camera",
     "test_new_calibration",
     "test_old_calibration_is_absolute_and_in_the_order_of_opencv",
-    "test_sample_says_where_its_gnss_was",
-    "test_sample_with_a_rig_has_degrees_in_a_metric_chunk",
 )
 
-SOROLLA, sorolla = needs("cameras", "metashape", "uclm_sorolla")
-RIG, rig = needs("cameras", "metashape", "micasense_rig")
 
 ONE = "1 0 0 {} 0 1 0 {} 0 0 1 {} 0 0 0 1"
 QUARTER = "0 -1 0 1 0 0 0 0 1"
@@ -118,21 +113,6 @@ MARK = (("float", "x"), ("float", "y"), ("float", "size"), ("int", "id"))
 
 
 # The samples
-
-
-@sorolla
-def test_sample_says_where_its_gnss_was():
-    cameras = read(SOROLLA / "markers_25830-5782.xml")
-    assert cameras.project_crs.startswith('COMPD_CS["ETRS89 / UTM zone 30N + Alicante height"')
-    assert cameras.source == "Agisoft Metashape 2.0.1.16069"
-    assert cameras.gnss.crs.startswith('GEOGCS["WGS 84"')
-    assert cameras.gnss.sigma_m[0].tolist() == [0.08, 0.08, 0.12]
-
-
-@rig
-def test_sample_with_a_rig_has_degrees_in_a_metric_chunk():
-    cameras = read(RIG / "markers_micasenses_rededge.xml")
-    assert notes(cameras) == ["cameras.gnss_in_degrees"]
 
 
 # The format
@@ -267,7 +247,6 @@ def test_new_calibration(tmp_path):
         *(100.0, 60.0, 40.0, 33.0, 16.0, 0.5, 0.25),
         radial=(0.1, 0.2, 0.3, 0.4),
         tangential=(0.01, 0.02, 0.03, 0.04),
-        pixel_size_mm=0.005,
         sensor="S0",
     )
     # the manual's formula, written out again

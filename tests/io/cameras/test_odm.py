@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.utils.camera_files import read, read_ties
 from tests.utils.codes import refused
-from tests.utils.pose_files.block import axes_at
+from tests.utils.geodesy import axes_at
 
 pytestmark = pytest.mark.quick
 
@@ -150,8 +150,9 @@ def test_transformation_is_applied_to_poses_and_points(tmp_path, named):
     assert cameras.centres == pytest.approx(exact_utm(PLACES, lon, lat), abs=0.02)
     points = read_ties(path)
     assert points.xyz == pytest.approx(exact_utm(np.array([[9.0, 8, 7]]), lon, lat), abs=1e-3)
-    identity = cameras.rotations @ cameras.rotations.transpose(0, 2, 1)
-    assert identity == pytest.approx(np.broadcast_to(np.eye(3), identity.shape), abs=1e-12)
+    ray = Rotation.from_rotvec(DOWN).apply([9.0, 8.0, 7.0] - PLACES[1])
+    turned = cameras.rotations[1] @ (points.xyz[0] - cameras.centres[1])
+    assert turned == pytest.approx(ray, abs=0.1)  # the map scales in plan by 0.9996
 
 
 def test_transformation_of_another_origin_is_not_used(tmp_path):

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 import pcfix
 from pcfix.io.cameras import read_tie_points
+from pcfix.model import Cameras, Lens
 from tests.utils.camera_files import brown
 from tests.utils.codes import refused
-from tests.utils.pose_files.block import Block
-from tests.utils.pose_files.opf import FIRST_ID, Base
-from tests.utils.pose_files.opf import opf as write
+from tests.utils.opf_files import FIRST_ID, Base, shift_of
+from tests.utils.opf_files import opf as write
 from tests.utils.reprojection import bring_to, tie_point_residuals_px
 
 pytestmark = pytest.mark.quick_but("test_refused", "test_tracks_fall_where_the_images_saw_them")
@@ -76,18 +76,20 @@ def make(tmp_path):
     def made(kind="perspective", base=None, epsg=32632, places=PLACES):
         up_back = Rotation.from_euler("XYZ", ANGLES, degrees=True).as_matrix()
         rotations = (up_back @ np.diag([1.0, -1.0, -1.0])).transpose(0, 2, 1)
-        block = Block(("a b.jpg", "b.jpg"), places, rotations, 3000.0, *SIZE, epsg)
+        lens = Lens(3000.0, *SIZE, SIZE[0] / 2, SIZE[1] / 2)
+        labels = ("a b.jpg", "b.jpg")
+        block = Cameras(labels, places, rotations, (lens,) * 2, f"EPSG:{epsg}")
         noise = np.random.default_rng(1).uniform(-6.0, 6.0, (30, 3))
         xyz = places.mean(axis=0) - [0.0, 0.0, 60.0] + noise
         # as the file rounds them, so that they are seen where they are
-        shift = -block.origin - [0.25, 0.5, 0.125]
+        shift = shift_of(block)
         middle = np.round(np.median(xyz + shift, axis=0))
         xyz = (xyz + shift - middle).astype("<f4") + middle - shift
         point, camera = np.repeat(np.arange(30), 2)[:-1], np.tile([0, 1], 30)[:-1]
         uv = np.array(
             [seen(kind, ANGLES[c], places[c], xyz[p]) for p, c in zip(point, camera, strict=True)]
         )
-        path = write(tmp_path, block, base, (xyz, point, camera, uv)).path
+        path = write(tmp_path, block, base, (xyz, point, camera, uv))
         middle_px = [SIZE[0] / 2 + 11.0, SIZE[1] / 2 - 7.0]
         inner = LENSES[kind] | {"principal_point_px": middle_px}
         change(tmp_path, "calibrated-cameras.json", sensors=[{"id": 7, "internals": inner}])
@@ -107,7 +109,6 @@ def test_tracks_fall_where_the_images_saw_them(make, kind):
     assert len(misses) == 59
     assert misses.max() < FLOAT32_PX
     assert cameras.labels == ("a b.jpg", "b.jpg")
-    assert cameras.lenses[0].pixel_size_mm == pytest.approx(2.4e-3)
     assert cameras.source == "OPF PIX4Dmatic 1.6"
 
 

@@ -61,7 +61,7 @@ def test_samples_give_rotations_without_lenses():
     assert cameras.rotations[1][2] == pytest.approx([0.34449907, -0.48551712, 0.80348834])
     assert cameras.lenses is None
     assert cameras.crs is None
-    assert notes(cameras) == ["cameras.no_lens"]
+    assert notes(cameras) == []
 
 
 @pytest.mark.parametrize(
@@ -117,6 +117,7 @@ def test_folder(tmp_path):
     assert cameras.labels == ("a.jpg", "b.TIF")
     assert cameras.centres.tolist() == [[1, 2, 3], [10, 20, 30]]
     assert cameras.unposed == ("lost.jpg",)
+    assert cameras.rotations[0] == pytest.approx(TURN)
 
 
 @pytest.mark.parametrize(

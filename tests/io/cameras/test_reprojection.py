@@ -15,7 +15,7 @@ from pyproj import Transformer
 
 import pcfix
 from pcfix.io.cameras import read_tie_points
-from tests.utils.pose_files.block import axes_at
+from tests.utils.geodesy import axes_at
 from tests.utils.reprojection import (
     check_file,
     from_upper_left,

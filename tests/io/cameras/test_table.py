@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 from pyproj import CRS
+from scipy.spatial.transform import Rotation
 
 import pcfix
 from pcfix.io.cameras import table
+from pcfix.io.cameras.sensor import read_sensor
 from tests.utils.camera_files import read
 from tests.utils.codes import refused, warned
 from tests.utils.shared import needs
@@ -61,6 +63,7 @@ def test_yaw_pitch_roll(tmp_path, kind, angles, forward, top, right):
         b"\xef\xbb\xbflabel,x,y,z\r\n\r\na,1,2,3\r\n\r\n",
         '"label","x","y","z"\n"a, b",1,2,3\n',
         b"label,x,y,z\nStra\xdfe.jpg,1,2,3\n",
+        "label;x;y;z\na;1,0;2,00;3\n",
     ],
 )
 def test_dialects(tmp_path, text):
@@ -174,6 +177,15 @@ def test_omega_phi_kappa(tmp_path, header, per_degree):
     assert cameras.rotations[0] == pytest.approx(photogrammetric(*np.radians(angles)), abs=1e-12)
 
 
+@pytest.mark.parametrize("names", ["qw,qx,qy,qz", "r11,r12,r13,r21,r22,r23,r31,r32,r33"])
+def test_turns_are_from_world_to_camera(tmp_path, names):
+    turn = Rotation.from_euler("xyz", [170.0, 12.0, 34.0], degrees=True)
+    numbers = np.roll(turn.as_quat(), 1) if "q" in names else turn.as_matrix().ravel()
+    row = ",".join(map(repr, numbers.tolist()))
+    cameras = plain(tmp_path, f"label,x,y,z,{names}\na,1,2,3,{row}\n")
+    assert cameras.rotations[0] == pytest.approx(turn.as_matrix(), abs=1e-12)
+
+
 GIMBAL = "label,x,y,z,{}\na,1,2,3,10,-90,0\nb,1,2,3,20,-60,0\n"
 
 
@@ -264,7 +276,7 @@ def test_a_sensor_in_pixels_has_the_order_of_opencv(tmp_path):
     sensor.write_text(
         "focal_px,width_px,height_px,cx,cy,k1,k2,p1,p2,k3\n3000,4000,3000,2010,1490,.1,.2,.3,.4,.5\n"
     )
-    assert table.read_sensor(sensor) == pcfix.Lens(
+    assert read_sensor(sensor) == pcfix.Lens(
         3000, 4000, 3000, 2010, 1490, radial=(0.1, 0.2, 0.5), tangential=(0.4, 0.3)
     )
 
@@ -309,10 +321,7 @@ REFUSED = {
     "a translation": ("label,qw,qx,qy,qz,tx,ty,tz\na,1,0,0,0,1,2,3\n", "table.translations"),
     "a quaternion": ("label,x,y,z,qw,qx,qy,qz\na.jpg,1,2,3,1,1,0,0\n", "cameras.rotation"),
     "a mirror": (MATRIX + "\na.jpg,1,2,3,1,0,0,0,1,0,0,0,-1\n", "cameras.rotation"),
-    "matrix against angles": (
-        MATRIX + ",omega,phi,kappa\na.jpg,1,2,3,1,0,0,0,1,0,0,0,1,0,1,0\n",
-        "cameras.angles_differ",
-    ),
+    "gon": (ANGLED + "a,1,2,3,0,0,300\nb,1,2,3,399.9,0,100\n", "cameras.angle_range"),
     "nothing adjusted": ("#Label,X,Y,Z,X_est,Y_est,Z_est\na,1,2,3,,,\n", "cameras.no_pose"),
 }
 

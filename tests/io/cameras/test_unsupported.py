@@ -1,13 +1,11 @@
 """The table of formats, and files that are known but not read: each is refused by its name."""
 
 import json
-import re
-from pathlib import Path
 
 import pytest
 
 import pcfix
-from pcfix.io.cameras import FORMATS, table, unsupported
+from pcfix.io.cameras import table, unsupported
 from pcfix.io.cameras.checks import Source
 from tests.utils.codes import refused
 
@@ -90,18 +88,6 @@ def test_unknown(tmp_path, data):
     assert not unsupported.recognises(Source(tmp_path / "what"))
     with refused("cameras.unknown"):
         pcfix.read_cameras(tmp_path / "what")
-
-
-README = Path(pcfix.__file__).parent / "io" / "cameras" / "README.md"
-PART = re.compile(r"<!-- formats: .*? -->\n(.*?)<!-- end of formats -->", re.DOTALL)
-
-
-def test_the_table_of_the_readme_has_the_formats():
-    found = PART.search(README.read_text())
-    assert found is not None
-    rows = [line.split(" | ") for line in found[1].splitlines()[2:]]
-    assert [row[0].removeprefix("| ") for row in rows] == [*FORMATS.values()][:-1]
-    assert all(len(row) == 2 for row in rows)
 
 
 @pytest.mark.parametrize("angles", [True, False])

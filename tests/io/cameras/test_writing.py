@@ -1,4 +1,4 @@
-"""Blocks that pcfix writes: COLMAP's, OpenSfM's, and tables; read by pcfix and by COLMAP itself."""
+"""Blocks that pcfix writes: COLMAP's and tables; read by pcfix and by COLMAP itself."""
 
 import json
 from dataclasses import replace
@@ -10,8 +10,6 @@ from pyproj import CRS
 from pcfix.errors import InputError, SettingError
 from pcfix.io.cameras import read_cameras, read_tie_points
 from pcfix.io.cameras.colmap import write_colmap
-from pcfix.io.cameras.georeference import georeference
-from pcfix.io.cameras.opensfm import write_opensfm
 from pcfix.io.cameras.sensor import write_table
 from pcfix.lens.imaging import project
 from pcfix.model import Lens, TiePoints, Views
@@ -53,29 +51,15 @@ COLMAP_LENSES = {
     "SIMPLE_DIVISION": Lens(1500.0, *FRAME, projection="division", shape=(-0.05,)),
     "EUCM": Lens(1500.0, *FRAME, projection="eucm", shape=(0.6, 1.1)),
 }
-OPENSFM_LENSES = {
-    "perspective": Lens(1500.0, *CENTRED, radial=(-0.1, 0.02)),
-    "brown": Lens(1500.0, *FRAME, b1=-2.0, **BENT),
-    "fisheye": Lens(800.0, *CENTRED, **FISH, radial=(0.01,)),
-    "fisheye_opencv": Lens(800.0, *FRAME, **FISH, b1=0.5, radial=(0.01, 2e-3, 3e-4, 1e-5)),
-    "fisheye62": Lens(
-        800.0, *FRAME, **FISH, radial=(0.01, 0.0, 0.0, 0.0, 1e-5, 1e-6), tangential=(1e-3, 2e-3)
-    ),
-    "fisheye624": Lens(800.0, *FRAME, **FISH, thin_prism=(1e-4, 2e-4, 3e-4, 4e-4)),
-    "dual": Lens(800.0, *CENTRED, projection="dual", shape=(0.7,), radial=(0.01, 0.002)),
-}
 OPENCV = Lens(1500.0, *FRAME, **BENT, denominator=(0.01, 0.0, 0.002))
 FOUR = Lens(1400.0, *FRAME, radial=(-0.1, 0.02, -0.003, 1e-4), tangential=(1e-3, -2e-3))
 FILM = Lens(3.6, 3.8, 2.8, 1.9, 1.4, unit="mm")
 
 
-def write(form, folder, cameras, ties=None, **more):
+def write(form, folder, cameras):
     """Write a block into a folder, and return what is read again."""
     if form == "colmap":
-        write_colmap(folder, cameras, ties, **more)
-        return folder
-    if form == "opensfm":
-        write_opensfm(folder / "reconstruction.json", cameras, ties)
+        write_colmap(folder, cameras)
         return folder
     write_table(folder, cameras)
     return folder / "cameras.csv"
@@ -97,46 +81,19 @@ def check_ties(found, given, places_m=1e-9, px=0.0):
     np.testing.assert_allclose(found.image_xy, given.image_xy, rtol=0.0, atol=px)
 
 
-@pytest.mark.parametrize("offset", [(320000.0, 3842800.0, 0.0), (0.0, 0.0, 0.0), None])
-def test_colmap_there_and_back(tmp_path, offset):
+def test_colmap_there_and_back(tmp_path):
     cameras = small_block(tuple(COLMAP_LENSES.values()), k=16)
     ties = some_ties(cameras)
-    write_colmap(tmp_path / "m", cameras, ties, offset_m=offset)
+    write_colmap(tmp_path / "m", cameras, ties)
     place = json.loads((tmp_path / "m" / "georeference.json").read_text())
-    assert place["offset_m"] == list(offset or (320000.0, 3842800.0, 0.0))  # near the block
+    assert place["offset_m"] == [320000.0, 3842800.0, 0.0]  # near the block
     found = read_cameras(tmp_path / "m")
     assert found.crs == cameras.crs
-    check_block(found, cameras, 1e-9 if offset != (0.0, 0.0, 0.0) else 3e-9)
+    check_block(found, cameras)
     check_ties(read_tie_points(tmp_path / "m", found), ties)
     check_block(bring_to(found, "EPSG:32636"), cameras, 3e-9)
     names = {path.name for path in (tmp_path / "m").iterdir()}
     assert names == {"cameras.bin", "images.bin", "points3D.bin", "georeference.json"}
-
-
-@pytest.mark.parametrize(
-    ("crs", "origin"),
-    [
-        ("EPSG:32636", (319900.0, 3842700.0, 0.0)),
-        ("EPSG:25830", (725400.0, 4369900.0, 120.0)),
-        ("EPSG:2154", (652000.0, 6862000.0, 30.0)),
-        (CRS("EPSG:32636").to_3d().to_wkt(), (319900.0, 3842700.0, 0.0)),
-        ("ENU:34.7,31.2,12.5", (0.0, 0.0, 0.0)),
-        ("local", (0.0, 0.0, 0.0)),
-    ],
-)
-def test_opensfm_there_and_back(tmp_path, crs, origin):
-    cameras = small_block(tuple(OPENSFM_LENSES.values()), crs, origin, k=8)
-    ties = some_ties(cameras, origin)
-    found = read_cameras(write("opensfm", tmp_path, cameras, ties))
-    seen = read_tie_points(tmp_path, found)
-    assert (tmp_path / "reference_lla.json").exists() == (crs != "local")
-    if crs.startswith(("ENU", "local")):
-        assert found.crs == crs
-    else:
-        way = georeference(found, crs)
-        found, seen = way.cameras(found), replace(seen, xyz=way.points(seen.xyz))
-    check_block(found, cameras, 1e-4, 1e-7)
-    check_ties(seen, ties, 1e-4, 1e-4)
 
 
 @pytest.mark.parametrize("lenses", [(PLAIN,), (OPENCV,), (FILM,)])
@@ -153,8 +110,8 @@ def test_colmap_reads_it(tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     cameras = small_block(tuple(COLMAP_LENSES.values()), k=16)
     ties = some_ties(cameras)
-    offset = np.array([319900.0, 3842700.0, 0.0])
-    write_colmap(tmp_path, cameras, ties, offset_m=tuple(offset))
+    write_colmap(tmp_path, cameras, ties)
+    offset = np.array([320000.0, 3842800.0, 0.0])
     model = pycolmap.Reconstruction(str(tmp_path))
     assert len(model.points3D) == len(ties.xyz)
     for i, label in enumerate(cameras.labels):
@@ -188,10 +145,9 @@ ODD = (
 @pytest.mark.parametrize(
     ("form", "lenses"),
     [
-        *((form, (lens,)) for form in ("colmap", "opensfm") for lens in ODD),
+        *(("colmap", (lens,)) for lens in ODD),
         ("colmap", (Lens(1500.0, *FRAME, tangential=(1e-3, 1e-3, 1e-4)),)),
         ("colmap", (Lens(1500.0, *FRAME, thin_prism=(1e-3,)),)),
-        ("opensfm", (Lens(800.0, *FRAME, **FISH, tangential=(1e-3, 1e-3), in_turn=True),)),
         ("table", (FOUR,)),
         ("table", (replace(FILM, radial=(0.1,)),)),
         ("table", (PLAIN, OPENCV)),
@@ -206,11 +162,8 @@ def test_lens_not_held(tmp_path, form, lenses):
 @pytest.mark.parametrize(
     ("form", "changes", "code"),
     [
-        *((form, {"lenses": None}, "output.no_lenses") for form in ("colmap", "opensfm", "table")),
+        *((form, {"lenses": None}, "output.no_lenses") for form in ("colmap", "table")),
         ("colmap", {"labels": ("a\nb", *"cdefg")}, "output.label"),
-        ("opensfm", {"labels": ("a",) * 6}, "output.label"),
-        ("opensfm", {"crs": "EPSG:4979"}, "output.crs"),
-        ("opensfm", {"crs": "EPSG:32636+5773"}, "crs.heights"),
         ("table", {"crs": "ENU:1,2,3"}, "output.crs"),
     ],
 )
@@ -219,12 +172,11 @@ def test_block_not_held(tmp_path, form, changes, code):
         write(form, tmp_path, replace(small_block(), **changes))
 
 
-@pytest.mark.parametrize("form", ["colmap", "opensfm"])
-def test_unseen_points_are_left_out(tmp_path, form):
+def test_unseen_points_are_left_out(tmp_path):
     xyz = np.array([[1.0, 2, 3], [np.nan] * 3, [4.0, 5, 6], [7.0, 8, 9]])
     views = Views(np.array([0, 2, 4, 4, 6]), np.array([0, 1, 0, 1, 2, 0]))
     ties = TiePoints(xyz, views, np.arange(12.0).reshape(6, 2))
-    write(form, tmp_path, small_block(crs=None, origin=(0, 0, 0)), ties)
+    write_colmap(tmp_path, small_block(crs=None, origin=(0, 0, 0)), ties)
     found = read_tie_points(tmp_path, read_cameras(tmp_path))
     assert found.xyz.tolist() == [[1.0, 2, 3], [7.0, 8, 9]]
     assert found.views.start.tolist() == [0, 2, 4]
@@ -232,10 +184,7 @@ def test_unseen_points_are_left_out(tmp_path, form):
     assert found.image_xy[:, 0] == pytest.approx([0.0, 2.0, 10.0, 8.0], abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("form", "name"),
-    [("colmap", "points3D.bin"), ("opensfm", "reference_lla.json"), ("table", "sensor.csv")],
-)
+@pytest.mark.parametrize(("form", "name"), [("colmap", "points3D.bin"), ("table", "sensor.csv")])
 def test_nothing_is_replaced(tmp_path, form, name):
     (tmp_path / name).write_text("mine")
     with pytest.raises(SettingError):

@@ -1,19 +1,14 @@
 """OPF, by its published specification: a project, its parts, and tracks in a glTF model."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 from uuid import NAMESPACE_URL, uuid5
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from tests.utils.pose_files.block import PoseFile, omega_phi_kappa
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from tests.utils.pose_files.block import Block
+from pcfix.model import Cameras
 
 FIRST_ID, SENSOR_ID = 18_000_000_000_000_000_000, 7  # ids are unsigned numbers of 64 bits
 FLOAT, UNSIGNED = 5126, 5125
@@ -28,13 +23,16 @@ class Base(NamedTuple):
     up_m: float = 1.0
 
 
-def opf(folder: Path, block: Block, base: Base | None = None, ties: Any = None) -> PoseFile:
+def opf(folder: Path, block: Cameras, base: Base | None = None, ties: Any = None) -> Path:
     """Write a block whose centres are east, north, up in metres, with tracks if there are some.
 
-    `ties` are points (m, 3), and of each observation its point, its camera, u and v.
+    `ties` are points (m, 3), and of each observation its point, its camera, u and v. The lens is
+    that of the first camera, without distortion, its principal point in the middle.
     """
-    base = base or Base(f"EPSG:{block.epsg}")
-    shift = -block.origin - [0.25, 0.5, 0.125]
+    base, frame = base or Base(str(block.crs)), block.lenses[0]
+    shift, size = shift_of(block), [frame.width, frame.height]
+    up_back = (np.diag([1.0, -1.0, -1.0]) @ block.rotations).transpose(0, 2, 1)
+    omega_phi_kappa = Rotation.from_matrix(up_back).as_euler("XYZ", degrees=True)
     # to the isometric frame from base coordinates: times the scale, exchanged, plus the shift
     scale = [base.plan_m, base.plan_m, base.up_m]
     cameras = [
@@ -44,18 +42,16 @@ def opf(folder: Path, block: Block, base: Base | None = None, ties: Any = None) 
             "position": (centre + shift).tolist(),
             "orientation_deg": angles.tolist(),
         }
-        for i, (centre, angles) in enumerate(
-            zip(block.centres, omega_phi_kappa(block.rotations), strict=True)
-        )
+        for i, (centre, angles) in enumerate(zip(block.centres, omega_phi_kappa, strict=True))
     ]
     lens = {
         "type": "perspective",
-        "principal_point_px": [block.width / 2, block.height / 2],
-        "focal_length_px": block.focal_px,
+        "principal_point_px": [frame.width / 2, frame.height / 2],
+        "focal_length_px": frame.focal,
         "radial_distortion": [0.0, 0.0, 0.0],
         "tangential_distortion": [0.0, 0.0],
     }
-    sensor = {"id": SENSOR_ID, "name": "one", "image_size_px": [block.width, block.height]}
+    sensor = {"id": SENSOR_ID, "name": "one", "image_size_px": size}
     parts = {
         "camera_list": ("camera-list", {"cameras": [
             {"id": FIRST_ID + i, "uri": f"file:///c:/my%20flight/{label}"}
@@ -89,7 +85,12 @@ def opf(folder: Path, block: Block, base: Base | None = None, ties: Any = None) 
         "description": "", "generator": {"name": "PIX4Dmatic", "version": "1.6"}, "items": items,
     }  # fmt: skip
     write_json(folder / "project.opf", project)
-    return PoseFile(folder / "project.opf", {})
+    return folder / "project.opf"
+
+
+def shift_of(block: Cameras) -> np.ndarray:
+    """Return the shift from the map to the processing frame, near whole metres, (3,)."""
+    return -np.round(block.centres.mean(axis=0)) - [0.25, 0.5, 0.125]
 
 
 def uuid(name: str) -> str:
