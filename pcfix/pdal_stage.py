@@ -149,7 +149,8 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
 
 
 def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
-    from pcfix.flow.clean import RAY_DIMENSIONS, Tested, find_noise
+    from pcfix.clean.points import WEAK
+    from pcfix.flow.clean import Tested, find_noise
     from pcfix.flow.runner import check_summary, write_summary
     from pcfix.options.steps import CleanOptions
     from pcfix.running import threads
@@ -157,7 +158,7 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     started = time.perf_counter()
     options = _options(namespace, CleanOptions)
     cloud = PdalCloud(ins, namespace.get("metadata"))
-    rays = cloud.columns(tuple(RAY_DIMENSIONS))
+    rays = cloud.columns(tuple(WEAK))
     check_summary(options)
 
     def chunks(water: WaterSurface | None) -> Iterator[Tested]:

@@ -1,9 +1,10 @@
-"""Nearest neighbours of points, in memory that does not grow with the cloud.
+"""Nearest neighbours of points, by one tree of scipy over points in the order of small cells.
 
-The cloud is cut into square tiles of the plan. The neighbours of a point are searched in its own
-tile, then in every other tile whose bounding box is nearer than the farthest neighbour so far. So
-the result is that of one tree over the whole cloud, and an outlier far from everything costs a few
-queries.
+The cloud is sorted into square tiles of the plan, and each of these by cells. A tree over points in
+this order is built and searched in less than half the time (5 million points against 5 million, two
+threads: 7 s of processor time instead of 16), because each point finds in the processor's cache
+what its predecessor needed. A tree needs about 16 bytes of memory per point; the points themselves
+may be on disk.
 """
 
 from __future__ import annotations
@@ -11,26 +12,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pcfix.blocks import bounds, empty, grouped, mapped, release, row_numbers
-from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.model import FloatArray, IntArray
 from pcfix.running import current
 
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
-
 PIECE_ROWS = 65_536
-MOST_IN_A_TREE = 2_000_000
-"""Points of a cloud that is not cut into tiles to search the nearest of them."""
+LEAF_POINTS = 32
 SLACK = 1.0 + 1e-9
 """Distances whose ratio is smaller than this count as equal: more than rounding, less than any step
 of a LAS file at the distance of neighbours."""
-_TREES = 16
 _SPARE_COLUMNS, _MOST_COLUMNS = 8, 1024
 _ENTRIES = 4_000_000
 
@@ -39,17 +33,12 @@ class Neighbours:
     """Search neighbours among the points of tiles, in space (3 axes) or in plan (2 axes)."""
 
     def __init__(self, tiles: Tiles, axes: int) -> None:
-        self.tiles, self.axes = tiles, axes
-        self._low, self._high = tiles.low[:, :axes], tiles.high[:, :axes]
+        from scipy.spatial import cKDTree  # slow to import
 
-        @lru_cache(maxsize=_TREES)
-        def tree(tile: int) -> cKDTree:
-            from scipy.spatial import cKDTree  # slow to import
-
-            first, last = tiles.start[tile : tile + 2]
-            return cKDTree(np.array(tiles.xyz[first:last, :axes]), balanced_tree=False)
-
-        self._tree = tree
+        self.tiles, self.axes, points = tiles, axes, tiles.xyz
+        if points.shape[1] != axes:
+            points = mapped(lambda some: np.ascontiguousarray(some[:, :axes]), points)
+        self._tree = cKDTree(points, LEAF_POINTS, balanced_tree=False)
 
     def nearest(self, xyz: FloatArray, k: int) -> tuple[FloatArray, IntArray]:
         """Return the k nearest points of the tiles, which hold at least k.
@@ -59,47 +48,9 @@ class Neighbours:
         equally far points is not defined, nor which of them are returned if the last ones are
         equally far.
         """
-        points = np.ascontiguousarray(xyz[:, : self.axes])
-        distance = np.full((len(points), k), np.inf)
-        place = np.zeros((len(points), k), np.int64)
-        rest = np.arange(len(points))
-        low, high = bounds(points)
-        gaps = _gap(low, high, self._low, self._high)
-        middle = (low + high - self._low - self._high) / 2.0
-        for tile in np.lexsort((np.hypot(*middle[:, :2].T), gaps)):
-            rest = rest[distance[rest, -1] * SLACK >= gaps[tile]]
-            if not rest.size:
-                break
-            rows = rest
-            for axis in range(self.axes):  # one side of the box rejects most points at once
-                at, reach = points[rows, axis], distance[rows, -1] * SLACK
-                low, high = self._low[tile, axis], self._high[tile, axis]
-                rows = rows[(low - at <= reach) & (at - high <= reach)]
-            gap = _gap(points[rows], points[rows], self._low[tile], self._high[tile])
-            rows = rows[distance[rows, -1] * SLACK >= gap]
-            if rows.size:
-                self._add(int(tile), points, rows, distance, place)
-        return distance, place
-
-    def _add(
-        self, tile: int, points: FloatArray, rows: IntArray, distance: FloatArray, place: IntArray
-    ) -> None:
-        """Merge the neighbours in one tile into those of the given rows."""
-        tree, k = self._tree(tile), distance.shape[1]
-        found = tree.query(
-            points[rows],
-            k=list(range(1, min(k, tree.n) + 1)),
-            distance_upper_bound=float(distance[rows, -1].max()) * SLACK,
-            workers=current().threads,
-        )
-        new, places = np.asarray(found[0]), np.asarray(found[1]) + self.tiles.start[tile]
-        if np.isinf(distance[rows, 0]).all():  # nothing to merge with
-            distance[rows, : new.shape[1]], place[rows, : new.shape[1]] = new, places
-            return
-        both, places = np.hstack([distance[rows], new]), np.hstack([place[rows], places])
-        order = np.argsort(both, axis=1, kind="stable")[:, :k]
-        distance[rows] = np.take_along_axis(both, order, axis=1)
-        place[rows] = np.take_along_axis(places, order, axis=1)
+        columns = list(range(1, k + 1))
+        found = self._tree.query(xyz[:, : self.axes], columns, workers=current().threads)
+        return np.asarray(found[0]), np.asarray(found[1])
 
     def with_ties(
         self, xyz: FloatArray, k: int, spare: int
@@ -145,8 +96,7 @@ def nearest_distance(places: FloatArray, points: FloatArray, axes: int = 2) -> F
     the two clouds sample a surface at different places it is at least about half the spacing of the
     points.
     """
-    few = len(points) <= MOST_IN_A_TREE
-    near = Neighbours(make_tiles(points, points=len(points) if few else None), axes)
+    near = Neighbours(make_tiles(points), axes)
     asked, distance = make_tiles(places), empty((len(places),))
     for piece in asked.pieces(PIECE_ROWS):
         distance[asked.row[piece]] = near.nearest(asked.xyz[piece], 1)[0][:, 0]
@@ -175,14 +125,6 @@ def height_quartiles(near: Neighbours, xyz: FloatArray, k: int) -> FloatArray:
     return quartiles
 
 
-def _gap(
-    low: FloatArray, high: FloatArray, other_low: FloatArray, other_high: FloatArray
-) -> FloatArray:
-    """Return the distance between boxes, zero if they touch; the last axis is x, y(, z)."""
-    apart = np.maximum(np.maximum(other_low - high, low - other_high), 0.0)
-    return np.asarray(np.sqrt((apart * apart).sum(axis=-1)))
-
-
 POINTS_PER_TILE = 250_000
 _MOST_TILES_A_SIDE = 200
 _SAMPLE = 100_000
@@ -192,7 +134,7 @@ _CELLS_ACROSS = 256
 
 @dataclass(frozen=True, eq=False)
 class Tiles:
-    """The m used points of a cloud, sorted by tile."""
+    """The m points of a cloud, sorted by tile."""
 
     xyz: FloatArray  # (m, 3), metres, world frame
     row: IntArray  # (m,), index of each point in the cloud
@@ -221,24 +163,17 @@ class Tiles:
         return np.asarray(places[np.argsort(self.row[places])])
 
 
-def make_tiles(xyz: FloatArray, used: BoolArray | None = None, points: int | None = None) -> Tiles:
-    """Sort the used points into square tiles.
+def make_tiles(xyz: FloatArray, points: int | None = None) -> Tiles:
+    """Sort points into square tiles of about `points`, by default `POINTS_PER_TILE`.
 
     The tiles cover all but the outermost hundredth of the points, so that no outlier stretches
     them; points beyond belong to the tile at the edge. Points have the shape (n, 3), or (n, 2) in
-    plan, metres, world frame; at least one is used, by default all. A tile holds about `points`, by
-    default `POINTS_PER_TILE`. The points of a tile are sorted by small cells, as a tree is queried
-    twice as fast in this order: each point finds in the processor's cache what its predecessor
-    needed.
+    plan, metres, world frame. The points of a tile are sorted by small cells.
     """
-    step = max(1, len(xyz) // _SAMPLE)
-    sample = xyz[::step] if used is None else xyz[::step][used[::step]]
-    if used is not None and not len(sample):
-        sample = np.array(xyz[int(np.argmax(used))])[None, :]
-    origin, high = np.percentile(sample[:, :2], (1.0, 99.0), axis=0)
+    sample = xyz[:: max(1, len(xyz) // _SAMPLE), :2]
+    origin, high = np.percentile(sample, (1.0, 99.0), axis=0)
     extent = np.maximum(high - origin, 1e-3)
-    share = (points or POINTS_PER_TILE) / (len(xyz) if used is None else int(used.sum()))
-    side = math.sqrt(float(extent.prod()) * share)
+    side = math.sqrt(float(extent.prod()) * (points or POINTS_PER_TILE) / len(xyz))
     side = max(side, float(extent.max()) / _MOST_TILES_A_SIDE)
     columns, rows = np.ceil(extent / side).astype(int).tolist()
 
@@ -247,11 +182,9 @@ def make_tiles(xyz: FloatArray, used: BoolArray | None = None, points: int | Non
         column, row = cell.astype(np.uint16).T
         return np.asarray(column * np.uint16(rows) + row)
 
-    number = mapped(tile_of, xyz)
-    if used is not None:
-        number[~used] = columns * rows  # one more tile, which is cut off
-    start, (places, row) = grouped(number, columns * rows + 1, xyz, row_numbers(len(xyz)))
-    start = np.unique(start[:-1])
+    numbers = mapped(tile_of, xyz)
+    start, (places, row) = grouped(numbers, columns * rows, xyz, row_numbers(len(xyz)))
+    start = np.unique(start)
     boxes = []
     for a, b in pairwise(start):
         cell = np.floor(places[a:b, :2] * (_CELLS_ACROSS / side)).astype(np.int64) % _CELLS_ACROSS
@@ -260,4 +193,4 @@ def make_tiles(xyz: FloatArray, used: BoolArray | None = None, points: int | Non
         boxes.append(bounds(places[a:b]))
         release()
     low, high = np.swapaxes(np.array(boxes), 0, 1)
-    return Tiles(places[: start[-1]], row[: start[-1]], start, low, high)
+    return Tiles(places, row, start, low, high)

@@ -5,23 +5,23 @@ They are independent of each other: each looks at all used points, whatever anot
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from enum import IntFlag
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from pcfix.blocks import kept, row_numbers
 from pcfix.clean.neighbours import PIECE_ROWS, SLACK, Neighbours, height_quartiles, make_tiles
 from pcfix.errors import bad_file
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import LEAST_NEIGHBOURS, CleanRules
-from pcfix.running import threads
+from pcfix.running import current, threads
 from pcfix.water.checks import as_surface, checked_column, checked_points
-from pcfix.water.surface import is_submerged, surface_above
+from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
 ReasonArray = npt.NDArray[np.uint8]
-Counted = Callable[[int], None]
 
 
 class Reason(IntFlag):
@@ -36,6 +36,15 @@ class Reason(IntFlag):
     FLOATING = 64
 
 
+WEAK = {
+    "RayCount": (Reason.FEW_RAYS, "min_rays", np.less),
+    "RayMiss": (Reason.RAY_MISS, "max_ray_miss", np.greater),
+    "Incidence": (Reason.INCIDENCE, "max_incidence", np.greater),
+}
+"""The tests of weak intersections: a dimension of a corrected cloud, the reason, and the name of
+the threshold and on which side of it a point is noise."""
+
+
 class Cloud(NamedTuple):
     """What the tests need of n points."""
 
@@ -44,110 +53,108 @@ class Cloud(NamedTuple):
     submerged: BoolArray  # (n,), those of them to test against the bed
     reasons: ReasonArray  # (n,), bits of `Reason`, set by the tests
 
+    def add(
+        self,
+        rows: slice,
+        xyz: FloatArray,
+        used: BoolArray,
+        above: SurfaceAbove | None,
+        rays: Mapping[str, FloatArray],
+        rules: CleanRules,
+    ) -> None:
+        """Set some rows, and flag the weak intersections among their corrected points.
 
-def flag_weak(
-    settings: CleanRules,
-    reasons: ReasonArray,
-    ray_count: npt.NDArray[np.number],
-    ray_miss_m: FloatArray | None = None,
-    incidence_deg: FloatArray | None = None,
-) -> None:
-    """Flag weak intersections among the corrected points, those with a ray count above zero.
-
-    Sets `Reason.FEW_RAYS`, `RAY_MISS` and `INCIDENCE`. All arrays have the shape (n,); without ray
-    distances or incidence angles (see `pcfix.Correction`) their test is skipped.
-    """
-    corrected = ray_count > 0
-    if settings.min_rays is not None:
-        _set(reasons, corrected & (ray_count < settings.min_rays), Reason.FEW_RAYS)
-    if settings.max_ray_miss is not None and ray_miss_m is not None:
-        _set(reasons, corrected & (ray_miss_m > settings.max_ray_miss), Reason.RAY_MISS)
-    if settings.max_incidence is not None and incidence_deg is not None:
-        _set(reasons, corrected & (incidence_deg > settings.max_incidence), Reason.INCIDENCE)
+        `above` is the water; without it the points with rays are submerged. `rays` are the
+        dimensions of `WEAK` by name, as far as they are known. Points without rays, which were not
+        corrected, have no weak intersection.
+        """
+        self.xyz[rows], self.used[rows] = xyz, used
+        if "RayCount" in rays:
+            corrected = used & (rays["RayCount"] > 0)
+            self.submerged[rows] = corrected
+            for name, (reason, limit, is_beyond) in WEAK.items():
+                value = getattr(rules, limit)
+                if value is not None and name in rays:
+                    _set(self.reasons[rows], corrected & is_beyond(rays[name], value), reason)
+        if above is not None:
+            self.submerged[rows] = used & is_submerged(xyz[:, 2], above)
 
 
-def flag_neighbours(
-    name: str, cloud: Cloud, settings: CleanRules, progress: Counted | None = None
-) -> dict[str, float]:
+def flag_neighbours(name: str, cloud: Cloud, rules: CleanRules) -> dict[str, float]:
     """Run the tests that look at neighbours: see `flag_sparse` and `flag_off_bed`.
 
-    `progress` is called with the number of points of each piece that a test has done.
+    Each reports the number of points of each piece that it has done; see `pcfix.running.Run`.
     """
-    least = max(LEAST_NEIGHBOURS, settings.nearest)
-    used, submerged = int(cloud.used.sum()), int(cloud.submerged.sum())
-    if used < least + 1:
-        sentence = (
-            f"has {used:,} points that are neither withheld nor noise, too few for a neighbourhood"
-            f" of {least}. Use fewer neighbours, or skip the cleaning."
-        )
-        raise bad_file(name, "cloud.too_few_points", sentence, points=used, least=least + 1)
-    least = settings.bed_neighbours
-    if settings.below_or_floating and 0 < submerged < least + 1:
-        sentence = (
-            f"has {submerged:,} submerged points, too few for a neighbourhood of {least} on the"
-            " bed. Use fewer bed-neighbours, or switch off the tests below and floating."
-        )
-        raise bad_file(name, "cloud.too_few_points", sentence, points=submerged, least=least + 1)
-    distances = flag_sparse(cloud, settings, progress) if settings.nearest else {}
-    if settings.below_or_floating and submerged:
-        flag_off_bed(cloud, settings, progress)
+    nearest = max(LEAST_NEIGHBOURS, rules.nearest)
+    on_bed = rules.bed_neighbours if rules.below_or_floating and cloud.submerged.any() else 0
+    for rows, least, what, remedy in (
+        (cloud.used, nearest, "points that are neither withheld nor noise",
+         "Use fewer neighbours, or skip the cleaning."),
+        (cloud.submerged, on_bed, "submerged points",
+         "Use fewer bed-neighbours, or switch off the tests below and floating."),
+    ):  # fmt: skip
+        count = int(rows.sum())
+        if least and count < least + 1:
+            sentence = f"has {count:,} {what}, too few for a neighbourhood of {least}. {remedy}"
+            raise bad_file(name, "cloud.too_few_points", sentence, points=count, least=least + 1)
+    distances = flag_sparse(cloud, rules) if rules.nearest else {}
+    if on_bed:
+        flag_off_bed(cloud, rules)
     return distances
 
 
-def flag_sparse(cloud: Cloud, settings: CleanRules, progress: Counted | None) -> dict[str, float]:
+def flag_sparse(cloud: Cloud, rules: CleanRules) -> dict[str, float]:
     """Flag statistical and radius outliers: `Reason.STATISTICAL` and `RADIUS`.
 
-    More than ``settings.nearest`` points are used. Returns mean, standard deviation and limit of
-    the mean distances to the neighbours, metres; empty without the statistical test.
+    More than ``rules.nearest`` points are used. Returns mean, standard deviation and limit of the
+    mean distances to the neighbours, metres; empty without the statistical test.
 
     Both tests find what open3d's ``remove_statistical_outlier`` and ``remove_radius_outlier``
     find, except in clouds where enough points coincide that the mean distance is zero, or where it
     is the same for all points. There open3d takes all points for outliers, and pcfix none.
     """
-    mean_m = np.zeros(len(cloud.xyz)) if settings.statistical else None
-    for near, rows, xyz in _pieces(cloud.xyz, cloud.used, 3, progress):
-        distance, _ = near.nearest(xyz, settings.nearest)
+    mean_m = np.zeros(len(cloud.xyz)) if rules.statistical else None
+    for near, rows, xyz in _pieces(cloud.xyz, cloud.used, 3):
+        distance, _ = near.nearest(xyz, rules.nearest)
         if mean_m is not None:
-            mean_m[rows] = distance[:, : settings.neighbours].mean(axis=1)
-        if settings.radius is not None:
-            lonely = distance[:, settings.radius_neighbours] * SLACK >= settings.radius
+            mean_m[rows] = distance[:, : rules.neighbours].mean(axis=1)
+        if rules.radius is not None:
+            lonely = distance[:, rules.radius_neighbours] * SLACK >= rules.radius
             _set(cloud.reasons, rows[lonely], Reason.RADIUS)
     if mean_m is None:
         return {}
     known = mean_m[cloud.used]  # in the order of the file
     mean, sd = float(known.mean()), float(known.std(ddof=1))
-    limit = mean + (settings.deviations or 0.0) * sd
+    limit = mean + (rules.deviations or 0.0) * sd
     _set(cloud.reasons, cloud.used & (mean_m > limit * SLACK), Reason.STATISTICAL)
     return {"mean": mean, "sd": sd, "limit": limit}
 
 
-def flag_off_bed(cloud: Cloud, settings: CleanRules, progress: Counted | None) -> None:
+def flag_off_bed(cloud: Cloud, rules: CleanRules) -> None:
     """Flag submerged points below the bed (`Reason.BELOW_BED`) and above it (`FLOATING`).
 
     The bed at a point is the middle half, by height, of the submerged points nearest to it in plan;
-    see `CleanRules`. At least ``settings.bed_neighbours`` points are submerged.
+    see `CleanRules`. At least ``rules.bed_neighbours`` points are submerged.
     """
-    for near, rows, xyz in _pieces(cloud.xyz, cloud.submerged, 2, progress):
-        lower, upper = height_quartiles(near, xyz, settings.bed_neighbours).T
-        fence, z = settings.fences * (upper - lower), xyz[:, 2]
-        if settings.below is not None:
-            below = lower - z > np.maximum(fence, settings.below)
-            _set(cloud.reasons, rows[below], Reason.BELOW_BED)
-        if settings.floating is not None:
-            above = z - upper > np.maximum(fence, settings.floating)
-            _set(cloud.reasons, rows[above], Reason.FLOATING)
+    for near, rows, xyz in _pieces(cloud.xyz, cloud.submerged, 2):
+        lower, upper = height_quartiles(near, xyz, rules.bed_neighbours).T
+        fence, z = rules.fences * (upper - lower), xyz[:, 2]
+        for reason, least_m, off_m in (
+            (Reason.BELOW_BED, rules.below, lower - z), (Reason.FLOATING, rules.floating, z - upper)
+        ):  # fmt: skip
+            if least_m is not None:
+                _set(cloud.reasons, rows[off_m > np.maximum(fence, least_m)], reason)
 
 
 def _pieces(
-    xyz: FloatArray, used: BoolArray, axes: int, progress: Counted | None
+    xyz: FloatArray, used: BoolArray, axes: int
 ) -> Iterator[tuple[Neighbours, IntArray, FloatArray]]:
     """Yield the search, and rows and coordinates of the used points, piece by piece."""
-    tiles = make_tiles(xyz, used)
+    tiles, row = make_tiles(kept(used, xyz)), kept(used, row_numbers(len(xyz)))
     near = Neighbours(tiles, axes)
     for piece in tiles.pieces(PIECE_ROWS):
-        yield near, tiles.row[piece], tiles.xyz[piece]
-        if progress is not None:
-            progress(piece.stop - piece.start)
+        yield near, row[tiles.row[piece]], tiles.xyz[piece]
+        current().report(piece.stop - piece.start)
 
 
 def _set(reasons: ReasonArray, where: BoolArray | IntArray, reason: Reason) -> None:
@@ -213,26 +220,23 @@ def clean_points(
     >>> [(int(row), Reason(int(reasons[row])).name) for row in np.flatnonzero(reasons)]
     [(450, 'FLOATING')]
     """
-    points = checked_points(xyz)
-    settings = settings or CleanRules()
+    points, rules = checked_points(xyz), settings or CleanRules()
     n = len(points)
-    given, rays, miss, incidence = (
-        None if one is None else checked_column(name, one, (n,))
-        for name, one in {
-            "used": used, "ray_count": ray_count, "ray_miss_m": ray_miss_m,
-            "incidence_deg": incidence_deg,
-        }.items()
-    )  # fmt: skip
-    mask = np.ones(n, np.bool_) if given is None else given.astype(np.bool_)
-    submerged, reasons = np.zeros(n, np.bool_), np.zeros(n, np.uint8)
-    if rays is not None:
-        flag_weak(settings, reasons, rays, miss, incidence)
-        reasons[~mask] = 0
-        submerged = rays > 0
+    given = {"ray_count": ray_count, "ray_miss_m": ray_miss_m, "incidence_deg": incidence_deg}
+    rays = {
+        dimension: checked_column(name, values, (n,))
+        for dimension, (name, values) in zip(WEAK, given.items(), strict=True)
+        if values is not None
+    }
+    mask = np.ones(n, np.bool_)
+    if used is not None:
+        mask = checked_column("used", used, (n,)).astype(np.bool_)
+    above = None
     if water is not None:
         surface, heights = as_surface(water, n)
-        submerged = is_submerged(points[:, 2], surface_above(surface, points, heights))
+        above = surface_above(surface, points, heights)
+    cloud = Cloud(np.empty((n, 3)), *(np.zeros(n, kind) for kind in (bool, bool, np.uint8)))
+    cloud.add(slice(n), points, mask, above, rays, rules)
     with threads(jobs):
-        cloud = Cloud(points, mask, mask & submerged, reasons)
-        flag_neighbours("xyz", cloud, settings)
-    return reasons
+        flag_neighbours("xyz", cloud, rules)
+    return cloud.reasons

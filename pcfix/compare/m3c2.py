@@ -6,16 +6,16 @@ import contextlib
 import logging
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from pcfix.clean.neighbours import SLACK, Neighbours, Tiles, make_tiles
-from pcfix.compare.statistics import Statistics, statistics_of
+from pcfix.clean.neighbours import SLACK, Neighbours, make_tiles
+from pcfix.compare.statistics import statistics_of
 from pcfix.errors import GeometryError
 from pcfix.libraries import optional_library
 from pcfix.model import FloatArray, IntArray
+from pcfix.sums import Figures
 
 MAX_CORE_POINTS = 100_000
 TILE_POINTS = 500_000
@@ -25,30 +25,10 @@ NORMAL_SPACINGS, CYLINDER_SPACINGS = 6.0, 3.0
 """Radii in point spacings of the sparser cloud: a cylinder holds about 28 points."""
 
 
-@dataclass(frozen=True, slots=True)
-class M3c2:
-    """Signed distances along the local normal, positive where the cloud lies above."""
-
-    core_points: int
-    statistics: Statistics  # of the distances where both clouds have points in the cylinder
-    mean_level_of_detection_m: float  # at 95 %, from roughness and density
-    significant_share: float  # of distances beyond their own level of detection, 0 to 1
-    normal_radius_m: float
-    cylinder_radius_m: float
-    max_distance_m: float
-
-
 def load_py4dgeo() -> Any:
     """Import py4dgeo; InputError ``library.missing`` if it is not installed."""
     with _silence():
         return optional_library("py4dgeo", "m3c2", "M3C2")
-
-
-def point_spacing_m(xyz: FloatArray, tiles: Tiles) -> float:
-    """Return the median distance to the nearest other point of a sample of the cloud (n, 3)."""
-    sample = xyz[sample_rows(len(xyz), SPACING_SAMPLE)]
-    distance, _ = Neighbours(tiles, 3).nearest(sample, min(2, len(xyz)))
-    return float(np.median(distance[:, -1]))
 
 
 def sample_rows(count: int, most: int) -> IntArray:
@@ -56,17 +36,21 @@ def sample_rows(count: int, most: int) -> IntArray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
-def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float) -> M3c2:
+def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float) -> Figures:
     """Return M3C2 distances of a cloud from a reference, at `MAX_CORE_POINTS` points at most.
 
-    The core points are rows of the cloud, (n, 3), which also gives the normals; the reference has
-    the shape (m, 3), both metres, world frame. The cylinders reach at least `max_distance_m` to
-    either side. Raises GeometryError ``reference.no_overlap`` if no cylinder holds points of both.
+    They are along the local normal, positive where the cloud is above. The core points are rows of
+    the cloud, (n, 3), which also gives the normals; the reference has the shape (m, 3), both
+    metres, world frame. The cylinders reach at least `max_distance_m` to either side. Raises
+    GeometryError ``reference.no_overlap`` if no cylinder holds points of both.
     """
     py4dgeo = load_py4dgeo()
     clouds = make_tiles(xyz, points=TILE_POINTS), make_tiles(reference, points=TILE_POINTS)
-    spacings = (point_spacing_m(*one) for one in zip((xyz, reference), clouds, strict=True))
-    spacing = max(1e-3, *spacings)
+    spacing = 1e-3  # median distance to the nearest other point, of the sparser cloud
+    for one, cut in zip((xyz, reference), clouds, strict=True):
+        sample = one[sample_rows(len(one), SPACING_SAMPLE)]
+        near, _ = Neighbours(cut, 3).nearest(sample, min(2, len(one)))
+        spacing = max(spacing, float(np.median(near[:, -1])))
     normal, cylinder = NORMAL_SPACINGS * spacing, CYLINDER_SPACINGS * spacing
     # py4dgeo cuts a cylinder into lengths of its radius: an odd number of them, as a core point on
     # the border of two would count twice, once or not at all
@@ -108,14 +92,15 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
     distance, detection = distance[known], detection[known]
     certain = np.isfinite(detection)
     beyond = np.abs(distance[certain]) > detection[certain]
-    return M3c2(
-        len(core),
-        statistics_of(distance),
-        float(detection[certain].mean()) if certain.any() else float("nan"),
-        float(beyond.mean()) if certain.any() else 0.0,
-        normal,
-        cylinder,
-        max_distance_m,
+    return Figures(
+        core_points=len(core),
+        statistics=statistics_of(distance),  # where both clouds have points in the cylinder
+        # at 95 %, from roughness and density; and the share of distances beyond it
+        mean_level_of_detection_m=float(detection[certain].mean()) if certain.any() else math.nan,
+        significant_share=float(beyond.mean()) if certain.any() else 0.0,
+        normal_radius_m=normal,
+        cylinder_radius_m=cylinder,
+        max_distance_m=max_distance_m,
     )
 
 

@@ -39,9 +39,14 @@ class SurveyCloud:
     def __len__(self) -> int:
         return len(self.xyz)
 
+    @property
+    def after(self) -> FloatArray:
+        """The points after the correction, shape (n, 3)."""
+        return self.xyz
+
     @cached_property
-    def apparent(self) -> FloatArray | None:
-        """The points before the correction, shape (n, 3), metres."""
+    def before(self) -> FloatArray | None:
+        """The apparent points before the correction, shape (n, 3); None if they are not known."""
         return None if self.shift_m is None else mapped(np.subtract, self.xyz, self.shift_m)
 
     def take(self, rows: BoolArray) -> SurveyCloud:
@@ -79,15 +84,19 @@ class Match:
     """The points of a cloud and a reference that are compared."""
 
     whole: SurveyCloud  # all points that are neither withheld nor noise
-    cloud: SurveyCloud  # the n points of it to compare
+    asked: SurveyCloud  # those under water, if only these are compared
+    cloud: SurveyCloud  # the n points of these within the reference
     wet: BoolArray  # (n,), those under water
     dry: BoolArray  # those of the whole cloud above the water
     reference: Reference
     places: FloatArray  # (p, 3), points of the reference that the cloud covers, metres
-    asked: SurveyCloud  # points of the cloud that may be the nearest to one of these
     outside: int  # points outside the overlap, and on land; check points if the reference is sparse
     not_submerged: int
     settings: CompareRules
+
+    def facing(self, xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return where a cloud is measured, and the surface to which: its own at check points."""
+        return (self.places, xyz) if self.reference.sparse else (xyz, self.reference.xyz)
 
     @cached_property
     def water_points(self) -> FloatArray:
@@ -103,10 +112,9 @@ class Match:
 
         Without a surface it is the height above the nearest point where it is known.
         """
-        if self.whole.water is not None:
+        if (water := self.whole.water) is not None:
             from pcfix.water.surface import surface_above  # slow to import
 
-            water = self.whole.water
             return mapped(
                 lambda p: surface_above(water, np.column_stack([p, p[:, 0]])).height_m, xy
             )
@@ -125,19 +133,20 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
     Raises PcfixError if the clouds do not overlap, nothing is under water where that was asked for,
     or the reference does not allow the direction of C2C.
     """
+    direction = settings.direction
     if target.raster and settings.from_reference:
         raise SettingError(
             "reference.no_points",
-            f"{target.name} is a raster, and --direction {settings.direction} starts at measured"
-            " points of the reference. Give the reference as LAS or LAZ, or leave out --direction.",
-            path=target.name, direction=settings.direction,
+            f"{target.name} is a raster, and --direction {direction} starts at measured points of"
+            " the reference. Give the reference as LAS or LAZ, or leave out --direction.",
+            path=target.name, direction=direction,
         )  # fmt: skip
-    if target.sparse and settings.direction not in (None, "from-reference"):
+    if target.sparse and direction not in (None, "from-reference"):
         raise SettingError(
             "reference.check_points",
-            f"{target.name} has check points, and --direction {settings.direction} needs a dense"
-            " reference. Use --direction from-reference, or leave it out.",
-            path=target.name, direction=settings.direction,
+            f"{target.name} has check points, and --direction {direction} needs a dense reference."
+            " Use --direction from-reference, or leave it out.",
+            path=target.name, direction=direction,
         )  # fmt: skip
     wet = mapped(lambda xyz, water: xyz[:, 2] < water, whole.xyz, whole.water_m)
     if not given:
@@ -149,19 +158,17 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
             " leave out --submerged."
         )
         raise bad_file(whole.name, "cloud.not_submerged", sentence)
-    not_submerged = int(len(whole) - chosen.sum())
+    asked, not_submerged = whole.take(chosen), int(len(whole) - chosen.sum())
+    by_place = target.sparse or settings.from_reference
     places, near = target.xyz, chosen
-    if target.sparse or settings.from_reference:
+    if by_place:
         gap = settings.max_gap or gap_m(whole.xyz)
-        places = kept(near_in_plan(places, kept(chosen, whole.xyz), gap), places)
-    if target.sparse:
-        outside = len(target.xyz) - len(places)
-    else:
+        places = kept(near_in_plan(places, asked.xyz, gap), places)
+    if not target.sparse:
         gap = settings.max_gap or gap_m(target.xyz)
         near = chosen & near_in_plan(whole.xyz, target.xyz, gap)
-        outside = int(chosen.sum() - near.sum())
     if not (near.any() and len(places)):
-        boxes = [bounds(xyz[:, :2]) for xyz in (kept(chosen, whole.xyz), target.xyz)]
+        boxes = [bounds(xyz[:, :2]) for xyz in (asked.xyz, target.xyz)]
         places_of = [
             f"{name} (x {low[0]:.1f} to {high[0]:.1f}, y {low[1]:.1f} to {high[1]:.1f})"
             for name, (low, high) in zip((whole.name, target.name), boxes, strict=True)
@@ -171,10 +178,10 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
             f"{' and '.join(places_of)} do not overlap in plan. Check the CRS of both.",
             cloud=whole.name, reference=target.name, bounds=boxes,
         )  # fmt: skip
-    cloud, by_place = whole.take(near), target.sparse or settings.from_reference
-    asked = whole.take(chosen) if settings.from_reference and not target.sparse else cloud
+    outside = len(target.xyz) - len(places) if target.sparse else int((chosen & ~near).sum())
     found = Match(
-        whole, cloud, kept(near, wet), ~wet, target, places, asked, outside, not_submerged, settings
+        whole, asked, whole.take(near), kept(near, wet), ~wet, target, places, outside,
+        not_submerged, settings,
     )  # fmt: skip
     surface = found.water_at(places[:, :2]) if by_place and settings.submerged else None
     if surface is None:
@@ -245,16 +252,14 @@ def near_in_plan(xy: FloatArray, other_xy: FloatArray, limit_m: float) -> BoolAr
     return mapped(lambda some: np.isin(squares(some), near), xy)
 
 
-def heights_at(
-    xy: FloatArray, surface: FloatArray, neighbours: int
-) -> tuple[FloatArray, BoolArray]:
-    """Return the height of a surface at places in plan, (n,), and where it is that of one point.
+def heights_at(xy: FloatArray, surface: FloatArray, neighbours: int) -> FloatArray:
+    """Return the height of a surface at places in plan, (n, 2) or (n, 3).
 
-    At each place, (n, 2) or (n, 3), a plane is fitted by least squares in Z to the `neighbours`
-    points of the surface, (m, 3), that are nearest in plan, and evaluated; metres, world frame. If
-    these points lie on a line, or the place far outside them, the height of the nearest is used.
+    At each place a plane is fitted by least squares in Z to the `neighbours` points of the surface,
+    (m, 3), that are nearest in plan, and evaluated; metres, world frame. If these points are on a
+    line, or the place is far outside them, the height of the nearest is used.
     """
-    height, by_nearest = empty((len(xy),)), empty((len(xy),), np.bool_)
+    height = empty((len(xy),))
     for rows, here, near in nearest_of(xy, surface, neighbours):
         near[:, :, :2] -= here[:, np.newaxis, :2]
         middle = near.mean(axis=1)
@@ -271,5 +276,5 @@ def heights_at(
         reach = (vv * mu * mu - 2.0 * uv * mu * mv + uu * mv * mv) / safe
         fitted = flat & (reach <= MAX_REACH**2)
         plane = middle[:, 2] - slope_u * mu - slope_v * mv
-        height[rows], by_nearest[rows] = np.where(fitted, plane, near[:, 0, 2]), ~fitted
-    return height, by_nearest
+        height[rows] = np.where(fitted, plane, near[:, 0, 2])
+    return height

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,23 +16,13 @@ STATIONS = 200
 """Maximum number of stations; they are at least a quarter of the corridor's width apart."""
 
 
-@dataclass(frozen=True, slots=True)
-class SectionLine:
+class SectionLine(NamedTuple):
     """A line in plan from (x1, y1) to (x2, y2), metres, world frame."""
 
     x1: float
     y1: float
     x2: float
     y2: float
-
-    def __post_init__(self) -> None:
-        """Check that the line has a length."""
-        if not (np.isfinite(self.length_m) and self.length_m > 0.0):
-            sentence = f"section {self} has no length. Give two different points x1,y1,x2,y2."
-            raise SettingError("option.section", sentence, value=str(self))
-
-    def __str__(self) -> str:
-        return f"{self.x1:.10g},{self.y1:.10g},{self.x2:.10g},{self.y2:.10g}"
 
     @property
     def length_m(self) -> float:
@@ -67,10 +58,13 @@ def parse_line(text: str) -> SectionLine:
     """Parse ``x1,y1,x2,y2``; SettingError ``option.section`` if that is no line."""
     try:
         x1, y1, x2, y2 = (float(part) for part in text.split(","))
+        line = SectionLine(x1, y1, x2, y2)
+        if 0.0 < line.length_m < np.inf:
+            return line
     except ValueError:
-        sentence = "is not four numbers x1,y1,x2,y2. Give them in the CRS of the cloud."
-        raise SettingError("option.section", f"section '{text}' {sentence}", value=text) from None
-    return SectionLine(x1, y1, x2, y2)
+        pass
+    sentence = "is not x1,y1,x2,y2, two different points. Give them in the CRS of the cloud."
+    raise SettingError("option.section", f"section '{text}' {sentence}", value=text)
 
 
 def section_along(line: SectionLine, layers: dict[str, FloatArray], half_width_m: float) -> Section:

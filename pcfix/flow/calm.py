@@ -27,16 +27,7 @@ from pcfix.options.declare import File, taken
 from pcfix.options.photos import CalmOptions
 from pcfix.photos.calm import LEAST_CORNERS, corners_in, covered, laid, median_of, register
 from pcfix.photos.mapping import Photo
-from pcfix.photos.waves import (
-    Nodes,
-    Slopes,
-    View,
-    displacements,
-    fit_waves,
-    nodes_of,
-    slopes_of,
-    still,
-)
+from pcfix.photos.waves import Nodes, View, displacements, fit_waves, nodes_of, slopes_of, still
 from pcfix.running import threads
 from pcfix.sums import Figures
 from pcfix.water.index import index_of
@@ -98,7 +89,9 @@ def calm_frames(
 
     with threads(given.jobs), scratch_arrays(target) as empty:
         view, crs = _view(given, found) if given.surface else (None, None)
-        homographies, scatter = _registered(found, count(found), still=given.still)
+        homographies, scatter = np.tile(np.eye(3), (len(found.names), 1, 1)), np.empty(0)
+        if not given.still:
+            homographies, scatter = _registered(found, count(found))
         median, spread, stack = _median(found, homographies, empty, count(found))
         notes, water = list[PcfixWarning](), None
         if view is not None:
@@ -107,7 +100,8 @@ def calm_frames(
             measured = displacements(median, view, nodes, count(stack))
             shifts, weights = (np.stack(one) for one in zip(*measured, strict=True))
             weights[:, still(shifts, weights)] = 0.0
-            waters, water = _water(view, nodes, shifts, weights, interval, str(folder))
+            waters, water = _water(view, nodes, shifts, weights, interval)
+            water.folder = str(folder)
             with temporary_output(folder, is_folder=True) as draft:
                 _write_waters(draft, found.names, view.level_m, nodes.lattice, waters, crs)
             if interval is None:
@@ -145,12 +139,8 @@ def calm_frames(
     return summary
 
 
-def _registered(
-    frames: Frames, images: Iterable[Any], *, still: bool
-) -> tuple[FloatArray, FloatArray]:
-    """Register all frames to the first as `register`, unless the camera stood still."""
-    if still:
-        return np.tile(np.eye(3), (len(frames.names), 1, 1)), np.empty(0)
+def _registered(frames: Frames, images: Iterable[Any]) -> tuple[FloatArray, FloatArray]:
+    """Register all frames to the first as `register`, or refuse them."""
     homographies, scatter = register(np.stack(list(corners_in(images))))
     lost = np.flatnonzero(~np.isfinite(homographies).all(axis=(1, 2)))
     if len(lost):
@@ -244,43 +234,33 @@ def _bed(given: CalmOptions) -> tuple[Callable[[FloatArray], FloatArray], str | 
 
 
 def _water(
-    view: View, nodes: Nodes, shifts: FloatArray, weights: FloatArray, interval: float | None,
-    folder: str,
-) -> tuple[list[tuple[FloatArray, FloatArray]], Figures]:  # fmt: skip
+    view: View, nodes: Nodes, shifts: FloatArray, weights: FloatArray, interval: float | None
+) -> tuple[list[tuple[FloatArray, FloatArray]], Figures]:
     """Fit the water of each frame; return heights and standard errors, and a summary."""
-    times = np.arange(len(shifts), dtype=np.float64) * (interval or 0.0)
-    middle, seen = nodes.xy.mean(axis=0), nodes.seen
+    times, seen = np.arange(len(shifts), dtype=np.float64) * (interval or 0.0), nodes.seen
     depth = float(np.nanmedian(view.level_m - view.bed(nodes.xy[seen])))
-    heights = np.full((len(shifts), len(nodes.xy)), view.level_m)
-    found: list[tuple[FloatArray, FloatArray]] = []
+    heights = np.full(shifts.shape[:2], view.level_m)
     for _ in range(PASSES):
-        slope = np.stack(
-            [slopes_of(view, nodes.xy, *one) for one in zip(heights, shifts, strict=True)]
-        )
-        known = np.isfinite(slope.sum(axis=2))
-        if not (known & (weights > 0.0)).any():
+        both = zip(heights, shifts, strict=True)
+        slope = np.stack([slopes_of(view, nodes.xy, *one) for one in both])
+        weight = np.where(np.isfinite(slope.sum(axis=2)), weights, 0.0)
+        slope = np.nan_to_num(slope)
+        if not (weight > 0.0).any():
             raise GeometryError(
                 "frames.no_water",
                 "No part of the image shows a bed under moving water. Check depth and level.",
                 depth_m=depth,
             )
-        data = Slopes(
-            np.nan_to_num(slope), np.where(known, weights, 0.0), times,
-            nodes.xy - middle, nodes.lattice,
-        )  # fmt: skip
         if interval is not None:  # time ties the frames together
-            waves = [fit_waves(data, depth)] * len(times)
+            waves = [fit_waves(nodes, slope, weight, times, depth)] * len(times)
         else:
-            waves = [
-                fit_waves(data._replace(slope=s[None], weight=w[None], time_s=np.zeros(1)), depth)
-                for s, w in zip(data.slope, data.weight, strict=True)
-            ]
-        found = [w.at(nodes.xy - middle, t) for w, t in zip(waves, times, strict=True)]
+            each = zip(slope[:, None], weight[:, None], times[:, None], strict=True)
+            waves = [fit_waves(nodes, *one, depth) for one in each]
+        found = [w.at(nodes, t) for w, t in zip(waves, times, strict=True)]
         heights = view.level_m + np.stack([height for height, _ in found])
-    weight = data.weight[..., None]
-    energy = float((weight * data.slope**2).sum() / (2.0 * weight.sum()))
+    energy = float((weight[..., None] * slope**2).sum() / (2.0 * weight.sum()))
     summary = Figures(
-        folder=folder, waves=max(len(one.number) for one in waves),
+        folder="", waves=max(len(one.number) for one in waves),
         slope_deg=round(float(np.degrees(np.sqrt(energy))), 3),
         height_m=round(float(np.std([one[0][seen] for one in found])), 4),
         sigma_m=round(float(np.sqrt(np.mean([one[1][seen] ** 2 for one in found]))), 4),

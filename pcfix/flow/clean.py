@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
@@ -11,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.blocks import empty, release
-from pcfix.clean.points import Cloud, Reason, flag_neighbours, flag_weak
+from pcfix.clean.points import WEAK, Cloud, Reason, flag_neighbours
 from pcfix.errors import bad_file
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
 from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
@@ -24,10 +25,11 @@ from pcfix.model import LOW_NOISE, NOISE_CLASSES, BoolArray, FloatArray, WaterSu
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CleanOptions, CleanRules
+from pcfix.running import current, running
 from pcfix.sums import Figures
 from pcfix.version import __version__
 from pcfix.water.checks import check_submerged
-from pcfix.water.surface import is_submerged, surface_above
+from pcfix.water.surface import surface_above
 
 _PASSES = 4
 
@@ -50,7 +52,7 @@ def clean_file(
     ----------
     input, output : path
         The names end in ``.las`` or ``.laz``; the output is LAS 1.4, see `correct_file`. The
-        search needs 90 bytes per point of disk beside the output. Or many files and a folder, see
+        search needs 120 bytes per point of disk beside the output. Or many files and a folder, see
         `pcfix.correct_file`: neighbours are those of the whole cloud.
     options, progress
         See `pcfix.correct_file`.
@@ -65,13 +67,8 @@ def clean_file(
     )  # fmt: skip
 
 
-RAY_DIMENSIONS = ("RayCount", "RayMiss", "Incidence")
-"""Dimensions of a corrected cloud that the tests of weak intersections need."""
-_NEEDS = {"few rays": "min_rays", "ray miss": "max_ray_miss", "incidence": "max_incidence"}
-
-
 Tested: TypeAlias = tuple[Points, BoolArray, dict[str, FloatArray]]
-"""Some points, which of them are withheld, and by name those of `RAY_DIMENSIONS` there are."""
+"""Some points, which of them are withheld, and by name those dimensions of `WEAK` there are."""
 
 
 def find_noise(
@@ -81,7 +78,6 @@ def find_noise(
     names: Collection[str],
     chunks: Callable[[WaterSurface | None], Iterable[Tested]],
     n: int,
-    progress: Callable[[int], None] | None = None,
     *,
     has_rays: bool = True,
 ) -> tuple[BoolArray, Figures]:
@@ -92,66 +88,57 @@ def find_noise(
     Returns which points are noise, shape (n,), and a summary without files and time.
     """
     rules, not_run = options.part(CleanRules), list[str]()
+    tests = {
+        str(reason.name).lower().replace("_", " "): limit for reason, limit, _ in WEAK.values()
+    }
     if rules.weak and not has_rays:
         rules = replace(rules, weak=False)
-        not_run.append(f"{', '.join(_NEEDS)}: the cloud was corrected without cameras")
+        not_run.append(f"{', '.join(tests)}: the cloud was corrected without cameras")
     water = None
     if options.water is not None:
         water = find_surface(options.water, WaterOptions(), view()).surface
-    has = [one for one in RAY_DIMENSIONS if {"RayCount", one} <= set(names)]
+    has = {one for one in WEAK if {"RayCount", one} <= set(names)}
     not_run += [
         f"{test}: the cloud has no dimension {dimension if has else 'RayCount'}"
-        for (test, limit), dimension in zip(_NEEDS.items(), RAY_DIMENSIONS, strict=True)
+        for (test, limit), dimension in zip(tests.items(), WEAK, strict=True)
         if getattr(rules, limit) is not None and dimension not in has
     ]
     if rules.below_or_floating and water is None and not has:
         not_run.append("below bed, floating: no --water, and no dimension RayCount")
-
-    used, submerged, reasons = (np.zeros(n, kind) for kind in (bool, bool, np.uint8))
-    cloud = Cloud(empty((n, 3)), used, submerged, reasons)
+    cloud = Cloud(empty((n, 3)), *(np.zeros(n, kind) for kind in (bool, bool, np.uint8)))
     first = 0
-    for points, withheld, known in chunks(water):
-        count = len(withheld)
-        rows = slice(first, first + count)
-        xyz, heights, classes, *_ = points
-        cloud.xyz[rows] = xyz
-        used[rows] = ~(withheld | np.isin(classes, NOISE_CLASSES))
-        rays, miss, incidence = (known.get(dimension) for dimension in RAY_DIMENSIONS)
-        if rays is not None:
-            flag_weak(rules, reasons[rows], rays, miss, incidence)
-            reasons[rows][~used[rows]] = 0
-        if water is not None:
-            above = surface_above(water, xyz, heights)
-            submerged[rows] = used[rows] & is_submerged(xyz[:, 2], above)
-        elif rays is not None:
-            submerged[rows] = used[rows] & (rays > 0)
-        first += count
+    for points, withheld, rays in chunks(water):
+        rows = slice(first, first + len(withheld))
+        used = ~(withheld | np.isin(points.classes, NOISE_CLASSES))
+        above = None if water is None else surface_above(water, points.xyz, points.heights)
+        cloud.add(rows, points.xyz, used, above, rays, rules)
+        first = rows.stop
         release()
-        if progress is not None:
-            progress(count)
-    if not used.any():
+        current().report(len(withheld))
+    tested, submerged = int(cloud.used.sum()), int(cloud.submerged.sum())
+    if not tested:
         sentence = (
             f"all {n:,} points are withheld or noise (class 7 or 18). There is nothing left to"
             " clean."
         )
         raise bad_file(name, "cloud.all_withheld", sentence, points=n)
     if not rules.below_or_floating:
-        submerged[:] = False
+        submerged = 0
     elif water is not None:
-        check_submerged(int(submerged.sum()), name, water)
-    distance_m = flag_neighbours(name, cloud, rules, progress)
-    noise = reasons != 0
+        check_submerged(submerged, name, water)
+    distance_m = flag_neighbours(name, cloud, rules)
+    noise = cloud.reasons != 0
     count = int(noise.sum())
     return noise, Figures(
         input="",
         output="",
         pcfix=__version__,
         points=n,
-        set_aside=int((~used).sum()),  # withheld or noise before: not tested, not neighbours
-        submerged=int(submerged.sum()),  # tested against the bed
+        set_aside=n - tested,  # withheld or noise before: not tested, not neighbours
+        submerged=submerged,  # tested against the bed
         noise=count,
         reasons={
-            str(reason.name).lower(): int(np.count_nonzero(reasons & np.uint8(reason)))
+            str(reason.name).lower(): int(np.count_nonzero(cloud.reasons & np.uint8(reason)))
             for reason in Reason
         },
         dropped=count if options.drop else 0,
@@ -164,7 +151,7 @@ def find_noise(
 
 
 class CleanPlan(NamedTuple):
-    """The noise of a whole cloud, one bit per point, and what is said of it."""
+    """The noise of a whole cloud, one bit per point, and the summary."""
 
     noise: npt.NDArray[np.uint8]
     drop: bool
@@ -175,23 +162,22 @@ def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask)
     """Find the noise of a whole cloud; large arrays are on the disk of the target."""
     cloud = task.source
     with open_cloud(cloud) as source:
-        names, points = set(source.header.point_format.dimension_names), len(source)
-        try:
+        names, total = set(source.header.point_format.dimension_names), len(source)
+        ours = None
+        with suppress(ValueError):  # a damaged record is reported where its content is needed
             ours = own_settings(source.vlrs)
-        except ValueError:  # a damaged record is reported where its content is needed
-            ours = None
     has_rays = not (isinstance(ours, dict) and ours.get("cameras") == 0)
-    passed = 0
+    passed = 0.0
 
-    def count(some: int) -> None:
+    def count(points: float) -> None:
         nonlocal passed
-        passed += some
+        passed += points
         if progress is not None:
-            progress(passed // _PASSES, points)
+            progress(int(passed) // _PASSES, total)
 
     def chunks(water: WaterSurface | None) -> Iterator[Tested]:
         with open_cloud(cloud, options.jobs) as source:
-            shown = [name for name in RAY_DIMENSIONS if name in names]
+            shown = names.intersection(WEAK)
             for chunk in source.chunks():
                 rays = {name: source.dimension(chunk, name) for name in shown}
                 withheld = np.asarray(chunk["withheld"]).astype(np.bool_)
@@ -200,16 +186,15 @@ def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask)
     near = task.target.absolute()
     if not near.parent.is_dir():  # the folder of many files is made later
         near = next(one for one in near.parents if one.is_dir()) / near.name
-    with scratch_arrays(near):
+    with scratch_arrays(near), running(report=count):
         noise, summary = find_noise(
-            str(cloud), options, lambda: view_of(cloud), names, chunks, points,
-            count, has_rays=has_rays,
-        )  # fmt: skip
+            str(cloud), options, lambda: view_of(cloud), names, chunks, total, has_rays=has_rays
+        )
     if options.drop and noise.all():
         sentence = (
             "every point is noise by these thresholds. Use wider thresholds, or leave out --drop."
         )
-        raise bad_file(cloud, "cloud.all_noise", sentence, points=points)
+        raise bad_file(cloud, "cloud.all_noise", sentence, points=total)
     return CleanPlan(np.packbits(noise), options.drop, summary)
 
 

@@ -9,12 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
-from pcfix.blocks import mapped
 from pcfix.compare.figures import Comparison, bins_table, figures_of
 from pcfix.compare.m3c2 import load_py4dgeo
-from pcfix.compare.match import SurveyCloud, match
+from pcfix.compare.match import Match, SurveyCloud, match
 from pcfix.compare.sections import parse_line
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
@@ -86,20 +83,17 @@ def compare_clouds(
     near = Path([*outputs, Path(tempfile.gettempdir()) / "pcfix"][0])
     with scratch_arrays(near):  # arrays of large clouds
         target = read_reference(surveyed)
+
+        def matched_to(one: SurveyCloud) -> Match:
+            check_same_crs(one.name, one.crs, target.name, target.crs)
+            return match(one, target, given.part(CompareRules), given=water is not None)
+
         whole = cloud.read(water) if isinstance(cloud, Held) else read_cloud(clouds[0], water)
-        check_same_crs(whole.name, whole.crs, target.name, target.crs)
-        matched = match(whole, target, given.part(CompareRules), given=water is not None)
-        others = {}
-        for name, one in also.items():  # further clouds, at the places of the first
-            further = read_cloud(one, water)
-            check_same_crs(further.name, further.crs, target.name, target.crs)
-            over = matched.water_at(further.xyz) if matched.settings.submerged else None
-            if over is not None:  # the water of the first, where its own is unknown
-                heights = mapped(lambda w, v: np.where(np.isnan(w), v, w), further.water_m, over)
-                further = replace(further, water_m=heights)
-            found = match(further, target, matched.settings, given=water is not None)
-            others[name] = replace(found, places=matched.places)
-        result = figures_of(matched, lines, started, others)
+        matched, others = matched_to(whole), {}
+        for name, further in also.items():  # at the places of the first
+            others[name] = replace(matched_to(read_cloud(further, water)), places=matched.places)
+        result = figures_of(matched, lines, others)
+    result.seconds = round(time.perf_counter() - started, 3)
     _write(result, given)
     return result
 

@@ -18,15 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.blocks import bounds, empty, kept, mapped, release
+from pcfix.blocks import bounds, empty, release
 from pcfix.clean.neighbours import Tiles as PointTiles
 from pcfix.clean.neighbours import make_tiles
 from pcfix.errors import PcfixWarning, SettingError, bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.colours import NO_LIGHT, hillshade
-from pcfix.grid.delaunay import fill_holes, margin_cells
-from pcfix.grid.heights import Gridding, as_uncertainty, grid_window
-from pcfix.grid.lattice import lattice_over, round_resolution, spacing_m
+from pcfix.grid.heights import fill_holes, grid_window, margin_cells
+from pcfix.grid.lattice import Lattice, lattice_over, round_resolution, spacing_m
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.crs import crs_words, parts
@@ -52,6 +51,8 @@ BLOCK_CELLS = 1024
 """Longest side of a window."""
 BIN_POINTS = 200_000
 """Points of a tile by which they are sorted, on average."""
+TO_95 = 1.959964
+"""Half-width of 95 % of a normal distribution, in standard deviations."""
 SIGMA_Z = "SigmaZ"
 FEWEST_A_CELL = 0.9
 """Points per cell, on average where there are any; fewer give a warning."""
@@ -59,9 +60,6 @@ DIMENSIONS = {"depth": "WaterDepth", "uncertainty": SIGMA_Z}
 """Dimensions of these quantities; any other quantity is the dimension of its name."""
 POINTS_A_SQUARE, MOST_SQUARES = 6.0, 4_000_000
 """Points of a square, if these fill the area, and squares to measure the spacing of points."""
-SPARSE = 20.0
-"""Cells per point; if there are more, some points may lie far from all others."""
-BULK_SAMPLE, BEYOND_BULK = 1_000_000, 1e-3
 
 
 def grid_dsm(
@@ -77,8 +75,9 @@ def grid_dsm(
     The file has one band of float32, -9999 (nodata) if a cell has no value. Heights keep the
     vertical datum of the cloud; other quantities have the horizontal CRS only, as programs would
     take their values for heights. Depth is `WaterDepth`, and uncertainty the vertical one at 95 %,
-    of the bed (class 40), as `pcfix.correct_file` writes them; see
-    `pcfix.grid.heights.as_uncertainty`.
+    of the bed (class 40), as `pcfix.correct_file` writes them. The uncertainty of a cell is not
+    divided by the square root of the number of its points: errors of level, index and tilt of the
+    water and of poses are common to them. To treat all errors as common is conservative.
 
     With `counts` a second file has two bands: count (points in the cell) and spread (population
     standard deviation of their values). A cell with a value and count 0 was interpolated.
@@ -124,11 +123,10 @@ def grid_dsm(
         with open_cloud(task.source) as source:
             crs, count = metric_crs(source), len(source)
             corrected = any(is_ours(vlr) for vlr in source.vlrs)
-            read = _points_of(source, rules, report)
+            used = _points_of(source, rules, report)
             if given.resolution is None:
-                cell_m = round_resolution(_spacing_m(source, read), 0.0)
+                cell_m = round_resolution(_spacing_m(source, used))
                 rules = replace(rules, resolution=cell_m)
-            used = _without_stray(source, read, rules.cell_m)
             apart_m = _spacing_m(source, used, rules.cell_m)
         lattice = lattice_over(*bounds(used[:, :2]), rules.cell_m, str(task.source))
         if (density := (rules.cell_m / apart_m) ** 2 if apart_m else np.inf) < FEWEST_A_CELL:
@@ -142,11 +140,10 @@ def grid_dsm(
         reach_m = max(
             TIN_REACH_SPACINGS * apart_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
         )
-        how = Gridding(lattice, rules.method, reach_m, apart_m)
         # a cloud optimised file is a copy, with overviews of its own
         paths = {name: folder / f"{name}.tif" if given.cog else drafts[name] for name in drafts}
         tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
-        counted = _write_rasters(tiles, how, rules, paths, crs, tags, report)
+        counted = _write_rasters(tiles, lattice, reach_m, apart_m, rules, paths, crs, tags, report)
         for name, path in paths.items():
             if given.cog:
                 rasters.copy_as_cog(path, drafts[name])
@@ -176,7 +173,6 @@ def grid_dsm(
         seconds=task.seconds,
         resolution_is="given" if given.resolution else "chosen",
         part=part_report(task.source),
-        stray=len(read) - len(used),  # points ignored because they lie far from all others
     )
     write_summary(given, result.as_dict())
     return result
@@ -184,7 +180,9 @@ def grid_dsm(
 
 def _write_rasters(
     tiles: PointTiles,
-    how: Gridding,
+    lattice: Lattice,
+    reach_m: float,
+    apart_m: float,
     rules: DsmRules,
     paths: dict[str, Path],
     crs: Any,
@@ -195,15 +193,18 @@ def _write_rasters(
 
     Returns the numbers of cells and the statistics of their values, by their names in the summary.
     """
-    lattice, size_m = how.lattice, rules.cell_m
+    size_m, method = rules.cell_m, rules.method
+    reach, spacing = reach_m / size_m, apart_m / size_m
+    # the number of cells around a window whose points decide on it
+    beyond = {"tin": int(np.ceil(reach)) + 1, "idw": 1}.get(method, 0)
     plan = None if crs is None else parts(crs)[0]
     unit = METRE if rules.what == "height" or rules.what in DIMENSIONS else ""
     new = partial(rasters.new_raster, lattice=lattice, tags={"PCFIX": json.dumps(tags)})
     # the width of holes to fill, in cells; a TIN has filled its own
-    widest = 0.0 if how.method == "tin" else (rules.fill or 0.0) / size_m
+    widest = 0.0 if method == "tin" else (rules.fill or 0.0) / size_m
     margin = margin_cells(widest) if widest else 0
     # windows have about this number of points if points are everywhere, and are wide for a margin
-    side = np.sqrt(WINDOW_POINTS) * how.spacing_m / size_m or BLOCK_CELLS
+    side = np.sqrt(WINDOW_POINTS) * spacing or BLOCK_CELLS
     cells, filled, known, count, total, low, high, done = 0, 0, 0, 0, 0.0, np.inf, -np.inf, 0
     with ExitStack() as files:
         bands = {rules.what: unit}
@@ -214,15 +215,15 @@ def _write_rasters(
             counts = files.enter_context(new(paths["counts"], crs=plan, bands=bands))
         for window in lattice.window.parts(int(np.clip(side, 4 * margin + 1, BLOCK_CELLS))):
             around = window.grown(margin).clipped(lattice.window)
-            xyz = tiles.xyz[tiles.within(*lattice.box(around.grown(how.margin_cells)))]
+            xyz = tiles.xyz[tiles.within(*lattice.box(around.grown(beyond)))]
             release()
-            gridded = grid_window(xyz, around, how)
-            if rules.what == "uncertainty":
-                gridded = as_uncertainty(gridded)
-            height, number, spread = (band[window.within(around)] for band in gridded)
+            whole, *counted = grid_window(xyz, around, lattice, method, reach, spacing)
+            if rules.what == "uncertainty":  # the root mean square of the standard errors of a cell
+                whole = TO_95 * np.hypot(whole, counted[1])
+            height, number, spread = (band[window.within(around)] for band in (whole, *counted))
             values = height[~np.isnan(height)]
             if widest:
-                height = fill_holes(gridded.height, window, around, widest)
+                height = fill_holes(whole, window, around, widest)
             rasters.write_part(dsm, height, window, 1)
             if "counts" in paths:
                 rasters.write_part(counts, number, window, 1)
@@ -265,7 +266,10 @@ def point_spacing_m(cloud: CloudFiles, near: Path) -> float:
 def _spacing_m(source: LasSource, xyz: FloatArray, finest_m: float = MIN_RESOLUTION_M) -> float:
     """Return the spacing of points of a cloud by squares of at least a size; see `spacing_m`."""
     share = max(POINTS_A_SQUARE / len(source), 1.0 / MOST_SQUARES)
-    return spacing_m(xyz, max(np.sqrt(share * _stated_area(source, finest_m)), finest_m))
+    # as the header states it, which need not be right
+    area = float(np.prod(source.header.maxs[:2] - source.header.mins[:2]))
+    side = np.sqrt(share * area) if np.isfinite(area) and area > 0.0 else 0.0
+    return spacing_m(xyz, max(float(side), finest_m))
 
 
 def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], None]) -> FloatArray:
@@ -299,30 +303,6 @@ def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], Non
     return result[:count]
 
 
-def _without_stray(source: LasSource, xyz: FloatArray, resolution_m: float) -> FloatArray:
-    """Return the points without those far from all others, where the extent is too large for all.
-
-    The box of all but a thousandth of the points on each side grows by its own size, so that a
-    cloud of two places is inside it.
-    """
-    if _stated_area(source, resolution_m) <= SPARSE * len(source) * resolution_m**2:
-        return xyz
-    some = xyz[:: 1 + len(xyz) // BULK_SAMPLE, :2]
-    low, high = np.quantile(some, (BEYOND_BULK, 1.0 - BEYOND_BULK), axis=0)
-    size = np.maximum(high - low, resolution_m)
-    low, high = low - size, high + size
-    inside = mapped(lambda p: ((p[:, :2] >= low) & (p[:, :2] <= high)).all(axis=1), xyz)
-    if not inside.all():
-        stray = int((~inside).sum())
-        place = ", ".join(f"{value:,.2f}" for value in xyz[np.argmin(inside)])
-        sentence = (
-            f"{source.path}: {stray:,} points far from all others are not gridded, the first at"
-            f" {place}. Remove them, or grid their part of the cloud separately."
-        )
-        warnings.warn(PcfixWarning("dsm.stray", sentence, points=stray), stacklevel=3)
-    return kept(inside, xyz)
-
-
 def _dimension_of(source: LasSource, what: str) -> str | None:
     """Return the dimension whose values are gridded, None for heights."""
     name = None if what == "height" else DIMENSIONS.get(what, what)
@@ -338,9 +318,3 @@ def _dimension_of(source: LasSource, what: str) -> str | None:
     known = ", ".join(("height", *DIMENSIONS, *names))
     sentence = f"{source.path}: has no dimension {what}. --what is one of {known}."
     raise SettingError("option.choice", sentence, option="what", value=what)
-
-
-def _stated_area(source: LasSource, resolution_m: float) -> float:
-    """Return the area of a cloud as its header states it, which need not be right, m2."""
-    area = float(np.prod(source.header.maxs[:2] - source.header.mins[:2]))
-    return max(area, resolution_m**2) if np.isfinite(area) else resolution_m**2

@@ -25,8 +25,7 @@ from pcfix.io.labels import match_labels
 from pcfix.io.tides import level_offsets, read_image_times, read_tide
 from pcfix.io.vectors import LAYER_MARK, read_water_polygons
 from pcfix.io.views import ViewList, read_views, track_views
-from pcfix.label.areas import WaterMask
-from pcfix.label.labelling import Labelling
+from pcfix.label.labelling import Labelling, WaterMask
 from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints, ViewKind
 from pcfix.options.correct import LabelRules
 from pcfix.options.declare import File, OptionSet, options_of

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import PcfixWarning, SettingError
+from pcfix.errors import PcfixWarning
 from pcfix.flow.inputs import labelling_of, mask_of, paths_in
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
 from pcfix.flow.surfaces import (
@@ -26,14 +26,19 @@ from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource, part_report
 from pcfix.io.las.writing import noted_header
 from pcfix.io.tiles import Clouds
-from pcfix.label.areas import WaterMask
-from pcfix.label.labelling import LabelCounts, Labelling, Part
+from pcfix.label.labelling import LabelCounts, Labelling, Part, WaterMask
 from pcfix.model import WaterPlane, WaterSurface
 from pcfix.options.correct import LabelOptions, LabelRules, StageLabelOptions
 from pcfix.options.declare import File, taken
 from pcfix.sums import Figures
 from pcfix.version import __version__
-from pcfix.water.checks import as_surface, check_submerged, check_tilt, checked_points
+from pcfix.water.checks import (
+    as_surface,
+    check_submerged,
+    check_tilt,
+    checked_column,
+    checked_points,
+)
 from pcfix.water.surface import surface_above
 
 Classes = npt.NDArray[np.uint8]
@@ -78,14 +83,9 @@ def label_points(
     """
     rules = taken(LabelRules, options, keywords, "label_points")
     points = checked_points(xyz)
-    given = np.zeros(len(points), np.uint8) if classes is None else np.asarray(classes)
-    if given.shape != (len(points),) or given.dtype != np.uint8:
-        raise SettingError(
-            "option.shape",
-            f"classes are {given.dtype} of the shape {given.shape}. Give {len(points)} values of"
-            " uint8.",
-            option="classes", shape=given.shape,
-        )  # fmt: skip
+    given = np.zeros(len(points), np.uint8)
+    if classes is not None:
+        given = checked_column("classes", classes, given.shape).astype(np.uint8)
     surface, heights = as_surface(water, len(points))
     if water_mask is None or isinstance(water_mask, str | PathLike):
         water_mask = mask_of(water_mask, crs)

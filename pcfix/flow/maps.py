@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import shapely
 
-from pcfix.compare.sections import SectionLine
 from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
 from pcfix.flow.request import SURFACE, RunFolder
 from pcfix.flow.runner import Progress
@@ -56,19 +55,11 @@ def raster_files(folder: Path, *, errors: bool) -> list[Path]:
 def write_rasters(run: RunFolder, *, errors: bool, progress: Progress | None = None) -> Plain:
     """Write all rasters of a corrected cloud as cloud optimised GeoTIFF, with styles for QGIS.
 
-    By default the cells have 2 to 4 points, and are no smaller than a pixel on the ground. Returns
-    their side for ``run.json``.
+    By default the cells have 2 to 4 points. Returns their side for ``run.json``.
     """
-    folder, cloud, cameras = run.folder, run.cleaned_cloud, run.cameras
-    gsd_m = 0.0  # a pixel on the ground at nadir, median
-    if cameras.lenses:
-        with open_cloud(cloud) as source:
-            middle = float(source.header.mins[2] + source.header.maxs[2]) / 2.0
-        focal = np.array([lens.focal_px for lens in cameras.lenses])
-        gsd_m = float(np.median((cameras.centres[:, 2] - middle) / focal))
-    cell_m = run.request.resolution
+    folder, cloud, cell_m = run.folder, run.cleaned_cloud, run.request.resolution
     if cell_m is None:
-        cell_m = round_resolution(point_spacing_m(cloud, folder / SURFACE), gsd_m)
+        cell_m = round_resolution(point_spacing_m(cloud, folder / SURFACE))
     plain = DsmOptions(resolution=cell_m, cog=True, style=True, overwrite=True)
     filled = replace(plain, fill=HOLE_CELLS * cell_m)
     asked = {
@@ -89,14 +80,8 @@ def write_rasters(run: RunFolder, *, errors: bool, progress: Progress | None = N
 
 
 def _write_shaded(folder: Path) -> None:
-    """Write the picture: the bed in the colours of its depth, the land grey.
-
-    Holes of the surface are filled between land and bed, so some cells are under water that have
-    no depth: it follows from the water next to them.
-    """
-    from scipy.ndimage import minimum_filter
-
-    target, edge = folder / SHADED, int(HOLE_CELLS)
+    """Write the picture: the bed in the colours of its depth, the land grey."""
+    target = folder / SHADED
     high = limits_of(rasters.preview(folder / DEPTH)[0], "depth")[1]
     with ExitStack() as stack:
         draft = stack.enter_context(temporary_output(target))
@@ -109,14 +94,9 @@ def _write_shaded(folder: Path) -> None:
         plan = None if depth.crs is None else depth.crs.to_wkt()
         with rasters.new_raster(plain, lattice, plan, bands, dtype="uint8", nodata=None) as out:
             for window in lattice.window.parts(BLOCK_CELLS):
-                wide = window.grown(edge)
-                height = rasters.read_within(surface, wide, lattice.window)
-                deep = rasters.read_within(depth, wide.moved(down, right), below.window)
-                level = minimum_filter(np.nan_to_num(height + deep, nan=np.inf), 2 * edge + 1)
-                is_wet = np.isnan(deep) & (height < level) & np.isfinite(level)
-                deep = np.where(is_wet, level - height, deep)[edge:-edge, edge:-edge]
-                around = height[edge - 1 : 1 - edge, edge - 1 : 1 - edge]
-                light = hillshade(around, lattice.resolution_m, *SUN_DEG)
+                height = rasters.read_within(surface, window.grown(1), lattice.window)
+                deep = rasters.read_within(depth, window.moved(down, right), below.window)
+                light = hillshade(height, lattice.resolution_m, *SUN_DEG)
                 colours = relief_colours(light, deep, high, flat=np.sin(np.radians(SUN_DEG[1])))
                 for number, band in enumerate(colours, start=1):
                     rasters.write_part(out, band, window, number)
@@ -157,8 +137,8 @@ def contours_layer(folder: Path, interval: float | None = None) -> Layer:
         sigma = rasters.preview(path)[0] if path.exists() else np.zeros(0)
         interval = depth_interval(depth, sigma)
     found = contours(depth, interval)
-    lines = [shapely.linestrings(rasters.centres(one.place, depth, bounds)) for one in found]
-    level = np.array([one.level for one in found])
+    lines = [shapely.linestrings(rasters.centres(place, depth, bounds)) for _, place in found]
+    level = np.array([level for level, _ in found])
     values = {"depth_m": level, "interval_m": np.full(len(found), interval)}
     style = vector_style({"line": Symbol("line", DARK, 0.25)}, label='"depth_m"')
     return Layer("depth_contours", "LineString", lines, values, style)
@@ -182,12 +162,11 @@ def _waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Laye
 
 def _sections(sections: Sequence[Mapping[str, float]]) -> Layer:
     """Return the cross-sections of the comparison."""
-    lines = [SectionLine(s["x1"], s["y1"], s["x2"], s["y2"]) for s in sections]
+    lines = [shapely.linestrings([(s["x1"], s["y1"]), (s["x2"], s["y2"])]) for s in sections]
     names = np.array([f"Cross-section {n}" for n, _ in enumerate(lines, start=1)], object)
-    values = {"name": names, "length_m": np.array([one.length_m for one in lines])}
-    ends = [shapely.linestrings([(one.x1, one.y1), (one.x2, one.y2)]) for one in lines]
+    values = {"name": names, "length_m": shapely.length(lines)}
     style = vector_style({"line": Symbol("line", GREY, 0.4)}, label='"name"')
-    return Layer("cross_sections", "LineString", ends, values, style)
+    return Layer("cross_sections", "LineString", lines, values, style)
 
 
 def _cameras(cameras: Cameras, unused: Sequence[str]) -> Layer:

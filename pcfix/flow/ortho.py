@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import GeometryError, bad_file
+from pcfix.errors import bad_file
 from pcfix.flow.inputs import paths_in
 from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, warn_all
 from pcfix.flow.runner import Progress, check_summary, write_summary
@@ -78,12 +78,6 @@ def ortho_photo(
         side = given.resolution or float(f"{block.gsd_m:.1e}")
         lattice = lattice_over(low, high - 1e-6 * side, side, str(given.dsm))
         covered, ground = _write(block, lattice, given, folder / "plain.tif", progress)
-        if not covered:
-            raise GeometryError(
-                "cameras.no_overlap",
-                f"{given.dsm}: no photograph sees it. Check the CRS of the DSM and the cameras.",
-                path=given.dsm,
-            )
         rasters.copy_as_cog(folder / "plain.tif", draft)
     summary = Figures(
         output=str(target),
@@ -92,7 +86,7 @@ def ortho_photo(
         height=lattice.height,
         resolution_m=lattice.resolution_m,
         bounds_m=lattice.bounds_m,
-        covered_share=round(covered / ground, 5),  # of the cells over the DSM
+        covered_share=round(covered / max(ground, 1), 5),  # of the cells over the DSM
         seconds=round(time.perf_counter() - started, 3),
         dsm=str(given.dsm),
         water=None if given.water is None else str(given.water),

@@ -26,7 +26,7 @@ from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, map_photos, open_record
 from pcfix.flow.runner import Progress, check_summary, json_text, key_of, write_summary
-from pcfix.io.files import check_input, file_state, run_logged, write_text
+from pcfix.io.files import check_input, run_logged, write_text
 from pcfix.io.las.writing import write_points
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.io.rasters import open_raster, place_of, read_masked, write_dod
@@ -39,8 +39,6 @@ from pcfix.sums import Figures
 from pcfix.water.surface import surface_above
 
 RECORD = "pcfix-rebuild.json"
-ROUND = ("cloud", "dsm", "cells", "mean_m", "sd_m", "within_gsd")
-"""What is recorded of a round: its DSM minus the one before, over submerged cells."""
 PAPER_ROUNDS = 3
 """Rounds after which the mapping by eq 12 is close to its fixed point, which is not the bed."""
 STEREO_CELL_PIXELS = 2.0
@@ -96,13 +94,6 @@ def rebuild_rounds(
         shutil.rmtree(folders.pop())
     record = open_record(target / RECORD, key_of("rebuild", given, ignored=COMMAND_ONLY), folders)
     record.setdefault("rounds", [])
-
-    def note(number: int, noted: dict[str, Any]) -> dict[str, Any]:
-        """Record a round, for a later call to resume."""
-        record["rounds"][number - 1 :] = [noted]
-        write_text(target / RECORD, json_text(record), overwrite=True)
-        return noted
-
     start = str(given.dsm) if Path(given.dsm).suffix.lower() in CLOUDS else None
     if start is not None:  # a cloud is gridded to the folder
         raster = target / "dsm.tif"
@@ -116,15 +107,12 @@ def rebuild_rounds(
     rounds, done_before = list[Figures](), 0
     notes: list[PcfixWarning] = []
     while len(rounds) < given.most_rounds and not (rounds and abs(rounds[-1].mean_m) < threshold_m):
-        number = len(rounds) + 1
-        before = Path(rounds[-1].dsm if rounds else given.dsm)
+        number, before = len(rounds) + 1, Path(rounds[-1].dsm if rounds else given.dsm)
         folder = target / f"round{number}"
         cloud, dsm = folder / "cloud.laz", folder / "dsm.tif"
-        noted = record["rounds"][number - 1] if number <= len(record["rounds"]) else {}
-        has_cloud = cloud.exists() and noted.get("state") == file_state(cloud)
-        is_done = has_cloud and "mean_m" in noted and dsm.exists()
-        done_before += is_done
-        if not has_cloud:
+        if number <= len(record["rounds"]) and cloud.exists() and dsm.exists():
+            done_before += 1
+        else:
             how = replace(
                 given, dsm=before, resolution=None, summary=None, **RebuildOptions().as_dict()
             )
@@ -134,11 +122,10 @@ def rebuild_rounds(
                 map_photos(images, folder / "images", options=how, progress=progress)
             with threads(given.jobs):
                 _reconstruct(given, block, number, folder / "images", cloud, progress)
-            noted = note(number, {"command": given.rebuild, "state": file_state(cloud)})
-        if not is_done:
             grid_dsm(cloud, dsm, resolution=block.scene.ground.cell_m, overwrite=True)
-            noted = note(number, noted | _difference(block, cloud, dsm, before))
-        one = Figures(**{name: noted[name] for name in ROUND})
+            record["rounds"][number - 1 :] = [_difference(block, cloud, dsm, before)]
+            write_text(target / RECORD, json_text(record), overwrite=True)
+        one = Figures(**record["rounds"][number - 1])
         rounds.append(one)
         if say is not None:
             say(
@@ -233,6 +220,12 @@ def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> dict
     x, y = place_of(transform, column + 0.5, row + 0.5)
     wet = surface_above(block.scene.water, np.column_stack([x, y, z])).height_m > z
     moved = moved[wet] if wet.any() else moved
-    within = float((np.abs(moved) <= block.gsd_m).mean())  # moved by at most a ground pixel
-    sizes = round(float(moved.mean()), 5), round(float(moved.std()), 5), round(within, 5)
-    return dict(zip(ROUND, (str(cloud), str(dsm), len(moved), *sizes), strict=True))
+    return {
+        "cloud": str(cloud),
+        "dsm": str(dsm),
+        # its DSM minus the one before, over submerged cells
+        "cells": len(moved),
+        "mean_m": round(float(moved.mean()), 5),
+        "sd_m": round(float(moved.std()), 5),
+        "within_gsd": round(float((np.abs(moved) <= block.gsd_m).mean()), 5),
+    }

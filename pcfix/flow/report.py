@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import bad_file
 from pcfix.flow.adjust import FOLDER, SUMMARY
 from pcfix.flow.request import RunFolder
 from pcfix.flow.surfaces import view_of
@@ -16,21 +15,19 @@ from pcfix.flow.water import found_picture
 from pcfix.grid.maps import MOST_CELLS, MapsBuilder
 from pcfix.io.crs import crs_words
 from pcfix.io.files import read_json, sha256, write_bytes, write_text
-from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import coordinates, stated_crs
 from pcfix.io.rasters import preview
 from pcfix.io.tiles import Tiles, open_cloud
 from pcfix.model import NOISE_CLASSES
 from pcfix.report.adjustment import adjustment_tables
-from pcfix.report.comparison import evaluation, in_a_sentence
+from pcfix.report.comparison import evaluation
 from pcfix.report.page import Picture, Report, Table, render
 from pcfix.report.run import RunResults, in_short, run_report
 from pcfix.report.summary import Summary
 from pcfix.report.text import uncertainty_sentence
 
 Plain = dict[str, Any]
-NEEDED = (*SHIFTS, "WaterDepth", "RayCount")
-SIGMA_Z = "SigmaZ"
+COLUMNS = ("WaterDepth", "ShiftZ", "RayCount", "SigmaZ")
 SAMPLE_POINTS = 200_000
 """Points in histogram and uncertainty figure, evenly spread over the file."""
 PAGE = "report.html"
@@ -67,7 +64,6 @@ def report_run(
     if compared:
         dod = preview(run.dod, MOST_CELLS) if request.has_surface else None
         pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
-        verdict += in_a_sentence(compared["figures"])
     if first["model"] is not None:
         figures = read_json(run.folder / FOLDER / SUMMARY)
         tables += adjustment_tables(figures, f"{FOLDER}/report.html")
@@ -93,26 +89,22 @@ def write_report(run: RunResults, inputs: Sequence[Path], out_dir: Path) -> Repo
     """
     rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in inputs]
     table = Table("Input files", ["file", "bytes", "SHA-256"], rows)
-    report = run_report(run, table, _results_in(out_dir))
+    files = []
+    for name, words in RESULTS.items():
+        tiles = out_dir / name.removesuffix(".laz")
+        if (out_dir / name).is_file():
+            files.append((name, words))
+        elif tiles.is_dir():  # of many files
+            files.append((f"{tiles.name}/", words))
+    sections = sorted(out_dir.glob("compare/section_*.csv"))
+    files += [(f"compare/{one.name}", "a cross-section") for one in sections]
+    report = run_report(run, table, files)
     figures = out_dir / "figures"
     figures.mkdir(exist_ok=True)
     for picture in report.pictures:
         write_bytes(figures / f"{picture.name}.png", picture.png, overwrite=True)
     write_text(out_dir / PAGE, render(report), overwrite=True)
     return report
-
-
-def _results_in(folder: Path) -> list[tuple[str, str]]:
-    """Return the files of a run, or the folders of tiles, and their contents."""
-    found = []
-    for name, words in RESULTS.items():
-        tiles = folder / name.removesuffix(".laz")
-        if (folder / name).is_file():
-            found.append((name, words))
-        elif tiles.is_dir():
-            found.append((f"{tiles.name}/", words))
-    sections = sorted(folder.glob("compare/section_*.csv"))
-    return [*found, *((f"compare/{one.name}", "a cross-section") for one in sections)]
 
 
 def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> Plain:
@@ -122,12 +114,6 @@ def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> Plain:
     `RunResults`; `resolution_m` is that of the rasters.
     """
     with open_cloud(path) as source:
-        dimensions = set(source.header.point_format.dimension_names)
-        if missing := set(NEEDED) - dimensions:
-            sentence = (
-                f"has no dimensions {', '.join(sorted(missing))}. Correct it with --dimensions all."
-            )
-            raise bad_file(path, "cloud.dimension_missing", sentence, dimensions=sorted(missing))
         builder = MapsBuilder(
             source.header.mins[:2], source.header.maxs[:2], len(source), resolution_m
         )
@@ -137,10 +123,7 @@ def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> Plain:
             good = ~np.isin(np.asarray(points["classification"]), NOISE_CLASSES)
             points = points[good & ~np.asarray(points["withheld"]).astype(bool)]
             moved = np.asarray(points["RayCount"]) > 0
-            columns = ["WaterDepth", "ShiftZ", "RayCount"] + [SIGMA_Z] * (SIGMA_Z in dimensions)
-            values = np.zeros((int(moved.sum()), 4))
-            for i, name in enumerate(columns):
-                values[:, i] = np.asarray(points[name])[moved]
+            values = np.column_stack([np.asarray(points[name])[moved] for name in COLUMNS])
             builder.add(coordinates(points), moved, values)
             sample.append(values[-count % every :: every, [0, 3]])
             depth = values[:, 0]

@@ -109,22 +109,6 @@ def file_points(
         yield from read_ahead(points_of(one, source, water) for one in source.chunks())
 
 
-def joined_points(parts: Iterable[Points]) -> Points:
-    """Return consecutive points as one, with what all of them have; several without weights."""
-    parts = list(parts)
-    if len(parts) == 1:
-        return parts[0]
-    *columns, views = [
-        None if any(v is None for v in one) else one for one in zip(*parts, strict=True)
-    ]
-    joined: list[Any] = [None if one is None else np.concatenate(one) for one in columns]
-    if views is None:
-        return Points(*joined)
-    start = np.cumsum(np.concatenate([[0], *(np.diff(one.start) for one in views)]))
-    camera = np.concatenate([one.camera for one in views])
-    return Points._make([*joined, Views(start, camera, kind=views[0].kind)])
-
-
 def sample_of(
     view: CloudView, rows: IntArray | int, water: WaterSurface | None = None,
     match: ViewMatch | None = None,
@@ -145,7 +129,17 @@ def sample_of(
         first += len(one.xyz)
         if high == len(rows):
             break
-    return joined_points(parts)
+    if len(parts) == 1:
+        return parts[0]
+    *columns, listed = zip(*parts, strict=True)
+    joined: list[Any] = [
+        None if any(v is None for v in one) else np.concatenate(one) for one in columns
+    ]
+    if listed[0] is None:
+        return Points(*joined)
+    start = np.cumsum(np.concatenate([[0], *(np.diff(one.start) for one in listed)]))
+    camera = np.concatenate([one.camera for one in listed])
+    return Points._make([*joined, Views(start, camera, kind=listed[0].kind)])
 
 
 def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Points:
@@ -348,9 +342,4 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
         found = fit_water(xyz, model=options.water_model, counts=shore.counts)
     for note in coded("water.points", notes):
         warnings.warn(note, stacklevel=2)
-    if (shore.counts < 1.0).any():
-        notes.append(
-            f"{shore.name}: {len(xyz):,} points along drawn lines count as"
-            f" {shore.counts.sum():.0f} independent ones."
-        )
     return replace(found, notes=(*map(str, notes), *found.notes))

@@ -37,8 +37,7 @@ FRUSTUM_SHARE = 0.06
 """Length of a frustum, as a share of the height of its camera above the clouds."""
 WATER_CELLS = 40
 SHOWN = ("WaterDepth", "SigmaZ", *SHIFTS)
-WATER_COLOUR = (0.29, 0.64, 0.78, 0.25)
-CAMERA_COLOUR = (0.04, 0.37, 0.54)
+LINE_COLOURS = {"water": (0.65, 0.82, 0.89), "cameras": (0.04, 0.37, 0.54)}
 AZIMUTH_DEG, ELEVATION_DEG = -119.0, 29.0
 """The view is from the south-west, from above."""
 MOST_DOTS = 30_000
@@ -68,16 +67,15 @@ class _Layer(NamedTuple):
 
 
 class Scene3d(NamedTuple):
-    """Named clouds with their colours, frusta of cameras, and the water, metres from an origin.
+    """Named clouds with their colours, and the lines of cameras and water, metres from an origin.
 
-    `lines` has the shape (k, 2, 3), and the triangles of `water` (m, 3, 3).
+    `lines`, "cameras" and "water", have the shape (k, 2, 3): frusta, and a grid.
     """
 
     names: list[str]
     xyz: list[FloatArray]
     rgb: list[FloatArray]
-    lines: FloatArray
-    water: FloatArray
+    lines: dict[str, FloatArray]
 
 
 def view_clouds(
@@ -128,15 +126,15 @@ def view_clouds(
     rgb = [scale.to_rgba(np.ma.masked_invalid(one))[:, :3] for one in values]
     # all about their common centre
     low, high = (end([end(one, axis=0) for one in xyz], axis=0) for end in (np.min, np.max))
-    lines = np.zeros((0, 2, 3))
+    lines = {"water": _grid(surface, low, high)}
     if given.cameras is not None:
         inputs = replace(given, water=0.0 if given.water is None else given.water).part(Inputs)
-        lines = _frusta(inputs.block(first.crs)[0], float(high[2]))
-    ends = np.vstack([low, high, lines.reshape(-1, 3)])
+        lines["cameras"] = _frusta(inputs.block(first.crs)[0], float(high[2]))
+    ends = np.vstack([low, high, *(one.reshape(-1, 3) for one in lines.values())])
     origin = (ends.min(axis=0) + ends.max(axis=0)) / 2.0
     scene = Scene3d(
         [one.name for one in layers], [one - origin for one in xyz], rgb,
-        lines - origin, _sheet(surface, low, high) - origin,
+        {name: one - origin for name, one in lines.items() if len(one)},
     )  # fmt: skip
     if given.image is None:
         show(scene, f"pcfix view: {given.colour}")
@@ -181,7 +179,7 @@ def _values(
         near = near_in_plan(xyz, reference, gap_m(reference))
         if xyz is not reference and near.any():
             k = min(CompareRules().neighbours, len(reference))
-            found[near] = xyz[near, 2] - heights_at(xyz[near], reference, k)[0]
+            found[near] = xyz[near, 2] - heights_at(xyz[near], reference, k)
         return found
     name, factor = {
         "depth": ("WaterDepth", 1.0),
@@ -212,19 +210,19 @@ def _frusta(cameras: Cameras, ground_m: float) -> FloatArray:
     return np.asarray(found[np.isfinite(found).all(axis=(1, 2))])
 
 
-def _sheet(surface: WaterSurface | None, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return the water over the clouds as triangles, shape (m, 3, 3).
+def _grid(surface: WaterSurface | None, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return the edges of cells of the water over the clouds.
 
     A dimension has no surface between its points.
     """
     if surface is None or isinstance(surface, WaterDimension):
-        return np.zeros((0, 3, 3))
+        return np.zeros((0, 2, 3))
     sides = [np.linspace(low[axis], high[axis], WATER_CELLS + 1) for axis in (0, 1)]
     xyz = np.dstack([*np.meshgrid(*sides), np.zeros((WATER_CELLS + 1, WATER_CELLS + 1))])
     xyz[..., 2] = surface_above(surface, xyz.reshape(-1, 3)).height_m.reshape(xyz.shape[:2])
-    a, b, c, d = xyz[:-1, :-1], xyz[:-1, 1:], xyz[1:, 1:], xyz[1:, :-1]
-    triangles = np.moveaxis(np.stack([[a, b, c], [a, c, d]]), 1, 3).reshape(-1, 3, 3)
-    return np.asarray(triangles[np.isfinite(triangles).all(axis=(1, 2))])
+    ways = (xyz[:, :-1], xyz[:, 1:]), (xyz[:-1], xyz[1:])  # east, north
+    edges = np.vstack([np.stack(way, axis=2).reshape(-1, 2, 3) for way in ways])
+    return np.asarray(edges[np.isfinite(edges).all(axis=(1, 2))])
 
 
 def scale_of(what: str, values: FloatArray) -> ScalarMappable:
@@ -255,31 +253,19 @@ def show(scene: Scene3d, title: str) -> None:
             "view.no_screen", "There is no screen to open a window on. Give --image FILE.png."
         )
     o3d = load_open3d()
-    points, record = o3d.utility.Vector3dVector, o3d.visualization.rendering.MaterialRecord
-    things = []
-
-    def add(name: str, geometry: Any, shader: str, **look: Any) -> None:
-        material = record()
-        for key, value in {"shader": shader, **look}.items():
-            setattr(material, key, value)
-        things.append({"name": name, "geometry": geometry, "material": material})
-
+    points, things = o3d.utility.Vector3dVector, []
     for name, xyz, rgb in zip(scene.names, scene.xyz, scene.rgb, strict=True):
         cloud = o3d.geometry.PointCloud(points(xyz))
         cloud.colors = points(rgb)
-        add(name, cloud, "defaultUnlit", point_size=2.5)
-    if len(scene.lines):
-        ends = np.arange(2 * len(scene.lines)).reshape(-1, 2)
-        pairs = o3d.utility.Vector2iVector(ends)
-        lines = o3d.geometry.LineSet(points(scene.lines.reshape(-1, 3)), pairs)
-        lines.paint_uniform_color(CAMERA_COLOUR)
-        add("cameras", lines, "unlitLine", line_width=1.0)
-    if len(scene.water):
-        rows = o3d.utility.Vector3iVector(np.arange(3 * len(scene.water)).reshape(-1, 3))
-        mesh = o3d.geometry.TriangleMesh(points(scene.water.reshape(-1, 3)), rows)
-        mesh.compute_vertex_normals()  # without them, and with other shaders, open3d 0.20 crashes
-        add("water", mesh, "defaultLitTransparency", base_color=WATER_COLOUR)
-    o3d.visualization.draw(things, title=title, show_ui=True, bg_color=(1.0, 1.0, 1.0, 1.0))
+        things.append({"name": name, "geometry": cloud})
+    for name, edges in scene.lines.items():
+        ends = o3d.utility.Vector2iVector(np.arange(2 * len(edges)).reshape(-1, 2))
+        lines = o3d.geometry.LineSet(points(edges.reshape(-1, 3)), ends)
+        lines.paint_uniform_color(LINE_COLOURS[name])
+        things.append({"name": name, "geometry": lines})
+    o3d.visualization.draw(
+        things, title=title, show_ui=True, point_size=3, line_width=1, bg_color=(1.0, 1.0, 1.0, 1.0)
+    )
 
 
 def view_figure(scene: Scene3d, scale: ScalarMappable, what: str) -> Figure:
@@ -292,12 +278,10 @@ def view_figure(scene: Scene3d, scale: ScalarMappable, what: str) -> Figure:
         step = max(1, len(xyz) // MOST_DOTS)
         panel.set_title(name)
         panel.scatter(*xyz[::step].T, c=rgb[::step], s=1, depthshade=False)
-        for line in scene.lines:
-            panel.plot(*line.T, color=CAMERA_COLOUR, linewidth=0.5)
-        if len(scene.water):
-            x, y, z = scene.water.reshape(-1, 3).T
-            rows = np.arange(len(x)).reshape(-1, 3)
-            panel.plot_trisurf(x, y, rows, z, color=WATER_COLOUR, linewidth=0)
+        for kind, edges in scene.lines.items():
+            gaps = np.full((len(edges), 1, 3), np.nan)  # between the edges
+            line = np.hstack([edges, gaps]).reshape(-1, 3)
+            panel.plot(*line.T, color=LINE_COLOURS[kind], linewidth=0.5)
         panel.view_init(ELEVATION_DEG, AZIMUTH_DEG)
         panel.set_aspect("equal")
         panel.set(xlabel="East (m)", ylabel="North (m)", zlabel="Height (m)")

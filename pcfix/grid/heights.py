@@ -1,65 +1,51 @@
-"""Compute one height for each cell from the points in and around it."""
+"""Heights of cells: statistics of their points, inverse distances, and Delaunay triangles.
+
+A triangle is Delaunay's if no point is inside the circle through its corners. If circles wider than
+a limit are ignored, only points within that limit of a cell decide on it: a part of the raster,
+triangulated with such a margin, gets the same triangles as the whole. Where four points are on one
+circle, as in a regular grid, there are two answers. So the triangles (not the heights) are chosen
+by positions that are displaced a little, always the same way for the same point.
+"""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
+from scipy.spatial import Delaunay, QhullError
 
-from pcfix.grid.delaunay import triangulated
 from pcfix.grid.lattice import Lattice, Window
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.steps import DsmMethod
-
-TO_95 = 1.959964
-"""Half-width of 95 % of a normal distribution, in standard deviations."""
+from pcfix.running import current
 
 
-class Gridding(NamedTuple):
-    """The raster and the method of its heights."""
+def grid_window(
+    points: FloatArray, window: Window, lattice: Lattice, method: DsmMethod, reach: float,
+    spacing: float,
+) -> tuple[FloatArray, IntArray, FloatArray]:  # fmt: skip
+    """Return height, number of points and spread of the cells of a part of a raster.
 
-    lattice: Lattice
-    method: DsmMethod
-    reach_m: float  # diameter of the widest circle around a triangle of the TIN
-    spacing_m: float  # of the points; see `pcfix.grid.lattice.spacing_m`
-
-    @property
-    def margin_cells(self) -> int:
-        """The number of cells around a window whose points decide on it."""
-        reach = int(np.ceil(self.reach_m / self.lattice.resolution_m)) + 1
-        return {"tin": reach, "idw": 1}.get(self.method, 0)
-
-
-class Gridded(NamedTuple):
-    """The bands of a window, each of its shape; NaN if unknown."""
-
-    height: FloatArray
-    points: IntArray
-    spread: FloatArray
-
-
-def grid_window(points: FloatArray, window: Window, how: Gridding) -> Gridded:
-    """Return the bands of a part of a raster, from all points that decide on it, or more.
-
-    Points, shape (n, 3), are x and y, world frame, metres, and the height or another quantity.
+    Points, shape (n, 3), are all that decide on it, or more: x and y, world frame, metres, and the
+    height or another quantity. `reach`, the diameter of the widest circle around a triangle of the
+    TIN, and `spacing` of the points (see `pcfix.grid.lattice.spacing_m`) are in cells. The bands
+    have the shape of the window, NaN if unknown.
     """
-    cell = how.lattice.cells(points)
+    cell, position = lattice.cells(points), lattice.positions(points)
     inner, shape = window.holds(cell), (window.height, window.width)
     code = (cell[inner, 1] - window.row) * window.width + cell[inner, 0] - window.column
     cells = cell_statistics(code, points[inner, 2], window.height * window.width)
-    size, position = how.lattice.resolution_m, how.lattice.positions(points)
-    match how.method:
+    match method:
         case "tin":
-            reach, spacing = how.reach_m / size, how.spacing_m / size
             height = triangulated(position, points[:, 2], window, reach, spacing)
         case "idw":
             height = inverse_distance(position, cell, points[:, 2], window)
             height[cells["points"] == 0] = np.nan
-        case method:
+        case _:
             height = cells[method]
-    return Gridded(
-        height.reshape(shape), cells["points"].reshape(shape), cells["spread"].reshape(shape)
-    )
+    counts, spread = cells["points"].reshape(shape), cells["spread"].reshape(shape)
+    return height.reshape(shape), counts, spread
 
 
 def cell_statistics(cell: IntArray, z: FloatArray, size: int) -> dict[str, Any]:
@@ -84,16 +70,6 @@ def cell_statistics(cell: IntArray, z: FloatArray, size: int) -> dict[str, Any]:
     whole[:, filled] = low + offset, median, low, z[first + n - 1], scatter
     names = ("mean", "median", "min", "max", "spread")
     return {"points": count, **dict(zip(names, whole, strict=True))}
-
-
-def as_uncertainty(bands: Gridded) -> Gridded:
-    """Return the vertical uncertainty (m) at 95 % from bands of standard errors.
-
-    It is the root mean square over the points of a cell, not divided by the square root of their
-    number: errors of level, index and tilt of the water and of poses are common to them and do not
-    average out. To treat all errors as common is conservative.
-    """
-    return bands._replace(height=TO_95 * np.hypot(bands.height, bands.spread))
 
 
 REACH_CELLS = 2.0**0.5
@@ -123,3 +99,121 @@ def inverse_distance(
             weights += np.bincount(to, weight, cells)
             total += np.bincount(to, weight * z[rows], cells)
     return np.asarray(total / np.where(weights > 0.0, weights, 1.0))
+
+
+MOVED = 1e-4
+"""Displacement for the choice of triangles, relative to the spacing of the points."""
+ON_EDGE = 1e-9  # of a barycentric coordinate: a centre on an edge belongs to both sides
+_MIX = np.array([0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB], np.uint64)
+
+
+def triangulated(
+    position: FloatArray, z: FloatArray, window: Window, widest: float, spacing: float
+) -> FloatArray:
+    """Return the height (m) of the triangle above each centre of a window; NaN outside all.
+
+    `position`, shape (n, 2), are columns and rows, in cells from the top left corner of the raster,
+    of at least the points within `widest` of the window; `z`, shape (n,), their heights (m). Of
+    several points at one place the mean height is used. `widest` is the diameter of the widest
+    circle around a triangle and `spacing` a usual distance between points, cells.
+    """
+    out = np.full(window.height * window.width, np.nan)
+    position, z = _one_a_place(position, z)
+    moved = position + MOVED * spacing * _offsets(position)
+    row, column = np.divmod(np.arange(out.size), window.width)
+    centre = np.column_stack([column + window.column, row + window.row]) + 0.5
+    origin = np.floor(moved.mean(axis=0)) if len(moved) else 0.0
+    try:
+        mesh = Delaunay(moved - origin)
+    except (QhullError, ValueError):  # fewer than three points, or all on one line
+        return out.reshape(window.height, window.width)
+    found = mesh.find_simplex(centre - origin, tol=ON_EDGE)
+    corners = np.sort(mesh.simplices[found], axis=1)
+    # the radius of the circle through three points is a b c / 4 area
+    a, b, c = np.moveaxis(moved[corners], 1, 0)
+    ab, ac, bc = (((p - q) ** 2).sum(axis=1) for p, q in ((a, b), (a, c), (b, c)))
+    circle = ab * ac * bc / (4.0 * _cross(b - a, c - a) ** 2)
+    # the displaced positions choose the triangle, the true ones give the height
+    inside = (found >= 0) & (circle <= (widest / 2.0) ** 2)
+    corners, centre = corners[inside], centre[inside]
+    a, b, c = np.moveaxis(position[corners], 1, 0)
+    area = _cross(b - a, c - a)
+    s, u = _cross(centre - a, c - a) / area, _cross(b - a, centre - a) / area
+    i, j, k = z[corners].T
+    out[inside] = i + s * (j - i) + u * (k - i)
+    return out.reshape(window.height, window.width)
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the cross product of vectors in plan, shape (n, 2)."""
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def _one_a_place(position: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return points sorted by column and row, each place once, with the mean of its heights."""
+    order = np.lexsort((z, position[:, 1], position[:, 0]))
+    position, z = position[order], z[order]
+    new = np.ones(len(z), bool)
+    new[1:] = (position[1:] != position[:-1]).any(axis=1)
+    if new.all():
+        return position, z
+    first = np.flatnonzero(new)
+    n = np.diff(first, append=len(z))
+    mean = z[first] + np.add.reduceat(z - np.repeat(z[first], n), first) / n
+    return position[first], mean
+
+
+def _offsets(position: FloatArray) -> FloatArray:
+    """Return pseudo-random numbers from -0.5 to 0.5 that only depend on the position.
+
+    They are hashes of the bits of the coordinates, by D. Lea and G. Steele's SplitMix.
+    """
+    bits = np.ascontiguousarray(position + 0.0).view(np.uint64)
+    mixed = bits[:, :1] * _MIX[0] + bits[:, 1:] + _MIX[:2] * np.arange(1, 3, dtype=np.uint64)
+    for shift, factor in ((30, _MIX[1]), (27, _MIX[2])):
+        mixed = (mixed ^ (mixed >> np.uint64(shift))) * factor
+    mixed ^= mixed >> np.uint64(31)
+    return np.asarray((mixed >> np.uint64(11)) / 2.0**53 - 0.5)
+
+
+PART_CELLS, PART_MARGINS = 64, 8
+"""Side of a part, cells: small triangulations take half the time per point."""
+SLACK_CELLS = 1.5
+"""Rims k + 1 cells apart enclose k empty ones; circles through their corners are a bit wider."""
+
+
+def margin_cells(widest: float) -> int:
+    """Return the number of cells around a part of a raster that decide on its holes."""
+    return int(np.ceil(widest + SLACK_CELLS)) + 2
+
+
+def fill_holes(height: FloatArray, window: Window, around: Window, widest: float) -> FloatArray:
+    """Return the heights of a window with its narrow holes filled.
+
+    The centres of the cells at the rims of holes are triangulated; triangles whose circle is wider
+    than `widest`, in cells, are ignored. So narrow parts of wide holes, and narrow bays at the edge
+    of the survey, are filled too. `around`, the shape of the heights (metres, NaN if unknown), is
+    the window with `margin_cells` of margin, as far as the raster reaches.
+    """
+    from scipy.ndimage import binary_erosion
+
+    margin = margin_cells(widest)
+    side = max(PART_CELLS, PART_MARGINS * margin)
+    filled = np.empty((window.height, window.width))
+
+    def fill(part: Window) -> None:
+        """Fill the holes of a part of the window."""
+        about = part.grown(margin).clipped(around)
+        near = height[about.within(around)]
+        inner, known = near[part.within(about)], ~np.isnan(near)
+        if known.any() and np.isnan(inner).any():
+            inside = binary_erosion(known, np.ones((3, 3), np.bool_))  # with eight known neighbours
+            row, column = np.nonzero(known & ~inside)
+            position = np.column_stack([column + about.column + 0.5, row + about.row + 0.5])
+            surface = triangulated(position, near[row, column], part, widest + SLACK_CELLS, 1.0)
+            inner = np.where(np.isnan(inner), surface, inner)
+        filled[part.within(window)] = inner
+
+    with ThreadPoolExecutor(current().threads) as pool:
+        list(pool.map(fill, window.parts(side)))
+    return filled

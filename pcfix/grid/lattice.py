@@ -161,7 +161,8 @@ def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float, name: s
         columns, rows = size(resolution_m)
         sentence = (
             f"{name}: a resolution of {resolution_m:g} m makes {columns:,.0f} x {rows:,.0f} cells,"
-            f" more than {MAX_CELLS:,}. Use {finest:g} m or more."
+            f" more than {MAX_CELLS:,}. Use {finest:g} m or more, or first remove points that are"
+            " far from all others (pcfix clean)."
         )
         raise SettingError("option.resolution", sentence, value=resolution_m, finest=finest)
     (west, south), (east, north) = cells_of(np.array([low, high]), resolution_m).tolist()
@@ -174,12 +175,9 @@ ROUND = (1.0, 2.0, 5.0, 2.5, 4.0, 8.0, 1.25, 1.6, 3.2, 6.4)
 """Figures of a resolution, the roundest first; neighbours differ by less than sqrt 2."""
 
 
-def round_resolution(spacing_m: float, finest_m: float) -> float:
-    """Return a round side of cells with `POINTS_A_CELL` for a spacing of points, metres.
-
-    It is at least `finest_m`, such as the ground sampling distance.
-    """
-    least = max(spacing_m * math.sqrt(POINTS_A_CELL[0]), finest_m, MIN_RESOLUTION_M)
+def round_resolution(spacing_m: float) -> float:
+    """Return a round side of cells with `POINTS_A_CELL` for a spacing of points, metres."""
+    least = max(spacing_m * math.sqrt(POINTS_A_CELL[0]), MIN_RESOLUTION_M)
     power = 10.0 ** math.floor(math.log10(least))
     most = least * math.sqrt(POINTS_A_CELL[1] / POINTS_A_CELL[0])
     sides = (figure * scale for figure in ROUND for scale in (power, 10.0 * power))

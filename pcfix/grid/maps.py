@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -106,16 +105,14 @@ class MapsBuilder:
             np.add.at(sums, cells, summands)  # one by one: the same bits for any chunks
 
     def maps(self) -> Maps:
-        """Return the means."""
+        """Return the means; there is at least one point."""
         shape = self._rows, self._columns
         with np.errstate(invalid="ignore"):
             means = [self._sums[1] / self._sums[0], *(self._sums[3:] / self._sums[2])]
         heights, depth, shift, rays, variance = (_filled(one.reshape(shape)) for one in means)
         uncertainty = np.where(variance > 0.0, 1.96 * np.sqrt(variance), np.nan)
         known = np.argwhere(np.isfinite(heights))
-        (top, left), (last, right) = (
-            (known.min(axis=0), known.max(axis=0)) if len(known) else ((0, 0), np.array(shape) - 1)
-        )
+        (top, left), (last, right) = known.min(axis=0), known.max(axis=0)
         part = np.s_[top : last + 1, left : right + 1]  # the bounds include noise
         north = float(self._low[1]) + (self._rows - top) * self._cell_m
         place = float(self._low[0]) + left * self._cell_m, float(north), self._cell_m
@@ -150,13 +147,6 @@ LEAST_CELLS = 12.0
 """Shorter lines are dropped."""
 
 
-class Contour(NamedTuple):
-    """A line, shape (n, 2): columns and rows from the centre of the first cell; and its level."""
-
-    level: float
-    place: FloatArray
-
-
 def depth_interval(depth_m: FloatArray, uncertainty_m: FloatArray) -> float:
     """Return the interval for a map of depths: few levels, and not finer than the uncertainty.
 
@@ -168,10 +158,11 @@ def depth_interval(depth_m: FloatArray, uncertainty_m: FloatArray) -> float:
     return nice_step(max(float(deepest) / MOST_LEVELS, sigma, LEAST_INTERVAL_M))
 
 
-def contours(values: FloatArray, interval: float) -> list[Contour]:
-    """Return the contours of cells (rows, columns), NaN if unknown, at whole intervals.
+def contours(values: FloatArray, interval: float) -> list[tuple[float, FloatArray]]:
+    """Return levels and lines of the contours of cells (rows, columns), NaN if unknown.
 
-    The lowest and the highest value have no contour.
+    The levels are whole intervals; the lowest and the highest value have no contour. A line, shape
+    (n, 2), has columns and rows from the centre of the first cell.
     """
     from contourpy import contour_generator
 
@@ -180,11 +171,9 @@ def contours(values: FloatArray, interval: float) -> list[Contour]:
     maker = contour_generator(z=np.ma.masked_invalid(smoothed(values, SMOOTH_CELLS)))
     first = math.floor(float(np.nanmin(values)) / interval) + 1
     last = math.ceil(float(np.nanmax(values)) / interval)
-    lines = [
-        Contour(round(step * interval, 6), np.asarray(line))
-        for step in range(first, last)
-        for line in maker.lines(step * interval)
-    ]
     return [
-        one for one in lines if float(np.hypot(*np.diff(one.place, axis=0).T).sum()) >= LEAST_CELLS
+        (round(step * interval, 6), line)
+        for step in range(first, last)
+        for line in map(np.asarray, maker.lines(step * interval))
+        if np.hypot(*np.diff(line, axis=0).T).sum() >= LEAST_CELLS
     ]

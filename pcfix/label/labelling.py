@@ -6,19 +6,22 @@ its surroundings decide instead of its own height: each point inside the mask an
 class votes with its height above the surface, divided by the dead band and clipped to -1 ... 1. A
 point within the dead band is submerged if the votes of its cell and the eight around it sum to a
 negative number.
+
+Connected water is found in cells over the cloud, filled chunk by chunk. All sums are of whole
+numbers, so that they do not depend on the order of the points.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from pcfix.cells import CellFrame, Cells, Layer
 from pcfix.errors import GeometryError
-from pcfix.label.areas import Grid, Surroundings, WaterMask
 from pcfix.model import (
     BATHYMETRIC_POINT,
     UNCLASSIFIED,
@@ -28,10 +31,106 @@ from pcfix.model import (
     IntArray,
 )
 from pcfix.options.correct import LabelRules
-from pcfix.sums import LEAST, MOST, Sums
+from pcfix.sums import LEAST, Sums
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
 Classes = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class WaterMask:
+    """The polygons inside which points may be submerged.
+
+    A point on the border, of a hole too, is inside.
+    """
+
+    area: Any  # shapely Polygon or MultiPolygon, valid, in the cloud's CRS, metres
+    name: str = "mask"  # for messages
+    notes: tuple[str, ...] = ()  # of the reader, for the summary
+
+    def inside(self, x: FloatArray, y: FloatArray) -> BoolArray:
+        """Return which of n plan positions, metres, world frame, are inside."""
+        import shapely
+
+        shapely.prepare(self.area)  # does nothing the second time
+        return np.asarray(shapely.intersects_xy(self.area, x, y))
+
+
+SHARE_OF_LARGEST = 0.1
+"""Pools of at least this share of the area of the largest water body count as water."""
+_VOTE = 1000
+_AROUND = np.ones((3, 3), np.bool_)
+
+PRESENT, BELOW, UNDECIDED = 1, 2, 4
+"""A cell has points; points below the surface; points within the dead band."""
+
+
+class Surroundings(NamedTuple):
+    """What a grid knows about the cells of points; the rest is None without connected water."""
+
+    frame: CellFrame
+    is_wet: BoolArray  # (rows, columns), whether an undecided point in the cell is submerged
+    pool: npt.NDArray[np.int32] | None = None  # (rows, columns), 0 for none, else an index below
+    stays: BoolArray | None = None  # whether a pool counts as water
+    joined: BoolArray | None = None  # (rows, columns), a pool of water is in or next to the cell
+
+
+def surroundings_of(
+    parts: Iterable[tuple[FloatArray, FloatArray, FloatArray, BoolArray]],
+    low: FloatArray,
+    high: FloatArray,
+    dead_m: float,
+    *,
+    connected: bool,
+    least_pool_m2: float | None,
+) -> Surroundings:
+    """Collect points in cells, coarsen these until they have enough points, and find the water.
+
+    Parts have x, y and height above the water surface of their points, (n,), NaN if unknown, and
+    which of them count; the others cannot be submerged, and only show that there is no gap. Points
+    within `dead_m` of the surface are undecided. `low` and `high` are the corners of the cloud,
+    metres, shape (2,), if they are known. Water is connected over sides, corners, and gaps of at
+    most two cells.
+    """
+    from scipy.ndimage import binary_dilation, convolve, label
+
+    none = Layer(np.zeros((), np.uint8), np.bitwise_or), Layer(np.zeros((), np.int64), np.add)
+    cells, water_points = Cells(low, high, *none), 0
+    for x, y, height_m, counts in parts:
+        if not x.size:
+            continue
+        cells.cover(np.array([x.min(), y.min()]), np.array([x.max(), y.max()]))
+        row, column = cells.frame.cells(x, y)
+        flags, votes = cells.values
+        cell = row * flags.shape[1] + column
+        counts = counts & ~np.isnan(height_m)
+        below = counts & (height_m < -dead_m)
+        unsure = counts & ~below & (height_m <= dead_m) & (dead_m > 0.0)
+        water_points += int(np.count_nonzero(below | unsure))
+        bits = PRESENT + BELOW * below + UNDECIDED * unsure
+        np.bitwise_or.at(flags.reshape(-1), cell, bits.astype(np.uint8))
+        if dead_m:
+            vote = np.rint(_VOTE * np.clip(height_m[counts] / dead_m, -1.0, 1.0))
+            np.add.at(votes.reshape(-1), cell[counts], vote.astype(np.int64))
+    if not cells.values[0].size:  # no points
+        cells.cover(np.zeros(2), np.zeros(2))
+    cells.coarsen(water_points, lambda flags: (flags & (BELOW | UNDECIDED)) > 0)
+    frame, (flags, votes) = cells.frame, cells.values
+    # the votes of a cell and its eight neighbours together
+    is_wet = convolve(votes, np.ones((3, 3)), mode="constant") < 0
+    if not connected:
+        return Surroundings(frame, is_wet)
+    water = (flags & BELOW) > 0
+    if dead_m:
+        water |= ((flags & UNDECIDED) > 0) & is_wet
+    found, count = label(water | (binary_dilation(water, _AROUND) & (flags == 0)), _AROUND)
+    pool = np.where(water, found, 0).astype(np.int32)
+    area = frame.side_m**2 * np.bincount(pool[water], minlength=count + 1).astype(np.float64)
+    least = SHARE_OF_LARGEST * area.max() if least_pool_m2 is None else least_pool_m2
+    stays = (area >= least) | (area == area.max())
+    stays[0] = False
+    joined = binary_dilation(stays[pool], _AROUND)
+    return Surroundings(frame, is_wet, pool, stays, joined)
 
 
 class Part(NamedTuple):
@@ -53,12 +152,10 @@ class LabelCounts(Sums):
     water_unknown: int = 0  # without a known height of the water
     # depth of the point that is nearest to the water surface, negative above it, metres
     least_m: float = field(default=np.inf, metadata=LEAST)
-    # points below the water, how many of them are excluded, and their corners
+    # points below the water, and how many of them are excluded
     below: int = 0
     outside_mask: int = 0
     respected: int = 0
-    low: FloatArray = field(default_factory=lambda: np.full(2, np.inf), metadata=LEAST)
-    high: FloatArray = field(default_factory=lambda: np.full(2, -np.inf), metadata=MOST)
     in_pool: IntArray | None = None  # points of each separate pool
 
     def of_classes(self) -> dict[str, int]:
@@ -91,20 +188,25 @@ class Labelling:
 
         `parts` are the whole cloud in chunks, and `low` and `high` its corners, if they are known.
         """
-        settings = self.settings
-        if not (settings.connected or settings.dead_band > 0.0):
+        rules = self.settings
+        if not (rules.connected or rules.dead_band > 0.0):
             return self
-        grid = Grid(low, high, settings.dead_band)
-        for part in parts:
-            x, y, z = np.ascontiguousarray(part.xyz.T)
-            height = z - part.surface.height_m
-            # high points have no vote without a dead band
-            counts = np.ones(len(x), np.bool_) if settings.dead_band else height < 0.0
-            counts &= ~self._is_respected(part.classes)
-            rows = np.flatnonzero(counts)
-            counts[rows] = self._is_inside(x[rows], y[rows])
-            grid.add(x, y, height, counts)
-        around = grid.surroundings(connected=settings.connected, least_pool_m2=settings.least_pool)
+
+        def counted() -> Iterator[tuple[FloatArray, FloatArray, FloatArray, BoolArray]]:
+            for part in parts:
+                x, y, z = np.ascontiguousarray(part.xyz.T)
+                height = z - part.surface.height_m
+                # high points have no vote without a dead band
+                counts = np.ones(len(x), np.bool_) if rules.dead_band else height < 0.0
+                counts &= ~self._is_respected(part.classes)
+                rows = np.flatnonzero(counts)
+                counts[rows] = self._is_inside(x[rows], y[rows])
+                yield x, y, height, counts
+
+        around = surroundings_of(
+            counted(), low, high, rules.dead_band,
+            connected=rules.connected, least_pool_m2=rules.least_pool,
+        )  # fmt: skip
         return replace(self, around=around)
 
     def submerged(
@@ -114,11 +216,28 @@ class Labelling:
         below = is_submerged(xyz[:, 2], surface)
         if self.is_plain:
             return below, LabelCounts()
-        height = xyz[:, 2] - surface.height_m
-        wet = below | _within(height, self.settings.dead_band)
-        rows = np.flatnonzero(wet)
-        wet[rows], counts = self._decided(xyz[rows], height[rows], classes[rows])
-        return wet, counts
+        height, dead_m = xyz[:, 2] - surface.height_m, self.settings.dead_band
+        rows = np.flatnonzero(below | _within(height, dead_m))
+        x, y = np.ascontiguousarray(xyz[rows, :2].T)
+        height, in_pool = height[rows], None
+        below, inside = height < 0.0, self._is_inside(x, y)
+        respected = self._is_respected(classes[rows])
+        wet = inside & ~respected
+        if self.around is not None:
+            cells = self.around.frame.cells(x, y)
+            wet &= ~_within(height, dead_m) | self.around.is_wet[cells]
+            if self.around.pool is not None and self.around.stays is not None:
+                pool, stays = self.around.pool[cells], self.around.stays
+                in_pool = np.bincount(pool[wet & ~stays[pool]], minlength=len(stays))
+                wet &= stays[pool]
+        submerged = np.zeros(len(xyz), np.bool_)
+        submerged[rows] = wet
+        return submerged, LabelCounts(
+            below=int(below.sum()),
+            outside_mask=int((below & ~inside).sum()),
+            respected=int((below & inside & respected).sum()),
+            in_pool=in_pool,
+        )
 
     def labels(self, part: Part) -> tuple[Classes, LabelCounts]:
         """Return the new classes of points, and their counts; those of land do not change."""
@@ -154,31 +273,6 @@ class Labelling:
     def _is_inside(self, x: FloatArray, y: FloatArray) -> BoolArray:
         return np.ones(len(x), np.bool_) if self.mask is None else self.mask.inside(x, y)
 
-    def _decided(
-        self, xyz: FloatArray, height: FloatArray, classes: Classes
-    ) -> tuple[BoolArray, LabelCounts]:
-        """Decide on points that are below or within the dead band."""
-        x, y, _ = np.ascontiguousarray(xyz.T)
-        below, inside, respected = height < 0.0, self._is_inside(x, y), self._is_respected(classes)
-        wet, in_pool = inside & ~respected, None
-        if self.around is not None:
-            cells = self.around.frame.cells(x, y)
-            unsure = _within(height, self.settings.dead_band)
-            if unsure.any():
-                wet &= ~unsure | self.around.is_wet[cells]
-            if self.around.pool is not None and self.around.stays is not None:
-                pool, stays = self.around.pool[cells], self.around.stays
-                in_pool = np.bincount(pool[wet & ~stays[pool]], minlength=len(stays))
-                wet &= stays[pool]
-        return wet, LabelCounts(
-            below=int(below.sum()),
-            outside_mask=int((below & ~inside).sum()),
-            respected=int((below & inside & respected).sum()),
-            low=xyz[below, :2].min(axis=0, initial=np.inf),
-            high=xyz[below, :2].max(axis=0, initial=-np.inf),
-            in_pool=in_pool,
-        )
-
     def check(self, name: str, counts: LabelCounts, submerged: int | None = None) -> None:
         """Check that mask, respected classes and dead band leave points below the water."""
         left = counts.below - counts.outside_mask - counts.respected
@@ -201,12 +295,11 @@ class Labelling:
         if self.mask is None or counts.outside_mask < max(counts.below, 1):
             return
         west, south, east, north = bounds = self.mask.area.bounds
-        (x0, y0), (x1, y1) = counts.low, counts.high
         raise GeometryError(
             "mask.no_points",
             f"{self.mask.name} (x {west:.1f} to {east:.1f}, y {south:.1f} to {north:.1f}) contains"
-            f" none of the points of {name} below the water (x {x0:.1f} to {x1:.1f}, y {y0:.1f} to"
-            f" {y1:.1f}). Check the CRS of both, and that the polygons are of water.",
+            f" none of the {counts.below:,} points of {name} below the water. Check the CRS of"
+            " both, and that the polygons are of water.",
             path=self.mask.name, points=counts.below, bounds=bounds,
         )  # fmt: skip
 
@@ -215,21 +308,9 @@ class Labelling:
         if self.is_plain:
             return None
         around, separate = self.around, None
-        if around is not None and around.area_m2 is not None:  # pools that are excluded
-            in_pool = np.zeros_like(around.area_m2) if counts.in_pool is None else counts.in_pool
-            area, largest = np.where(in_pool > 0, around.area_m2, 0.0), None
-            if area.any():
-                pool, side = int(np.argmax(area)), around.frame.side_m
-                cells = np.argwhere(around.pool == pool)
-                row, column = cells[len(cells) // 2]  # a place inside it
-                largest = {
-                    "area_m2": round(float(area[pool]), 2),
-                    "points": int(in_pool[pool]),
-                    "x": float((around.frame.first_column + column + 0.5) * side),
-                    "y": float((around.frame.first_row + row + 0.5) * side),
-                }
-            pools, points = int((area > 0.0).sum()), int(in_pool.sum())
-            separate = {"pools": pools, "points": points, "largest": largest}
+        if around is not None and around.pool is not None:  # pools that are excluded
+            in_pool = np.zeros(1, np.int64) if counts.in_pool is None else counts.in_pool
+            separate = {"pools": int((in_pool > 0).sum()), "points": int(in_pool.sum())}
         return {
             "settings": asdict(self.settings),
             "water_mask": None if self.mask is None else self.mask.name,

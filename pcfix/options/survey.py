@@ -79,7 +79,7 @@ class RunOptions(
     """The options of ``pcfix run``: everything that its results depend on is in ``run.json``."""
 
     resolution: float | None = option(None, basic=True, above=0)
-    """Cell size of the rasters. [m] [default: 2 to 4 points a cell, or the GSD]"""
+    """Cell size of the rasters. [m] [default: 2 to 4 points a cell]"""
     project: str | None = option(None, basic=True)
     """Name of the project, the title of the report. [default: the name of the cloud]"""
     date: str | None = option(None)

@@ -42,14 +42,6 @@ class Picture(NamedTuple):
     shrunk: int = 1
     blank: BoolArray | None = None
 
-    def is_blank(self, place: FloatArray) -> BoolArray:
-        """Return which places, shape (n, 2), have no picture."""
-        if self.blank is None:
-            return np.zeros(len(place), bool)
-        rows, columns = self.blank.shape
-        column, row = (place / self.shrunk).astype(int).T
-        return self.blank[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
-
     def at(self, place: FloatArray) -> npt.NDArray[Any]:
         """Return the pixels at places, shape (n, bands), bicubic."""
         import cv2
@@ -121,7 +113,11 @@ def mosaic(
         for k in np.flatnonzero(wanted.any(axis=1)):
             rows = np.flatnonzero(wanted[k])
             place[k, rows], seen = seen_at(photos[near[k]], xyz[rows], scene)
-            seen[seen] = ~picture(near[k]).is_blank(place[k, rows[seen]])
+            image = picture(near[k])
+            if image.blank is not None:
+                column, row = (place[k, rows[seen]] / image.shrunk).astype(int).T
+                last = np.array(image.blank.shape) - 1
+                seen[seen] = ~image.blank[np.clip(row, 0, last[0]), np.clip(column, 0, last[1])]
             slope[k, rows[~seen]] = np.inf
             looked[k, rows] = True
     covered = np.isfinite(best)

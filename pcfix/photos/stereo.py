@@ -10,13 +10,14 @@ all pairs are in memory (a few hundred images). It suits land and bed seen from 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from pcfix.errors import GeometryError
+from pcfix.grid.heights import cell_statistics
 from pcfix.lens.imaging import project, unproject
-from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.model import BoolArray, FloatArray
 from pcfix.photos.mapping import Ground, Photo
 from pcfix.photos.ortho import Picture
 
@@ -35,20 +36,6 @@ HALF = 1 << 31
 """Added to columns, so that those west of x = 0 do not run into the row of their number."""
 
 
-class Rectified(NamedTuple):
-    """The common frame of a pair, x along the base, and its window."""
-
-    rotation: FloatArray  # from the world
-    base_m: float
-    focal_px: float
-    left_px: float  # the corner of the window in the left image, from the foot of the axis
-    top_px: float
-    width: int
-    height: int
-    least_px: int  # at which disparities begin
-    disparities: int
-
-
 def stereo_cloud(
     photos: Sequence[Photo],
     ground: Ground,
@@ -65,26 +52,37 @@ def stereo_cloud(
     low, high = np.nanquantile(ground.height_m, [0.001, 0.999])
     heights = float(low - SPARE_RELIEF * (high - low) - 1.0), float(high + 1.0)
     middle = float(np.nanmedian(ground.height_m))
-    pairs, cells, z = pairs_of(photos, middle), [], []
+    pairs, cells, means = pairs_of(photos, middle), [], []
     for done, (one, other) in enumerate(pairs, start=1):
         xyz = pair_points(photos[one], photos[other], picture(one), picture(other), heights)
-        own, mean = _means(xyz, cell_m)
-        cells.append(own)
-        z.append(mean)
+        column, row = np.floor(xyz[:, :2] / cell_m).astype(np.int64).T
+        own, cell = np.unique((row << 32) + column + HALF, return_inverse=True)
+        if len(own):
+            cells.append(own)
+            means.append(cell_statistics(cell, xyz[:, 2], len(own))["mean"])
         if progress is not None:
             progress(done, len(pairs))
-    if not sum(map(len, z)):
+    if not cells:
         raise GeometryError(
             "photos.no_pairs",
             "Stereo found no pairs of images that overlap and match. Rebuild with the command of a"
             " photogrammetry package.",
             pairs=len(pairs),
         )
+    # the median height of each cell, where most pairs agree to a pixel of parallax
     parallax = [
         (photo.centre[2] - middle) / (BASE_SHARES[1] * min(photo.lens.width, photo.lens.height))
         for photo in photos
     ]
-    return _fused(np.concatenate(cells), np.concatenate(z), cell_m, float(np.median(parallax)))
+    own, cell = np.unique(np.concatenate(cells), return_inverse=True)
+    z = np.concatenate(means)
+    fused = cell_statistics(cell, z, len(own))
+    agrees = np.abs(z - fused["median"][cell]) <= float(np.median(parallax))
+    agreeing = np.bincount(cell[agrees], minlength=len(own))
+    row = own >> 32
+    centre = cell_m * (np.column_stack([own - (row << 32) - HALF, row]) + 0.5)
+    fine = agreeing >= np.maximum(FEWEST_PAIRS, 0.5 * fused["points"])
+    return np.column_stack([centre, fused["median"]])[fine]
 
 
 def pairs_of(photos: Sequence[Photo], ground_m: float) -> list[tuple[int, int]]:
@@ -105,8 +103,16 @@ def pairs_of(photos: Sequence[Photo], ground_m: float) -> list[tuple[int, int]]:
     return sorted(chosen)
 
 
-def rectified(left: Photo, right: Photo, heights: tuple[float, float]) -> Rectified | None:
-    """Return the common frame of a pair; None where they have no ground in common."""
+def pair_points(
+    left: Photo, right: Photo, one: Picture, other: Picture, heights: tuple[float, float]
+) -> FloatArray:
+    """Intersect what both images of a pair see, shape (n, 3), metres, world frame.
+
+    Both are rectified to a common frame with x along the base, within the window that both see.
+    """
+    import cv2
+
+    nothing = np.empty((0, 3))
     way = right.centre - left.centre
     base = float(np.linalg.norm(way))
     x = way / base
@@ -119,17 +125,18 @@ def rectified(left: Photo, right: Photo, heights: tuple[float, float]) -> Rectif
         w, h = photo.lens.width, photo.lens.height
         places = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]])
         corners.append(np.asarray(unproject(photo.lens, places) @ photo.rotation))
-    ahead = [one @ rotation.T for one in corners]
-    if min((one[:, 2] / np.linalg.norm(one, axis=1)).min() for one in ahead) < 0.3:
-        return None
+    ahead = [rays @ rotation.T for rays in corners]
+    if min((rays[:, 2] / np.linalg.norm(rays, axis=1)).min() for rays in ahead) < 0.3:
+        return nothing
     focal = left.lens.focal
-    plane = [focal * one[:, :2] / one[:, 2:] for one in ahead]
-    top = max(one[:, 1].min() for one in plane)
-    bottom = min(one[:, 1].max() for one in plane)
+    plane = [focal * rays[:, :2] / rays[:, 2:] for rays in ahead]
+    top = max(corner[:, 1].min() for corner in plane)
+    bottom = min(corner[:, 1].max() for corner in plane)
     lengths = [(left.centre[2] - height) / -corners[0][:, 2] for height in heights]
-    far = [one for length in lengths for one in length * ahead[0][:, 2] if one > 0.0]
-    if not far or bottom - top < 8 * BLOCK_PX:
-        return None
+    far = np.concatenate([length * ahead[0][:, 2] for length in lengths])
+    far = far[far > 0.0]
+    if not len(far) or bottom - top < 8 * BLOCK_PX:
+        return nothing
     least = int(np.floor(focal * base / max(far))) - SPARE_PX
     most = int(np.ceil(focal * base / min(far))) + SPARE_PX
     start = max(plane[0][:, 0].min(), plane[1][:, 0].min() + least)
@@ -137,23 +144,12 @@ def rectified(left: Photo, right: Photo, heights: tuple[float, float]) -> Rectif
     width, height = int(stop - start), int(bottom - top)
     disparities = -(-(most - least) // 16) * 16
     if width <= disparities + 8 * BLOCK_PX:
-        return None
-    return Rectified(rotation, base, focal, start, top, width, height, least, disparities)
-
-
-def pair_points(
-    left: Photo, right: Photo, one: Picture, other: Picture, heights: tuple[float, float]
-) -> FloatArray:
-    """Intersect what both images of a pair see, shape (n, 3), metres, world frame."""
-    import cv2
-
-    frame = rectified(left, right, heights)
-    if frame is None:
-        return np.empty((0, 3))
-    seen, lost = _turned(left, one, frame, 0)
-    found, gone = _turned(right, other, frame, frame.least_px)
+        return nothing
+    u, v = np.arange(width) + 0.5 + start, np.arange(height) + 0.5 + top
+    seen, lost = _turned(left, one, rotation, u / focal, v / focal)
+    found, gone = _turned(right, other, rotation, (u - least) / focal, v / focal)
     matcher: Any = cv2.StereoSGBM.create(
-        minDisparity=0, numDisparities=frame.disparities, blockSize=BLOCK_PX,
+        minDisparity=0, numDisparities=disparities, blockSize=BLOCK_PX,
         P1=8 * BLOCK_PX**2, P2=32 * BLOCK_PX**2, disp12MaxDiff=1, preFilterCap=31,
         uniquenessRatio=5, speckleWindowSize=100, speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
@@ -164,51 +160,25 @@ def pair_points(
     partner = np.rint(column - shift).astype(int)
     fine = (partner >= 0) & ~gone[row, np.maximum(partner, 0)]
     row, column, shift = row[fine], column[fine], shift[fine].astype(np.float64)
-    depth = frame.focal_px * frame.base_m / (shift + frame.least_px)
-    x = (column + 0.5 + frame.left_px) / frame.focal_px
-    y = (row + 0.5 + frame.top_px) / frame.focal_px
-    ahead = depth[:, None] * np.column_stack([x, y, np.ones_like(x)])
-    return np.asarray(left.centre + ahead @ frame.rotation)
+    depth = focal * base / (shift + least)
+    ray = np.column_stack([u[column] / focal, v[row] / focal, np.ones(len(row))])
+    return np.asarray(left.centre + (depth[:, None] * ray) @ rotation)
 
 
 def _turned(
-    photo: Photo, picture: Picture, frame: Rectified, least_px: int
+    photo: Photo, picture: Picture, rotation: FloatArray, x: FloatArray, y: FloatArray
 ) -> tuple[Any, BoolArray]:
-    """Rectify an image to the frame of a pair, and return where it has no picture there."""
+    """Rectify an image to a frame of some columns and rows, and return where it has no picture."""
     import cv2
 
-    u = np.arange(frame.width) + 0.5 + frame.left_px - least_px
-    v = np.arange(frame.height) + 0.5 + frame.top_px
-    ahead = np.ones((frame.height, frame.width, 3))
-    ahead[..., 0], ahead[..., 1] = u / frame.focal_px, v[:, None] / frame.focal_px
-    directions = ahead.reshape(-1, 3) @ (photo.rotation @ frame.rotation.T).T
+    ahead = np.ones((len(y), len(x), 3))
+    ahead[..., 0], ahead[..., 1] = x, y[:, None]
+    directions = ahead.reshape(-1, 3) @ (photo.rotation @ rotation.T).T
     place = (project(photo.lens, directions) - 0.5).astype(np.float32)
-    at = np.nan_to_num(place, nan=-9.0).reshape(frame.height, frame.width, 2)
+    at = np.nan_to_num(place, nan=-9.0).reshape(len(y), len(x), 2)
     turned = cv2.remap(picture.pixels, at, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
     blank = cv2.remap(
         np.asarray(picture.blank, np.uint8), at, None, cv2.INTER_NEAREST,
         borderMode=cv2.BORDER_CONSTANT, borderValue=1,
     )  # fmt: skip
     return turned, np.asarray(blank > 0)
-
-
-def _means(xyz: FloatArray, cell_m: float) -> tuple[IntArray, FloatArray]:
-    """Return the cells with points, as one number each, and their mean heights."""
-    column, row = np.floor(xyz[:, :2] / cell_m).astype(np.int64).T
-    number = (row << 32) + column + HALF
-    cells, inverse, counts = np.unique(number, return_inverse=True, return_counts=True)
-    return cells, np.bincount(inverse, xyz[:, 2], len(cells)) / counts
-
-
-def _fused(cells: IntArray, z: FloatArray, cell_m: float, parallax_m: float) -> FloatArray:
-    """Return the median height of each cell, at its centre, where most pairs agree."""
-    order = np.lexsort((z, cells))
-    z = z[order]
-    own, first, counts = np.unique(cells[order], return_index=True, return_counts=True)
-    height = 0.5 * (z[first + (counts - 1) // 2] + z[first + counts // 2])
-    agrees = np.abs(z - np.repeat(height, counts)) <= parallax_m
-    agreeing = np.add.reduceat(agrees, first, dtype=int)
-    row = own >> 32
-    column = own - (row << 32) - HALF
-    xyz = np.column_stack([(column + 0.5) * cell_m, (row + 0.5) * cell_m, height])
-    return np.asarray(xyz[agreeing >= np.maximum(FEWEST_PAIRS, 0.5 * counts)])

@@ -36,7 +36,6 @@ and, without land, the part of the waves that looks like a movement of the camer
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,7 +45,7 @@ from pcfix.errors import GeometryError
 from pcfix.grid.lattice import Lattice
 from pcfix.lens.imaging import project, unproject
 from pcfix.libraries import photo_library
-from pcfix.model import BoolArray, FloatArray
+from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.photos.calm import grey8
 from pcfix.photos.mapping import Photo
 
@@ -76,13 +75,17 @@ class View(NamedTuple):
     bed: Callable[[FloatArray], FloatArray]
 
 
-@dataclass(frozen=True, eq=False)
-class Nodes:
+class Nodes(NamedTuple):
     """The cells of the rasters."""
 
     lattice: Lattice
     xy: FloatArray  # (n, 2), world frame, their centres row by row from the north
     seen: BoolArray  # (n,), whether the first frame sees them
+
+    @property
+    def local(self) -> FloatArray:
+        """The centres relative to their mean, for the phases of waves."""
+        return self.xy - self.xy.mean(axis=0)
 
 
 def on_level(view: View, pixels: FloatArray) -> FloatArray:
@@ -185,8 +188,7 @@ def slopes_of(view: View, xy: FloatArray, height_m: FloatArray, shift_px: FloatA
     return np.asarray(-normal[:, :2] / normal[:, 2:])
 
 
-@dataclass(frozen=True, eq=False)
-class Waves:
+class Waves(NamedTuple):
     """Plane waves and their precision.
 
     Amplitudes are those of the slope (k times that of the height), cosines then sines.
@@ -199,108 +201,57 @@ class Waves:
     left_over_m: float  # heights, rms, that correspond to the residual slopes
     explained: float  # share of the energy of the slopes
 
-    def at(self, xy: FloatArray, time_s: float) -> tuple[FloatArray, FloatArray]:
+    def at(self, nodes: Nodes, time_s: float) -> tuple[FloatArray, FloatArray]:
         """Return heights above the level and their standard errors, each of shape (n,)."""
-        if not len(self.number):
-            return np.zeros(len(xy)), np.full(len(xy), self.left_over_m)
-        angle = xy @ self.number.T - self.frequency * time_s
+        angle = nodes.local @ self.number.T - self.frequency * time_s
         size = np.hypot(*self.number.T)
         basis = np.hstack([np.cos(angle) / size, np.sin(angle) / size])
         variance = ((basis @ self.covariance) * basis).sum(axis=1)
         return basis @ self.slope, np.sqrt(np.maximum(variance, 0.0) + self.left_over_m**2)
 
 
-class Slopes(NamedTuple):
-    """Slopes of the surface in all frames."""
+def fit_waves(
+    nodes: Nodes, slope: FloatArray, weight: FloatArray, time_s: FloatArray, depth_m: float
+) -> Waves:
+    """Fit plane waves to slopes, (f, n, 2), with weights, (f, n), at the times of f frames.
 
-    slope: FloatArray  # (f, n, 2)
-    weight: FloatArray  # (f, n)
-    time_s: FloatArray  # (f,)
-    xy: FloatArray  # (n, 2), centres of the lattice, relative to any point
-    lattice: Lattice
-
-
-def fit_waves(given: Slopes, depth_m: float) -> Waves:
-    """Fit plane waves to slopes; with one frame, time has no effect."""
-    spectrum, weight = _Spectrum(given, depth_m), given.weight[..., None]
-    chosen, residual = np.empty(0, np.int64), given.slope
-    slope, covariance = np.empty(0), np.empty((0, 0))
-    left = float((weight * given.slope**2).sum())
+    With one frame, time has no effect.
+    """
+    shell, chosen, residual = _Shell(nodes, weight, time_s, depth_m), np.empty(0, np.int64), slope
+    found, covariance = np.empty(0), np.empty((0, 0))
+    left = float((weight[..., None] * slope**2).sum())
     total = max(left, 1e-30)
     for _ in range(ROUNDS):
         # those with most energy that are not chosen, well above that of white noise
-        energy = spectrum.energy(residual)
+        energy = shell.energy(residual)
         energy[chosen] = 0.0
         more = np.argsort(-energy, kind="stable")[:WAVES_AT_ONCE]
-        more = more[energy[more] > OVER_NOISE * spectrum.white(residual)]
+        more = more[energy[more] > OVER_NOISE * shell.white(residual)]
         if not len(more):
             break
         chosen = np.concatenate([chosen, more])
-        waves = spectrum.number[chosen], spectrum.frequency[chosen]
-        slope, covariance, residual = _solved(given, *waves)
-        before, left = left, float((weight * residual**2).sum())
+        found, covariance, residual = shell.solved(slope, chosen)
+        before, left = left, float((weight[..., None] * residual**2).sum())
         if before - left < LEAST_GAIN * total:
             break
     # residuals that are not white make the covariance larger
-    energy = np.delete(spectrum.energy(residual), chosen)
-    redness = max(1.0, float(energy.mean()) / max(spectrum.white(residual), 1e-30))
+    energy = np.delete(shell.energy(residual), chosen)
+    redness = max(1.0, float(energy.mean()) / max(shell.white(residual), 1e-30))
     return Waves(
-        spectrum.number[chosen], spectrum.frequency[chosen], slope, covariance * redness,
-        spectrum.height_rms(residual), 1.0 - left / total,
+        shell.number[chosen], shell.frequency[chosen], found, covariance * redness,
+        shell.height_rms(residual), 1.0 - left / total,
     )  # fmt: skip
 
 
-def _bases(given: Slopes, number: FloatArray, frequency: FloatArray) -> Iterator[FloatArray]:
-    """Yield the slopes along unit waves, cosines then sines, shape (n, 2 m), of each frame.
+class _Shell:
+    """The possible waves, whose frequencies follow from the dispersion relation."""
 
-    The mean over the frames is subtracted, as the median image keeps it.
-    """
-    place = np.exp(1j * (given.xy @ number.T))
-    turn = np.exp(-1j * given.time_s[:, None] * frequency)
-    if len(turn) > 1:
-        turn -= turn.mean(axis=0)
-    for one in turn:
-        wave = place * one
-        yield np.hstack([-wave.imag, wave.real])
-
-
-def _solved(
-    given: Slopes, number: FloatArray, frequency: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Fit waves to the slopes of all frames by least squares, with a prior of their variance.
-
-    Returns the amplitudes of the slope, their covariance, and the residuals.
-    """
-    along = np.tile(number / np.hypot(*number.T)[:, None], (2, 1))
-    size = len(along)
-    gram, right = np.zeros((size, size)), np.zeros(size)
-    used = np.flatnonzero((given.weight > 0.0).any(axis=0))
-    part = given._replace(xy=given.xy[used])
-    bases = _bases(part, number, frequency)
-    for basis, slope, weight in zip(bases, given.slope, given.weight, strict=True):
-        weighted = basis * weight[used, None]
-        gram += basis.T @ weighted
-        right += ((weighted.T @ slope[used]) * along).sum(axis=1)
-    gram *= along @ along.T
-    count = max(float(given.weight.sum()), 1e-30)
-    prior = float((given.weight[..., None] * given.slope**2).sum()) / count
-    residual, noise = given.slope.copy(), 0.1 * prior
-    for _ in range(2):  # first with a guess of the noise, then with that of the residuals
-        covariance = np.linalg.inv(gram + (noise / prior) * np.eye(size))
-        found = covariance @ right
-        bases = _bases(part, number, frequency)
-        for basis, left, slope in zip(bases, residual, given.slope, strict=True):
-            left[used] = slope[used] - basis @ (found[:, None] * along)
-        noise = float((given.weight[..., None] * residual**2).sum()) / (2.0 * count)
-    return found, np.asarray(covariance * noise, np.float64), residual
-
-
-class _Spectrum:
-    """The possible wave numbers, and the energy of slopes at each of them on the shell."""
-
-    def __init__(self, given: Slopes, depth_m: float) -> None:
-        self._given, cell_m = given, given.lattice.resolution_m
-        rows, columns = 2 * given.lattice.height, 2 * given.lattice.width
+    def __init__(
+        self, nodes: Nodes, weight: FloatArray, time_s: FloatArray, depth_m: float
+    ) -> None:
+        self._local, self._weight, self._time_s = nodes.local, weight, time_s
+        cell_m, self._height = nodes.lattice.resolution_m, nodes.lattice.height
+        rows, columns = 2 * nodes.lattice.height, 2 * nodes.lattice.width
         x = 2.0 * np.pi * np.fft.fftfreq(columns, cell_m)
         y = -2.0 * np.pi * np.fft.fftfreq(rows, cell_m)  # rows go south
         every = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
@@ -308,7 +259,7 @@ class _Spectrum:
         longest = cell_m * max(rows, columns)
         least, most = 2.0 * np.pi / longest, 2.0 * np.pi / (SHORTEST_CELLS * cell_m)
         may = (size >= least) & (size <= most)
-        if len(given.time_s) == 1:  # a wave and its opposite look the same
+        if len(time_s) == 1:  # a wave and its opposite look the same
             may &= (every[:, 0] > 0.0) | ((every[:, 0] == 0.0) & (every[:, 1] > 0.0))
         self._rows, self._shape = np.flatnonzero(may), (rows, columns)
         self.number, self._size = every[may], size[may]
@@ -316,32 +267,69 @@ class _Spectrum:
 
     def _transformed(self, slope: FloatArray, weight: FloatArray) -> npt.NDArray[np.complex128]:
         """Return the slope along each wave number of a frame, as its Fourier coefficient."""
-        planes = (slope * weight[:, None]).T.reshape(2, self._given.lattice.height, -1)
+        planes = (slope * weight[:, None]).T.reshape(2, self._height, -1)
         whole = np.fft.fft2(planes, s=self._shape).reshape(2, -1)[:, self._rows]
         return np.asarray((self.number.T * whole).sum(axis=0) / self._size)
 
     def energy(self, slope: FloatArray) -> FloatArray:
-        """Return the energy of slopes, shape (f, n, 2), on the shell."""
-        given = self._given
+        """Return the energy of slopes, shape (f, n, 2), at each wave number."""
         total = np.zeros(len(self.number), np.complex128)
-        for one, weight, time in zip(slope, given.weight, given.time_s, strict=True):
+        for one, weight, time in zip(slope, self._weight, self._time_s, strict=True):
             total += self._transformed(one, weight) * np.exp(1j * self.frequency * time)
         return np.abs(total) ** 2
 
     def white(self, slope: FloatArray) -> float:
         """Return the energy at each wave number if the slopes were white noise."""
-        weight = self._given.weight[..., None]
-        return float(((weight * slope) ** 2).sum()) / 2.0
+        return float(((self._weight[..., None] * slope) ** 2).sum()) / 2.0
 
     def height_rms(self, residual: FloatArray) -> float:
         """Integrate residual slopes to heights, rms, by the method of Frankot & Chellappa."""
-        given, total, count = self._given, 0.0, 0.0
-        half = 2.0 if len(given.time_s) == 1 else 1.0
-        for one, weight in zip(residual, given.weight, strict=True):
-            full = self._transformed(one, (weight > 0.0).astype(np.float64)) / self._size
+        known = (self._weight > 0.0).astype(np.float64)
+        half = 2.0 if len(known) == 1 else 1.0
+        total = 0.0
+        for one, weight in zip(residual, known, strict=True):
+            full = self._transformed(one, weight) / self._size
             total += half * float((np.abs(full) ** 2).sum()) / np.prod(self._shape)
-            count += float((weight > 0.0).sum())
-        return float(np.sqrt(total / max(count, 1.0)))
+        return float(np.sqrt(total / max(float(known.sum()), 1.0)))
+
+    def _bases(self, rows: IntArray, chosen: IntArray) -> Iterator[FloatArray]:
+        """Yield the slopes along unit waves, cosines then sines, at some nodes of each frame.
+
+        The mean over the frames is subtracted, as the median image keeps it.
+        """
+        place = np.exp(1j * (self._local[rows] @ self.number[chosen].T))
+        turn = np.exp(-1j * self._time_s[:, None] * self.frequency[chosen])
+        if len(turn) > 1:
+            turn -= turn.mean(axis=0)
+        for one in turn:
+            wave = place * one
+            yield np.hstack([-wave.imag, wave.real])
+
+    def solved(
+        self, slope: FloatArray, chosen: IntArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Fit waves to the slopes of all frames by least squares, with a prior of their variance.
+
+        Returns the amplitudes of the slope, their covariance, and the residuals.
+        """
+        along = np.tile(self.number[chosen] / self._size[chosen, None], (2, 1))
+        gram, right = np.zeros((len(along), len(along))), np.zeros(len(along))
+        used = np.flatnonzero((self._weight > 0.0).any(axis=0))
+        for basis, one, weight in zip(self._bases(used, chosen), slope, self._weight, strict=True):
+            weighted = basis * weight[used, None]
+            gram += basis.T @ weighted
+            right += ((weighted.T @ one[used]) * along).sum(axis=1)
+        gram *= along @ along.T
+        count = max(float(self._weight.sum()), 1e-30)
+        prior = float((self._weight[..., None] * slope**2).sum()) / count
+        residual, noise = slope.copy(), 0.1 * prior
+        for _ in range(2):  # first with a guess of the noise, then with that of the residuals
+            covariance = np.linalg.inv(gram + (noise / prior) * np.eye(len(along)))
+            found = covariance @ right
+            for basis, left, one in zip(self._bases(used, chosen), residual, slope, strict=True):
+                left[used] = one[used] - basis @ (found[:, None] * along)
+            noise = float((self._weight[..., None] * residual**2).sum()) / (2.0 * count)
+        return found, np.asarray(covariance * noise, np.float64), residual
 
 
 def still(shifts_px: FloatArray, weight: FloatArray) -> BoolArray:

@@ -13,8 +13,7 @@ from pcfix.adjust.result import Adjusted, Plain, adjustment_dict
 from pcfix.grid.colours import DIFFERENCE, UNCERTAINTY
 from pcfix.grid.maps import Maps, MapsBuilder
 from pcfix.model import FloatArray
-from pcfix.report.map_data import Layer
-from pcfix.report.page import Picture, Report, Table, label_plan, new_figure, render
+from pcfix.report.page import Layer, Picture, Report, Table, label_plan, new_figure, render
 from pcfix.report.text import Rows, RowTable, filled, share
 from pcfix.sums import nice_step
 

@@ -109,8 +109,6 @@ def comparison_text(c: Comparison) -> str:
         "outside the overlap": n.outside_overlap,
     }
     rows += [("", f"{count:,} ignored: {why}") for why, count in ignored.items() if count]
-    if n.by_nearest:
-        rows.append(("No plane", f"{n.by_nearest:,} points were compared with the nearest height"))
     if n.reference_compared:
         of = share(n.reference_compared, in_reference)
         rows.append(("C2C from", f"{n.reference_compared:,} points of the reference ({of})"))
@@ -137,31 +135,6 @@ def noise_sentence(own: Plain, raw: Plain) -> str:
     if own["rmse_m"] is None:
         return f"the differences scatter no more than {noise}, so the cloud's error is not known."
     return f"without {noise}; with it RMSE {raw['rmse_m']:.3f} m, 95 % {raw['within_95_m']:.3f} m."
-
-
-def in_a_sentence(compared: Plain) -> str:
-    """Return what the correction changed against the reference; empty where it is not known."""
-    pair = compared["vertical"]
-    if pair is None or pair["before"] is None:
-        return ""
-    bed, land = compared.get("bed"), compared.get("land")
-    before, after = (raw_of(compared)[when] for when, _, _ in TIMES)
-    way = "fell" if after["rmse_m"] <= before["rmse_m"] else "grew"
-    of_land = "" if not bed or land is None else (
-        f" Land: {land['before']['rmse_m']:.3f} to {land['after']['rmse_m']:.3f} m."
-    )  # fmt: skip
-    return (
-        f" Against {name_of(compared['reference'])} the vertical error"
-        f"{' of the bed' if bed else ''} {way} from {before['rmse_m']:.3f} to"
-        f" {after['rmse_m']:.3f} m (RMSE of {after['count']:,}"
-        f" points, the reference's noise included). The remaining bias is"
-        f" {signed(after['mean_m'])}.{of_land}{_noted(compared, 'cloud.corrected_twice')}"
-    )
-
-
-def _noted(compared: Plain, *codes: str) -> str:
-    """Return the messages of some warnings, each after a blank."""
-    return "".join(f" {one['message']}" for one in compared["notes"] if one["code"] in codes)
 
 
 def signed(value_m: float) -> str:
@@ -254,7 +227,8 @@ def evaluation(
         pictures.append(Picture("histogram_vertical", "Vertical error", alt, figure))
     title = "Distance to the nearest point (C2C)"
     alt = f"{title}: histograms with fitted Gaussians; the table has their figures."
-    alt += _noted(compared, "cloud.sparse", "reference.sparse")
+    sparse = ("cloud.sparse", "reference.sparse")
+    alt += "".join(f" {one['message']}" for one in compared["notes"] if one["code"] in sparse)
     pictures.append(Picture("histogram_c2c", title, alt, c2c_figure(compared)))
     if dod is not None:
         reach = float(np.nanpercentile(np.abs(dod[0]), 98.0))

@@ -16,12 +16,12 @@ from pcfix.grid.maps import Extent, Maps, contours, depth_interval
 from pcfix.model import Cameras, FloatArray
 from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
 from pcfix.report.comparison import noise_sentence, raw_of, signed
-from pcfix.report.map_data import Layer, relief
 from pcfix.report.page import (
     AFTER,
     BEFORE,
     REFERENCE,
     WATER,
+    Layer,
     Picture,
     Report,
     Table,
@@ -30,6 +30,7 @@ from pcfix.report.page import (
     map_figure,
     name_of,
     new_figure,
+    relief,
 )
 from pcfix.report.summary import Summary
 from pcfix.report.text import FEWEST, formal_words, summary_rows, uncertainty_sentence
@@ -129,7 +130,7 @@ def run_report(run: RunResults, inputs: Table, files: Sequence[Pair]) -> Report:
         pictures=sorted(
             [*_pictures(run), *run.pictures], key=lambda one: order.get(one.name, len(order))
         ),
-        tables=[*run.tables, *_orders(s, run.compared.get("tvu"))],
+        tables=list(run.tables),
         files=files,
         provenance=[
             Table("In short", [], [[label, words] for label, words in facts.items() if words]),
@@ -258,21 +259,6 @@ def tvu_figure(depth_m: FloatArray, sigma_z_m: FloatArray, measured: Sequence[Pl
     axes.set(xlim=(0.0, deepest), ylim=(0.0, None), xlabel="Depth (m)", ylabel="TVU at 95 % (m)")
     axes.legend(loc="best")
     return figure
-
-
-def _orders(s: Summary, measured: Plain | None) -> list[Table]:
-    """Return the share of the points within each order of IHO S-44."""
-    predicted = None if s.why_no_order else s.uncertainty
-    both = {"predicted TVU at 95 %": predicted, "measured difference": measured}
-    known = {name: found["s44"] for name, found in both.items() if found is not None}
-    rows = [
-        [order.name, f"{order.a_m:g} m", f"{order.b:g}"]
-        + [f"{100.0 * shares[order.name]:.4g} %" for shares in known.values()]
-        for order in ORDERS
-    ]
-    limit = "within sqrt(a^2 + (b depth)^2)"
-    header = ["order", "a", "b", *(f"points with {name} {limit}" for name in known)]
-    return [Table("Orders of IHO S-44, vertical", header, rows)] if known else []
 
 
 def in_short(tiles: Sequence[Tile]) -> str:

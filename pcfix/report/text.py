@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.options.correct import LEVEL_M
-from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
 from pcfix.refract.tally import ORDERS
 from pcfix.report.summary import Summary
 
@@ -43,9 +42,7 @@ _SHORELINE: RowTable = (
 _LABELLING: RowTable = (
     ("Mask", "{outside_mask:,} points below the surface lie outside and stay land", "water_mask"),
     ("Kept class", "{respected:,} points below the surface keep their class", "respected"),
-    ("Pools", "{pools[points]:,} points in {pools[pools]:,} separate pools stay land; the largest,"
-     " {pools[largest][area_m2]:,.1f} m2 with {pools[largest][points]:,} points, is at"
-     " {pools[largest][x]:.1f}, {pools[largest][y]:.1f}", "pools"),
+    ("Pools", "{pools[points]:,} points in {pools[pools]:,} separate pools stay land", "pools"),
     ("Pools", "none separate from the water", "no_pools"),
 )  # fmt: skip
 _CORRECTED: RowTable = (
@@ -70,8 +67,6 @@ _CORRECTED: RowTable = (
     ("Water", "{water}, refractive index {settings[index]:.6g}", "water"),
     ("", "fitted: {water_fit[model]}{fit_points}, standard error {water_fit[sigma_level_m]:.3f} m",
      "water_fit"),
-    ("", "index from {settings[index_from]}: the bed is {deeper_cm:+.1f} cm deeper than with"
-     f" {DEFAULT_REFRACTIVE_INDEX:g}, on average", "deeper_cm"),
 )  # fmt: skip
 _UNCERTAINTY: RowTable = (
     ("Uncertainty", "{uncertainty[tvu_95_m][mean]:.3f} m at 95 % (predicted)", "uncertainty"),
@@ -178,7 +173,7 @@ def summary_text(summary: Summary) -> str:
 
 def summary_rows(s: Summary) -> Rows:
     """Return the facts of a correction, for the terminal and the report page."""
-    fit, made, index = s.water_fit or {}, s.made, s.settings["index"]
+    fit, made = s.water_fit or {}, s.made
     method = str(s.settings["method"])
     if made is not None and made.get("made_of", "") not in ("", method):
         sure = f"detected, confidence {100.0 * made['confidence']:.0f} %"
@@ -192,9 +187,6 @@ def summary_rows(s: Summary) -> Rows:
             check = "cameras may not match the cloud; see the warnings"
         elif not s.fit["fits"]:
             check = "cameras and cloud could not be tested"
-    deeper_cm = None  # straight down, depth is in proportion to the index
-    if s.settings["index_from"] and s.depth_m:
-        deeper_cm = 100.0 * (1.0 - DEFAULT_REFRACTIVE_INDEX / index) * s.depth_m["mean"]
     values = vars(s) | {
         "part_words": _part_words(s.part),
         "fate": _FATE[s.settings["uncorrected"]],
@@ -211,7 +203,6 @@ def summary_rows(s: Summary) -> Rows:
         "unused": ", ".join(s.cameras_unused[:SHOWN_NAMES])
         + (", ..." if len(s.cameras_unused) > SHOWN_NAMES else ""),
         "fit_points": ", {accepted} of {points} points".format(**fit) if "points" in fit else "",
-        "deeper_cm": deeper_cm,
         "no_uncertainty": s.uncertainty is None and s.settings["dimensions"] == "all"
         and not s.cameras,
         "order": order_sentence(s),

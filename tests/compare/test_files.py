@@ -16,7 +16,6 @@ from pyproj import CRS
 import pcfix
 from pcfix.compare.statistics import own_of, statistics_of
 from pcfix.flow.compare import compare_clouds
-from pcfix.report.comparison import in_a_sentence
 from tests.utils.clouds import write_las
 from tests.utils.codes import refused
 from tests.utils.shared import SCENE
@@ -265,20 +264,6 @@ def test_refused(tmp_path, monkeypatch):
     ]:
         with pytest.raises(pcfix.PcfixError):
             compare_clouds(*files, **options)
-
-
-@pytest.mark.parametrize(("came", "twice"), [(1.0, True), (0.92, True), (0.75, False)])
-def test_corrected_twice(tmp_path, came, twice):
-    true = plane(500, 24, noise_m=0.0)
-    depth, up = -true[:, 2], np.array([0.0, 0.0, 1.0])
-    shift = {"ShiftX": 0.0 * depth, "ShiftY": 0.0 * depth, "ShiftZ": -0.34 * came * depth}
-    xyz = true + up * (depth * (1.0 - 1.34 * came))[:, np.newaxis]
-    cloud = write_las(tmp_path / "cloud.las", xyz, 40, WaterDepth=-xyz[:, 2], **shift)
-    found = compare_clouds(cloud, write_las(tmp_path / "lidar.las", true))
-    notes = [str(note) for note in found.notes if note.code == "cloud.corrected_twice"]
-    assert bool(notes) == twice
-    assert all(note in in_a_sentence(found.as_dict()) for note in notes)
-    assert found.tvu.count == 500
 
 
 def test_output_files(tmp_path, corrected):

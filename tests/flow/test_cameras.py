@@ -48,7 +48,7 @@ def test_good_block(tmp_path):
     found = json.loads((tmp_path / "s.json").read_text())
     assert found["fit"]["fits"]
     assert found["fit"]["seen_by"]["3 or more"] == 1.0
-    # the scene is flown 80 m above the water, tilted by a few degrees (pcfix.simulate.block)
+    # the scene is flown 80 m above the water, tilted by a few degrees (pcfix.simulate.scene)
     assert found["height_above_water_m"][1] == pytest.approx(80.0, abs=1.0)
     assert found["tilt_deg"][1] < 6.0
 

@@ -14,12 +14,12 @@ def test_rings_of_a_cone():
     depth = 0.1 * np.hypot(row - 100.0, column - 80.0)
     depth[:40, 150:] = np.nan
     found = contours(depth, 2.0)
-    assert {one.level for one in found} == {2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0}
-    for one in found:
-        radius = np.hypot(*(one.place - (80.0, 100.0)).T)
-        away = one.place[:, 1] > 43.0  # by the gap the filter takes one side alone
-        np.testing.assert_allclose(radius[away], 10.0 * one.level, atol=0.6)
-        inside = np.rint(one.place).astype(int)
+    assert {level for level, _ in found} == {2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0}
+    for level, place in found:
+        radius = np.hypot(*(place - (80.0, 100.0)).T)
+        away = place[:, 1] > 43.0  # by the gap the filter takes one side alone
+        np.testing.assert_allclose(radius[away], 10.0 * level, atol=0.6)
+        inside = np.rint(place).astype(int)
         assert np.isfinite(depth[inside[:, 1], inside[:, 0]]).all()
     assert contours(np.full((5, 5), np.nan), 1.0) == []
 

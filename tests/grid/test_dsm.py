@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import rasterio
 
-import pcfix
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow import dsm as flow
 from pcfix.flow.dsm import grid_dsm
@@ -17,7 +16,6 @@ from tests.grid.clouds import EAST, NORTH, awkward, scattered, write
 from tests.utils.codes import refused
 from tests.utils.nightly import mostly_nightly
 from tests.utils.rasters import HAS_STATISTICS, read_raster
-from tests.utils.shared import SCENE
 
 METHODS = ("mean", "median", "min", "max", "idw", "tin")
 
@@ -296,17 +294,3 @@ def test_summary_and_progress(tmp_path):
     assert saved["bounds_m"] == [EAST, NORTH, EAST + 10.0, NORTH + 10.0]
     assert steps == sorted(steps)
     assert steps[-1] == (500, 500)
-
-
-def test_stray_point(tmp_path):
-    cloud = laspy.read(SCENE / "cloud.laz")
-    cloud.x[5] += 200_000.0
-    cloud.write(tmp_path / "stray.laz")
-    with pytest.warns(pcfix.PcfixWarning):
-        found = pcfix.grid_dsm(tmp_path / "stray.laz", tmp_path / "d.tif", resolution=1.0)
-    whole = pcfix.grid_dsm(SCENE / "cloud.laz", tmp_path / "w.tif", resolution=1.0)
-    assert (found.stray, found.points_used) == (1, 19_999)
-    assert (found.width, found.height) == (whole.width, whole.height)
-    with rasterio.open(tmp_path / "d.tif") as one, rasterio.open(tmp_path / "w.tif") as other:
-        differ = one.read(1) != other.read(1)
-    assert differ.sum() <= 1  # the cell that the point came from

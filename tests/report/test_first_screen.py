@@ -1,6 +1,5 @@
 """The first screen of a page: measured or predicted accuracy, and contradictions."""
 
-from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,8 +22,8 @@ def summary(sigma=0.05, **more):
 def compared(bias, scatter, count=100):
     """Return a comparison whose bed has such errors, without noise of the reference."""
     s = statistics_of(bias + scatter * np.array([-1.0, 1.0] * (count // 2)))
-    own = asdict(own_of(s, "bed", 0.0, "cloud"))
-    pair = {"after": asdict(s), "before": None}
+    own = own_of(s, "bed", 0.0, "cloud").as_dict()
+    pair = {"after": s.as_dict(), "before": None}
     return {"own": own, "bed": pair, "land": None, "reference": "/far/away/lidar.laz"}
 
 

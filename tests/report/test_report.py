@@ -13,8 +13,7 @@ import pytest
 import pcfix
 from pcfix.flow.report import read_cloud, write_report
 from pcfix.grid.maps import MapsBuilder
-from pcfix.report.map_data import Layer
-from pcfix.report.page import Report, Table, Tile, render
+from pcfix.report.page import Layer, Report, Table, Tile, render
 from pcfix.report.run import RunResults
 from tests.utils.browser import needs_browser, open_page
 from tests.utils.shared import SCENE

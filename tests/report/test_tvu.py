@@ -1,7 +1,6 @@
 """Standard errors in the terms of IHO S-44."""
 
 import json
-from dataclasses import asdict
 from functools import reduce
 from operator import add
 from pathlib import Path
@@ -69,14 +68,14 @@ def test_measured_replaces_predicted(summary):
     assert summary.why_no_order in uncertainty_sentence(summary)
     predicted = uncertainty_sentence(Summary(**vars(summary) | {"poses": {"absorbed": False}}))
     assert "predicted" in predicted and "Exclusive Order" in predicted
-    far = asdict(tvu_of(np.full(100, 0.3), np.full(100, 2.0)))
+    far = tvu_of(np.full(100, 0.3), np.full(100, 2.0)).as_dict()
     found = uncertainty_sentence(summary, far)
     mean = summary.uncertainty["tvu_95_m"]["mean"]
     assert f"predicted {mean:.3f} m on average, measured 0.300 m at 100 points" in found
     assert "order 1a/1b" in found and "Exclusive" not in found
     unknown = Summary(**vars(summary) | {"uncertainty": None})
     assert "predicted" not in uncertainty_sentence(unknown, far)
-    few = asdict(tvu_of(np.full(FEWEST - 1, 0.01), np.full(FEWEST - 1, 2.0)))
+    few = tvu_of(np.full(FEWEST - 1, 0.01), np.full(FEWEST - 1, 2.0)).as_dict()
     assert f"fewer than {FEWEST} points claim no order" in uncertainty_sentence(summary, few)
 
 
