@@ -295,7 +295,8 @@ def weigh(
     types = reconstructions
     if given is not None and given not in types:
         types = *types, given
-    sample = patches.patches_of(batch) if len(types) > 1 else None
+    at_borders = batch.views is None and LIMITS[0] not in types
+    sample = patches.patches_of(batch, at_borders=at_borders) if len(types) > 1 else None
     if sample is None:
         return None
     part = batch.take(sample.rows)
