@@ -121,7 +121,7 @@ def adjust_block(
     if found.precision.members is None:
         words = (
             f"The block is too large ({len(block.cameras):,} images) for covariances of its points,"
-            " and the correction cannot use the errors of the poses."
+            " so the correction cannot use the errors of the poses."
         )
         notes.append(PcfixWarning("adjust.too_large", words, images=len(block.cameras)))
     on_bed = found.is_wet & np.isfinite(found.xyz).all(axis=1)
