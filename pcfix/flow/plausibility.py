@@ -333,7 +333,7 @@ def _heights(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Res
             " of the heights.",
             off_m=off,
         )
-    return Result(f"tie points in their image places and {abs(off):.2f} m from the cloud's heights")
+    return Result(f"tie points match their images, {abs(off):.2f} m from the cloud's heights")
 
 
 def _worst_residual(cameras: Cameras, ties: TiePoints) -> tuple[float, str] | None:

@@ -349,7 +349,7 @@ def test_tiles(finished, tiled, tmp_path):
         assert before.items() < finished_in(out / "corrected").items()
         said = []
         pcfix.run(tiled / "cloud", out, say=said.append, **asked)
-    assert [line.split()[1:3] for line in said[1:]] == [["done", "before:"]] * 6
+    assert [line.split()[1:3] for line in said[1:]] == [["already", "done:"]] * 6
     for name in ("corrected", "cleaned"):
         whole = laspy.read(finished[0] / f"{name}.laz").points.array
         np.testing.assert_array_equal(records(*sorted((out / name).glob("*.laz"))), whole)
