@@ -87,3 +87,10 @@ def test_spelling():
     words = [sys.executable, "-m", "codespell_lib", "-L", "trough", *documents, "-"]
     done = subprocess.run(words, input=help_text(), capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_idiom_of_documents():
+    idiom = re.compile(r"\b(anew|mend(s|ed|ing)?|bent|so many|by itself)\b")
+    for folder in ("", "samples", "pipelines", "pcfix/cli"):
+        lines = (ROOT / folder / "README.md").read_text("utf-8").splitlines()
+        assert [line for line in lines if idiom.search(line)] == [], folder
