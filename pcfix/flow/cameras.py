@@ -24,7 +24,15 @@ from pcfix.lens.imaging import unproject
 from pcfix.model import Cameras, FloatArray, Lens, TiePoints, WaterDimension
 from pcfix.options.declare import File, taken
 from pcfix.options.survey import CamerasCheckOptions
-from pcfix.report.page import AFTER, WATER, draw_cloud, label_plan, label_side, new_figure
+from pcfix.report.page import (
+    AFTER,
+    WATER,
+    draw_cloud,
+    label_plan,
+    label_side,
+    legend_below,
+    new_figure,
+)
 from pcfix.report.text import Plain, Rows, aligned
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
@@ -347,7 +355,7 @@ def block_figure(report: CamerasReport) -> Figure:
     label_plan(plan, 20.0)
     label_side(side)
     side.tick_params(axis="x", labelrotation=20)
-    plan.legend(loc="upper right")
+    legend_below(plan)
     if side.get_legend_handles_labels()[0]:
-        side.legend(loc="best")
+        side.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     return figure

@@ -80,8 +80,14 @@ def write_rasters(run: RunFolder, *, errors: bool, progress: Progress | None = N
 
 
 def _write_shaded(folder: Path) -> None:
-    """Write the picture: the bed in the colours of its depth, the land grey."""
-    target = folder / SHADED
+    """Write the picture: the bed in the colours of its depth, the land grey.
+
+    Some filled holes of the surface are under water and have no depth: it follows from the water
+    around them.
+    """
+    from scipy.ndimage import minimum_filter
+
+    target, edge = folder / SHADED, int(HOLE_CELLS)
     high = limits_of(rasters.preview(folder / DEPTH)[0], "depth")[1]
     with ExitStack() as stack:
         draft = stack.enter_context(temporary_output(target))
@@ -94,9 +100,14 @@ def _write_shaded(folder: Path) -> None:
         plan = None if depth.crs is None else depth.crs.to_wkt()
         with rasters.new_raster(plain, lattice, plan, bands, dtype="uint8", nodata=None) as out:
             for window in lattice.window.parts(BLOCK_CELLS):
-                height = rasters.read_within(surface, window.grown(1), lattice.window)
-                deep = rasters.read_within(depth, window.moved(down, right), below.window)
-                light = hillshade(height, lattice.resolution_m, *SUN_DEG)
+                wide = window.grown(edge)
+                height = rasters.read_within(surface, wide, lattice.window)
+                deep = rasters.read_within(depth, wide.moved(down, right), below.window)
+                level = minimum_filter(np.nan_to_num(height + deep, nan=np.inf), 2 * edge + 1)
+                is_wet = np.isnan(deep) & (height < level) & np.isfinite(level)
+                deep = np.where(is_wet, level - height, deep)[edge:-edge, edge:-edge]
+                around = height[edge - 1 : 1 - edge, edge - 1 : 1 - edge]
+                light = hillshade(around, lattice.resolution_m, *SUN_DEG)
                 colours = relief_colours(light, deep, high, flat=np.sin(np.radians(SUN_DEG[1])))
                 for number, band in enumerate(colours, start=1):
                     rasters.write_part(out, band, window, number)

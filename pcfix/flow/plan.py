@@ -32,7 +32,16 @@ from pcfix.options.declare import options_of, taken
 from pcfix.options.scenes import PlanOptions
 from pcfix.refract.batch import Survey
 from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
-from pcfix.report.page import AFTER, BEFORE, REFERENCE, WATER, Table, label_plan, new_figure
+from pcfix.report.page import (
+    AFTER,
+    BEFORE,
+    REFERENCE,
+    WATER,
+    Table,
+    label_plan,
+    legend_below,
+    new_figure,
+)
 from pcfix.report.text import aligned
 from pcfix.running import threads
 from pcfix.simulate.scene import lay_out, points_on
@@ -357,7 +366,7 @@ def plan_figure(plan: Figures, given: PlanOptions, cameras: Cameras) -> Figure:
     block.plot([0, x, x, 0, 0], [0, 0, y, y, 0], color=REFERENCE, label="area")
     block.plot([], [], color=WATER, label="footprints at the water")
     label_plan(block)
-    block.legend(loc="upper right")
+    legend_below(block)
     block.set_title(f"{len(cameras):,} images, GSD {100.0 * plan.gsd_m:.2f} cm")
     beds = sorted(plan.depths, key=lambda one: float(one.depth_m))
     depth = [one.depth_m for one in beds]
@@ -368,5 +377,5 @@ def plan_figure(plan: Figures, given: PlanOptions, cameras: Cameras) -> Figure:
     errors.plot(depth, total, "o-", color=REFERENCE, linewidth=2, label="total")
     errors.set(xlabel="Depth (m)", ylabel="Standard error of Z (cm)", ylim=(0.0, None))
     errors.set_title("Predicted standard error of the bed")
-    errors.legend(loc="best")
+    legend_below(errors)
     return figure

@@ -37,7 +37,7 @@ OUTLIER_GSD = 0.01
 """Density of points that are mismatches, per ground pixel."""
 MOST_A_POINT = 0.25
 """Largest difference of two log likelihoods, per point: one patch decides nothing."""
-MODEL_ERROR = 0.0175
+MODEL_ERROR = 0.0125
 """Standard error of the mean difference, per point, as no model is exact: of simulated and rendered
 clouds of every type."""
 

@@ -61,14 +61,17 @@ class Patches(NamedTuple):
     step: int  # one in so many points of the batch was taken
 
 
-def patches_of(batch: Batch) -> Patches | None:
-    """Return patches of neighbours; None where there are too few points, or too sparse ones."""
+def patches_of(batch: Batch, *, at_borders: bool) -> Patches | None:
+    """Return patches of neighbours; None where there are too few points, or too sparse ones.
+
+    With `at_borders` those of dense clouds lie where the nearest image changes.
+    """
     sizes = PATCH_POINTS if batch.views is None else PATCH_POINTS[-1:]
-    found = (_patches_of(batch, points) for points in sizes)
+    found = (_patches_of(batch, points, at_borders) for points in sizes)
     return next(filter(None, found), None)
 
 
-def _patches_of(batch: Batch, points: int) -> Patches | None:
+def _patches_of(batch: Batch, points: int, at_borders: bool) -> Patches | None:
     from scipy.spatial import cKDTree
 
     usable, fewest = np.arange(len(batch)), FEWEST_WITHOUT_LIST
@@ -87,7 +90,7 @@ def _patches_of(batch: Batch, points: int) -> Patches | None:
     usable = usable[::step]
     xy = batch.xyz[usable, :2]
     close = np.arange(len(xy))
-    if points == PATCH_POINTS[0] and batch.views is None:
+    if at_borders and points == PATCH_POINTS[0]:
         apart = _border_distance_m(xy, batch.survey.cameras.centres[:, :2])
         close = np.sort(np.argsort(apart)[: max(PATCHES, int(BORDER_SHARE * len(xy)))])
     seeds = np.unique(close[np.linspace(0, len(close) - 1, PATCHES).astype(int)])

@@ -29,9 +29,8 @@ are dense, and neighbours that are far apart show little of their scatter."""
 PRIOR_TRACKS, PRIOR_SOFTWARE = (-0.5, 0.7), 1.0
 """What a small and a large spacing count for tracks, as tie points are tens of pixels apart, and
 what the software counts."""
-SHARE_ERROR, SHARE_WEIGHT = 0.08, 0.1
-"""Standard error of a share from what the models neglect, and the weight of shares where
-likelihoods are compared: it is small, as the maps of a point are chosen by a smooth bed."""
+SHARE_ERROR = 0.08
+"""Standard error of a share from what the models neglect."""
 WEAK = 3.0
 """Divisor of the evidence of clouds that were smoothed."""
 MOST_CONFIDENCE = 0.99
@@ -296,7 +295,8 @@ def weigh(
     types = reconstructions
     if given is not None and given not in types:
         types = *types, given
-    sample = patches.patches_of(batch) if len(types) > 1 else None
+    at_borders = batch.views is None and LIMITS[0] not in types
+    sample = patches.patches_of(batch, at_borders=at_borders) if len(types) > 1 else None
     if sample is None:
         return None
     part = batch.take(sample.rows)
@@ -376,8 +376,8 @@ def _beds(
         # the maps of a point are chosen by a smooth bed: their likelihood allows for that, the
         # discontinuities do not; but neighbours that are far apart show little of their scatter
         for a, b in zip(*np.nonzero(from_maps[:, None] | from_maps), strict=True):
-            errors[a, b] *= SHARE_WEIGHT + sparse * (1.0 - SHARE_WEIGHT)
-            errors[a, b] += (1.0 - sparse) * standard_errors(likely[a], likely[b])
+            by_scatter = standard_errors(likely[a], likely[b])
+            errors[a, b] = sparse * errors[a, b] + (1.0 - sparse) * by_scatter
     np.fill_diagonal(share, -np.inf)
     np.fill_diagonal(errors, np.inf)
     return _Beds(types, z, place, len(place), share, sigma, errors)

@@ -49,6 +49,11 @@ def new_figure(
     return figure, figure.subplots(**grid)
 
 
+def legend_below(axes: Axes) -> None:
+    """Put the legend below the axes, where it covers nothing."""
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3, frameon=False)
+
+
 def png_of(figure: Figure) -> bytes:
     """Return a figure as a PNG file."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

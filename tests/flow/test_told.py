@@ -41,10 +41,7 @@ def test_local_ply(bent_middle, tmp_path):
         "--cameras", BENT / "cameras.xml", "--water", LEVEL_M,
         "--views", tmp_path / "dense.vis", "--summary", tmp_path / "it.json",
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    found = json.loads((tmp_path / "it.json").read_text())["views"]
-    assert found["share_seen"] > 0.95
-    assert found["by_row"] == len(local)
+    assert (done.returncode, done.code) == (1, "views.other_images")
 
 
 def nadir():
