@@ -2,6 +2,8 @@
 
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -55,3 +57,40 @@ def test_commands():
             kind(**{one.name: given[one.name] for one in options_of(kind) if one.name in given})
         except Exception as error:
             pytest.fail(f"{path.name}: {line}: {error}")
+
+
+IDIOM = re.compile(
+    r"\b(anew|mend(s|ed|ing)?|bent|so many|(its|their|your) own|by itself|told|tells|kept|came|said"
+    r"|beside|stands|goes by|leaves? out|left out|in sight|doubts?|flatter|steep(er|est)?)\b", re.I
+)  # fmt: skip
+"""Words of the project's former idiom, which readers did not understand."""
+
+
+def help_text():
+    """Return all that the help of the commands says."""
+    lines = []
+    for name, one in COMMANDS.items():
+        lines += [f"{name}: {text}" for text in (one.call.__doc__, *one.helps.values())]
+        for each in options_of(one.kind):
+            lines.append(f"{name} {each.flag}: {each.help} {each.needed} {each.default_text}")
+    return "\n".join(lines)
+
+
+def test_idiom_of_help():
+    assert [line for line in help_text().splitlines() if IDIOM.search(line)] == []
+
+
+def test_spelling():
+    pytest.importorskip("codespell_lib")
+    folders = ("*", "samples/*", "pipelines/*", "pcfix/**/*", "tests/**/*")
+    documents = [str(path) for folder in folders for path in ROOT.glob(f"{folder}.md")]
+    words = [sys.executable, "-m", "codespell_lib", "-L", "trough", *documents, "-"]
+    done = subprocess.run(words, input=help_text(), capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_idiom_of_documents():
+    idiom = re.compile(r"\b(anew|mend(s|ed|ing)?|bent|so many|by itself)\b")
+    for folder in ("", "samples", "pipelines", "pcfix/cli"):
+        lines = (ROOT / folder / "README.md").read_text("utf-8").splitlines()
+        assert [line for line in lines if idiom.search(line)] == [], folder

@@ -172,7 +172,7 @@ def _notes(chosen: Trial, lens_sets: list[tuple[str, ...]]) -> list[PcfixWarning
     if chosen.sigma_px >= POOR_PX:
         words = (
             f"Points of the cloud fit GNSS and control points only with {chosen.sigma_px:g} px, so"
-            " bed and focal length may be wrong by more than all figures say. Give tie points,"
+            " bed and focal length may be less accurate than stated. Give tie points,"
             " control points or a calibrated lens."
         )
         notes.append(PcfixWarning("adjust.poor_cloud", words, sigma_px=chosen.sigma_px))

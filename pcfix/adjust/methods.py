@@ -80,7 +80,7 @@ def adjust_block(
         ties = ties_of_cloud(cloud_xyz, views_in_frame(cloud_xyz, original), original)
     if ties is None or len(ties.xyz) < LEAST_TIES:
         words = (
-            f"{material.name}: the images do not see the cloud. Check the poses with 'pcfix cameras"
+            f"{material.name}: no image shows the cloud. Check the poses with 'pcfix cameras"
             " --cloud'."
         )
         raise GeometryError("cameras.no_overlap", words, path=material.name)
@@ -121,7 +121,7 @@ def adjust_block(
     if found.precision.members is None:
         words = (
             f"The block is too large ({len(block.cameras):,} images) for covariances of its points,"
-            " and the correction cannot use the errors of the poses."
+            " so the correction cannot use the errors of the poses."
         )
         notes.append(PcfixWarning("adjust.too_large", words, images=len(block.cameras)))
     on_bed = found.is_wet & np.isfinite(found.xyz).all(axis=1)

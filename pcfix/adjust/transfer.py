@@ -279,7 +279,7 @@ class CloudTransfer:
         if counts.points == 0 and counts.not_moved:
             words = (
                 f"{name}: no point could be transferred to the adjusted cameras, because {REASON}."
-                " Check that --adjusted-from is the model that made the cloud, in its CRS."
+                " Check that --adjusted-from is the model of the cloud, in its CRS."
             )
             raise GeometryError("adjusted_from.no_overlap", words, path=name)
 

@@ -59,7 +59,7 @@ def run(
 
     folder = out_dir or input
     if folder is None or options.cameras is not None or options.water is not None:
-        raise UsageError("with --config give OUT_DIR alone")
+        raise UsageError("with --config give only OUT_DIR")
     request = replace(request_of(config), overwrite=options.overwrite, jobs=options.jobs)
     run_all(request, Path(folder), **shown)
 
@@ -76,9 +76,9 @@ def correct(input: str, output: Path, /, *, options: CorrectOptions, quiet: bool
 
 @command(
     "pcfix adjust sparse adjusted --water 0.37 --cloud cloud.laz --gnss gnss.csv",
-    model="Camera poses, with tie points or beside a cloud.",
+    model="Camera poses with tie points, or without them if --cloud is given.",
     out="Folder for the adjusted model.",
-    jobs="Threads.",
+    jobs="Number of threads.",
 )
 def adjust(
     model: Path, out: Path, /, *, options: AdjustOptions, quiet: bool, jobs: int | None = None
@@ -126,7 +126,7 @@ def dsm(input: str, output: Path, /, *, options: DsmOptions, quiet: bool) -> Non
 def ortho(images: Path, output: Path, /, *, options: OrthoOptions, quiet: bool) -> None:
     """Make an orthophoto of land and bed from photographs and the corrected DSM."""
     given = images, output, options
-    _summarized("Laying out", "ortho_text", quiet, pcfix.ortho_photo, *given, unit="cells")
+    _summarized("Rectifying", "ortho_text", quiet, pcfix.ortho_photo, *given, unit="cells")
 
 
 @command(
@@ -164,11 +164,11 @@ def photos(images: Path, out_dir: Path, /, *, options: PhotosOptions, quiet: boo
 @command(
     "pcfix calm frames calm.jpg --surface --depth 2.5 --gsd 0.01 --interval 0.2",
     frames="Folder of photographs, or a video.",
-    out="Image to write, of the frames' format; PNG of a video.",
+    out="Image to write, in the format of the frames; PNG for a video.",
 )
 def calm(frames: Path, out: Path, /, *, options: CalmOptions, quiet: bool) -> None:
     """Combine a burst of frames into one image as seen through calm water."""
-    _summarized("Calming", "calm_text", quiet, pcfix.calm_frames, frames, out, options)
+    _summarized("Combining", "calm_text", quiet, pcfix.calm_frames, frames, out, options)
 
 
 @command(
@@ -195,7 +195,7 @@ def cameras(path: Path, /, *, options: CamerasCheckOptions) -> None:
 
 @command(
     "pcfix water shore.csv --cloud cloud.laz --plot water.png",
-    spec="As --water of 'pcfix correct'.",
+    spec="Water surface, as --water of 'pcfix correct'.",
 )
 def water(spec: str, /, *, options: WaterCheckOptions) -> None:
     """Read, fit or detect a water surface, with its standard error."""
@@ -227,12 +227,12 @@ def simulate(out_dir: Path, /, *, options: SimulateOptions, quiet: bool) -> None
     "pcfix pipeline cloud.laz corrected.laz --cameras cameras.csv --water 0.37",
     input="LAS or LAZ cloud.",
     output="LAS or LAZ to write.",
-    stage="Only the stage, for your own pipeline.",
+    stage="Print only the stage, for use in another pipeline.",
 )
 def pipeline(
     input: Path, output: Path | None = None, /, *, options: CorrectOptions, stage: bool = False
 ) -> None:
-    """Print the PDAL pipeline of the same 'pcfix correct', as JSON."""
+    """Print the PDAL pipeline equivalent to 'pcfix correct', as JSON."""
     from pcfix.flow.pipeline import pipeline_for
 
     if output is None and not stage:
@@ -266,7 +266,7 @@ def qgis_plugin(out: Path, /, *, options: OverwriteOption, quiet: bool) -> None:
     )  # fmt: skip
 
 
-@command("pcfix demo", out_dir="Folder to make.")
+@command("pcfix demo", out_dir="Folder to create.")
 def demo(out_dir: Path = Path("pcfix-demo"), /, *, options: DemoOptions, quiet: bool) -> None:
     """Simulate scenes, correct them, and compare with the truth."""
     from pcfix.flow.demo import run_demo

@@ -24,7 +24,7 @@ _QUIET = Parameter(
     negative=(),
     allow_repeating=True,
     group=_GROUPS[Panel.OUTPUT],
-    help="No summary and no progress.",
+    help="Print no summary and no progress.",
     show_default=False,
 )
 

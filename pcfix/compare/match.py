@@ -138,14 +138,14 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
         raise SettingError(
             "reference.no_points",
             f"{target.name} is a raster, and --direction {direction} starts at measured points of"
-            " the reference. Give the reference as LAS or LAZ, or leave out --direction.",
+            " the reference. Give the reference as LAS or LAZ, or omit --direction.",
             path=target.name, direction=direction,
         )  # fmt: skip
     if target.sparse and direction not in (None, "from-reference"):
         raise SettingError(
             "reference.check_points",
             f"{target.name} has check points, and --direction {direction} needs a dense reference."
-            " Use --direction from-reference, or leave it out.",
+            " Use --direction from-reference, or omit it.",
             path=target.name, direction=direction,
         )  # fmt: skip
     wet = mapped(lambda xyz, water: xyz[:, 2] < water, whole.xyz, whole.water_m)
@@ -155,7 +155,7 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
     if not chosen.any():
         sentence = (
             "no point is of class 40 or below the water. Give the water surface with --water, or"
-            " leave out --submerged."
+            " omit --submerged."
         )
         raise bad_file(whole.name, "cloud.not_submerged", sentence)
     asked, not_submerged = whole.take(chosen), int(len(whole) - chosen.sum())
@@ -190,7 +190,7 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
     under = mapped(lambda xyz, water: xyz[:, 2] < water, places, surface)
     if not under.any():
         sentence = (
-            "none of its points near the cloud is under water. Check the water level, or leave out"
+            "none of its points near the cloud is under water. Check the water level, or omit"
             " --submerged."
         )
         raise GeometryError(

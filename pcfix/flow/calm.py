@@ -148,7 +148,7 @@ def _registered(frames: Frames, images: Iterable[Any]) -> tuple[FloatArray, Floa
         raise InputError(
             "frames.no_overlap",
             f"{frames.path}: {len(lost)} frames share fewer than {LEAST_CORNERS} corners with the"
-            f" first, such as {names[0]}. Leave them out, or begin with another.",
+            f" first, such as {names[0]}. Remove them, or start with another frame.",
             frames=names,
         )
     return homographies, scatter

@@ -254,7 +254,7 @@ def cameras_text(report: CamerasReport) -> str:
     if len(sensors) > MOST_SENSORS:
         rows.append(("", f"and {len(sensors) - MOST_SENSORS} more"))
     if not sensors:
-        rows.append(("Sensor", "none: the frames are not known"))
+        rows.append(("Sensor", "none: the image sizes are not known"))
     if cameras.rotations is None:
         rows.append(("Angles", "none: every camera counts as visible from every point"))
     rows.append(("CRS", _short(r["crs_read"])))

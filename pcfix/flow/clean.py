@@ -192,7 +192,7 @@ def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask)
         )
     if options.drop and noise.all():
         sentence = (
-            "every point is noise by these thresholds. Use wider thresholds, or leave out --drop."
+            "every point exceeds these thresholds of noise. Use wider thresholds, or omit --drop."
         )
         raise bad_file(cloud, "cloud.all_noise", sentence, points=total)
     return CleanPlan(np.packbits(noise), options.drop, summary)

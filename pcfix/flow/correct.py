@@ -266,7 +266,7 @@ def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
     distance = float(np.hypot(*(plan.cameras.centres - middle)[:, :2].T).min())
     within = f" within {limit:g} degrees" if limit else ""
     sentence = (
-        f"no camera has a submerged point in sight{within}; the nearest is {distance:,.1f} m in"
+        f"no camera images a submerged point{within}; the nearest is {distance:,.1f} m in"
         f" plan from the middle of the {figures.submerged:,} submerged points. Check that cameras"
         " and cloud have the same CRS, and that pitch 0 is straight down."
     )

@@ -105,11 +105,11 @@ class Plan:
         elif self.options.method != "auto":
             return None
         elif settings.method == "snell":
-            because = "The cameras have no lenses or no angles: corrected by snell."
+            because = "Method snell was used, because the cameras have no lenses or no angles."
         elif self.kind is not None:
-            because = f"The view list is one of {self.kind}: corrected as such."
+            because = f"The view list contains the images of {self.kind}."
         else:
-            because = "Too few points to detect the reconstruction type: tracks assumed."
+            because = "Tracks are assumed; the points are too few to detect the type."
         return {
             "method": settings.method,
             "camera_set": settings.camera_set,

@@ -256,7 +256,7 @@ def _rows(original: tuple[str, ...], adjusted: tuple[str, ...]) -> IntArray:
     repeated = [label for label, count in Counter(adjusted).items() if count > 1]
     if ambiguous := [*repeated, *unclear]:
         words = (
-            f"--adjusted-from: image name {ambiguous[0]} is ambiguous. Give every image its own"
+            f"--adjusted-from: image name {ambiguous[0]} is ambiguous. Give every image a unique"
             " name."
         )
         raise GeometryError("adjusted_from.ambiguous", words, image=ambiguous[0])

@@ -145,7 +145,7 @@ def open_record(place: Path, key: str, written: Collection[Path]) -> dict[str, A
     elif record.get("key") != key:
         raise SettingError(
             "output.exists",
-            f"{min(written)}: exists, and was not written by an equal call. Add --overwrite to"
+            f"{min(written)}: exists, from other options or inputs. Add --overwrite to"
             " replace it, or give another folder.",
             path=min(written),
         )
@@ -186,7 +186,7 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
         sentence = "has no angles or no lenses. Photographs need both for each image."
         raise bad_file(name, "cameras.incomplete", sentence)
     if Path(given.dsm).suffix.lower() not in CLOUDS and given.resolution is not None:
-        sentence = "--resolution is for a cloud; the DSM has its own."
+        sentence = "--resolution applies only to a cloud, but the DSM is a raster. Omit it."
         raise SettingError("option.no_use", sentence, option="resolution")
     heights, origin, crs, corrected = read_heights(
         given.dsm, given.resolution, scratch, fill=given.holes == "fill"
@@ -208,8 +208,8 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
     lost = [path.name for path, one in zip(paths, row, strict=True) if one < 0]
     if len(lost) == len(paths):
         sentence = (
-            f"has no pose of the photographs ({lost[0]} against {cameras.labels[0]}). Give the"
-            " folder whose files have the names in the camera file."
+            f"has no pose for these photographs (first {lost[0]}; first pose"
+            f" {cameras.labels[0]}). Give the folder whose files have the names in the camera file."
         )
         raise bad_file(name, "photos.no_pose", sentence, photograph=lost[0])
     if lost:

@@ -28,7 +28,7 @@ def pipeline_for(input: Path, output: Path | None, options: CorrectOptions) -> d
         if getattr(options, name) is not None:
             raise SettingError(
                 "option.no_use",
-                f"--{name.replace('_', '-')} has no use in a pipeline. Choose the points by options"
+                f"--{name.replace('_', '-')} has no effect in a pipeline. Choose points by options"
                 " of readers.copc, and use 'pcfix correct' for a cloud taken under water.",
                 option=name,
             )

@@ -155,7 +155,7 @@ def _check_port(options: CorrectOptions) -> None:
         raise SettingError(
             "port.excludes",
             f"{name.replace('_', '-')} {getattr(options, name)} has no effect with a port."
-            " Leave it out; the methods are snell and consistent.",
+            " Omit it; the methods are snell and consistent.",
             option=name,
         )
 
@@ -270,7 +270,7 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
             replace(sample, survey=bare), view.points, ties, hint, near
         )
         survey = replace(survey, parts={UNLISTED: unlisted})
-        words = ["Points in no view list are corrected as without a list.", *map(str, verdicts)]
+        words = ["Points missing in the view list are corrected without it.", *map(str, verdicts)]
         notes.append(PcfixWarning("views.unlisted", " ".join(words)))
     return replace(plan, survey=survey, notes=tuple(notes))
 
@@ -287,7 +287,7 @@ def _note_flat(sample: Batch, survey: Survey) -> list[PcfixWarning]:
     sentence = (
         f"About {100.0 * flat.mean():.0f} % of the submerged points have only rays beyond"
         f" {FLAT_DEG:g} degrees, nearly all between {low[0]:.0f}, {low[1]:.0f} and"
-        f" {high[0]:.0f}, {high[1]:.0f}. Their depths are the least certain; add nadir images"
+        f" {high[0]:.0f}, {high[1]:.0f}. Their depths are the least accurate; add nadir images"
         + (", or flag them with --unsure withhold." if keeps else ".")
     )
     return [PcfixWarning("cloud.obliques_only", sentence, share=float(flat.mean()))]

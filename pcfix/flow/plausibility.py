@@ -60,7 +60,7 @@ class Plausible(NamedTuple):
     def __str__(self) -> str:
         """Return a line that claims no more than was tested."""
         found = "cameras and cloud fit" if self.fits else "nothing was tested"
-        found = "in doubt, see the warnings" if self.doubts else found
+        found = "cameras and cloud may not fit, see the warnings" if self.doubts else found
         found += f"; tested: {', '.join(self.fits)}" if self.fits else ""
         return found + (f"; not checked: {', '.join(self.unchecked)}" if self.unchecked else "")
 
@@ -122,8 +122,8 @@ class CloudSample(Sums):
             sentence = (
                 f"The cloud's shoreline rises to the {tilted.to} against the given water by"
                 f" {100.0 * tilted.slope:.2g} %, from {tilted.low_m:+.2f} to {tilted.high_m:+.2f}"
-                " m. The water flows or one of the two is tilted; measure shoreline points all"
-                " round and give them as --water."
+                " m. The water flows or one of the two is tilted; measure shoreline points on"
+                " all sides and give them as --water."
             )
             code = "water.shoreline_tilt"
             doubts.append(PcfixWarning(code, sentence, to=tilted.to, slope=tilted.slope))
@@ -157,7 +157,7 @@ def plausible(
         heights = Result()
     results = [
         *(test(cameras, xyz) for test in (_far, _frames, _directions)),
-        Result("listed points in the frames of their images" if listed and cameras.lenses else ""),
+        Result("listed points visible in their images" if listed and cameras.lenses else ""),
         *(positions(cameras, str(file)), heights, flown, _spacing(cameras, cloud, every)),
     ]
     fits, doubts, unchecked = (tuple(filter(None, found)) for found in zip(*results, strict=True))
@@ -276,8 +276,8 @@ def _directions(cameras: Cameras, xyz: FloatArray) -> Result:
     if read is not None and abs(read) <= MOST_TURN_DEG and np.ptp(yaw) <= 2.0 * np.pi:
         return _doubt(
             "cameras.radians",
-            f"The images are turned by {abs(turn):.0f} degrees against the flight lines, but not if"
-            " their angles are radians. Give the angles in degrees.",
+            f"The images are turned by {abs(turn):.0f} degrees against the flight lines, unless"
+            " their angles are in radians. Give the angles in degrees.",
             turn_deg=turn,
         )
     if abs(turn) < 180.0 - MOST_TURN_DEG:  # as cameras are mounted in aircraft
@@ -285,7 +285,7 @@ def _directions(cameras: Cameras, xyz: FloatArray) -> Result:
     return _doubt(
         "cameras.yaw",
         f"The images are turned by {abs(turn):.0f} degrees against the flight lines. Check the"
-        " convention of the angles, unless the camera was mounted so.",
+        " convention of the angles, unless the camera was mounted like that.",
         turn_deg=turn,
     )
 
@@ -301,7 +301,7 @@ def _heights(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Res
     if ties is None or cameras.lenses is None or cameras.rotations is None:
         pixel = _pixel_m(cameras, cloud)
         sized = "" if pixel is None else f", {100.0 * pixel:.3g} cm a pixel"
-        by_them = f"by them {_above(cameras, cloud):.0f} m above the cloud{sized}"
+        by_them = f"cameras {_above(cameras, cloud):.0f} m above the cloud{sized}"
         return Result(unchecked=f"heights (no tie points; {by_them})")
     found = _worst_residual(cameras, ties)
     if found is None:
@@ -333,7 +333,7 @@ def _heights(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Res
             " of the heights.",
             off_m=off,
         )
-    return Result(f"tie points in their image places and {abs(off):.2f} m from the cloud's heights")
+    return Result(f"tie points match their images, {abs(off):.2f} m from the cloud's heights")
 
 
 def _worst_residual(cameras: Cameras, ties: TiePoints) -> tuple[float, str] | None:
@@ -403,7 +403,7 @@ def flying_heights(cameras: Cameras, file: File, water_m: float | None) -> Resul
     return _doubt(
         "cameras.flying_height",
         f"The cameras are {above:.0f} m above the water, and recorded {flown:.0f} m above their"
-        f" take-off (median of {len(rows)}), which would be {where}. Unless it was, check the"
+        f" take-off (median of {len(rows)}), which would be {where}. If it was not, check the"
         " vertical datum and the unit of cameras and water.",
         above_water_m=above,
         above_take_off_m=flown,

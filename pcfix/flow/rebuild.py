@@ -136,7 +136,7 @@ def rebuild_rounds(
             n = block.scene.refractive_index
             excess = 1.0 / (n * (2.0 - n)) - 1.0  # near nadir the depth tends to h0 / (2 - n)
             words = (
-                "--mapping paper tends to the apparent depth over 2 - n, here up to"
+                "--mapping paper converges to the apparent depth / (2 - n), here up to"
                 f" {100 * excess:.0f} % too deep. Correct the cloud and use --mapping exact."
             )
             notes.append(PcfixWarning("photos.paper_limit", words, excess=excess))
@@ -201,7 +201,7 @@ def _reconstruct(
         raise InputError(
             "rebuild.failed",
             f"--rebuild {wrong} in round {number}: {' / '.join(last) or 'no message'} (see {log})."
-            " Correct it and call again, which resumes here.",
+            " Correct it and run the same command again; it resumes here.",
             exit_code=code, round=number, log=log,
         )  # fmt: skip
 

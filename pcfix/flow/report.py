@@ -33,14 +33,14 @@ SAMPLE_POINTS = 200_000
 PAGE = "report.html"
 RESULTS = {
     "corrected.laz": "all points, the bed corrected",
-    "cleaned.laz": "the same, with outliers flagged as noise",
+    "cleaned.laz": "all points, with outliers flagged as noise",
     "depth.tif": "depth below the water",
     "bed.tif": "heights of the bed",
     "surface.tif": "heights of land and bed",
     "uncertainty.tif": "vertical uncertainty at 95 %",
-    "surface_counts.tif": "points of each cell, and their spread",
+    "surface_counts.tif": "number of points in each cell, and their spread",
     "shaded.tif": "coloured, shaded relief",
-    "map.gpkg": "contours, waterline and other lines and places, for a GIS",
+    "map.gpkg": "contours, waterline and other layers for a GIS",
     "run.json": "options and results of the run",
     "compare/compare.json": "all figures of the comparison",
     "compare/depth_bins.csv": "errors by depth",

@@ -145,7 +145,7 @@ def run_all(
         """Do a step unless it is done; return its result, and the start of its line."""
         with bar(title) as progress:
             result, was_done = record.step(name, outputs, partial(work, progress))
-        return result, f"{name:<9} {'done before' if was_done else 'done'}: "
+        return result, f"{name:<9} {'already done' if was_done else 'done'}: "
 
     outputs = [out_dir / FOLDER / name for name in ADJUSTED]
     first, done = step(
@@ -157,7 +157,7 @@ def run_all(
         for words in (adjustment_sentence(figures), *all_notes(figures)):
             say(f"{'':<9} {words}")
     elif first["why"]:
-        say(f"{'adjust':<9} not done: {first['why']}")
+        say(f"{'adjust':<9} skipped: {first['why']}")
     request = request.with_adjusted(out_dir, first)
     run = RunFolder(out_dir, request)
 

@@ -454,7 +454,7 @@ def check_folder(
         if not overwrite:
             wrong = "exists. Add --overwrite to replace it"
         elif not (folder / mark).is_file():
-            wrong = f"holds other files, and no {mark}. Give an empty or new folder"
+            wrong = f"contains other files but no {mark}. Give an empty or new folder"
     if wrong:
         raise SettingError(code, f"{folder}: {wrong}.", path=folder)
 

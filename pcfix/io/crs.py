@@ -390,7 +390,7 @@ def way_to_cloud(
         if not source.is_projected or plan_unit(source)[1] != 1.0:
             sentence = f"is in {unit} ({source.name}), the cloud names no CRS. Set the cloud's CRS."
             raise bad_file(name, "crs.cloud_missing", sentence, unit=unit)
-        sentence = f"{name}: no cloud names a CRS; that of the file is assumed ({source.name})."
+        sentence = f"{name}: the cloud names no CRS; that of the file is assumed ({source.name})."
         return None, (PcfixWarning("crs.assumed", sentence),)
     if is_local(cloud) or is_local(source):
         sentence = f"is in {source.name}, the cloud in {cloud.name}, of which one is local. Use one"

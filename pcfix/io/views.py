@@ -251,7 +251,7 @@ def image_orders(raw: ViewList, cameras: Cameras) -> tuple[ImageOrder, ...]:
     if not fitting:
         largest = max(found, key=lambda order: len(order.camera))
         sentence = f"names image {most} (from 0); {largest.what} has {len(largest.camera)}. Put the"
-        sentence += " sparse model beside the list."
+        sentence += " sparse model next to the list."
         raise bad_file(raw.path, "views.image_number", sentence, value=most)
     known = [order for order in fitting if (order.camera >= 0).any()]
     if not known:
@@ -316,7 +316,7 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -
     share, best = max(shares, key=lambda pair: pair[0])
     if share < LEAST_SHARE:
         sentence = f"only {100 * share:.0f} % of the listed cameras have their point in the frame."
-        sentence += " Put the sparse model beside the list, or give its offset (--cameras-offset)."
+        sentence += " Put the sparse model next to the list, or give its offset (--cameras-offset)."
         raise bad_file(views.path, "views.other_images", sentence, share=share)
     return replace(views, orders=(best,), share_seen=share)
 
@@ -344,7 +344,7 @@ class ViewMatch:
             self.tolerance_m = max(rounding_m, views.tolerance_spacings * spacing_m)
             self._same_m = max(rounding_m, _SAME * spacing_m)
         elif points != len(views):
-            sentence = f"has {len(views):,} points, the cloud {points}. Put its PLY file beside it."
+            sentence = f"has {len(views):,} points, the cloud {points}. Put its PLY next to it."
             values = {"listed": len(views), "points": points}
             raise bad_file(views.path, "views.other_points", sentence, **values)
 
@@ -479,7 +479,7 @@ class ViewReport(Sums):
 
 def beside(entries: int, points: int) -> str:
     """Return the sentence on cameras that cannot have imaged the points they are listed for."""
-    return f"{entries:,} entries, of {points:,} points, name cameras that look elsewhere: ignored."
+    return f"{entries:,} entries of {points:,} points are ignored: their cameras face elsewhere."
 
 
 def spacing_m(xyz: FloatArray) -> float | None:

@@ -267,7 +267,7 @@ def rasters_of_images(
         sentence = f"has no raster named after an image, such as {Path(names[0]).stem}.tif."
         raise bad_file(folder, "water.no_image_rasters", sentence)
     lost = len(names) - len(found)
-    return found, (f"{lost} images have no water raster of their own in {folder}.",) * (lost > 0)
+    return found, (f"{lost} images have no water raster in {folder}.",) * (lost > 0)
 
 
 def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:

@@ -48,9 +48,9 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     matcher: Literal["depth-maps", "single-map", "nearest-map", "pairs"] = option(
         "depth-maps", with_cameras=True
     )
-    """Dense matcher of --camera-set mvs: fused depth maps (OpenMVS, COLMAP), the depth map of a
-    single image at each place (single-map, SURE), that of the image nearest in plan (nearest-map),
-    or the median of stereo pairs (MicMac)."""
+    """Dense matcher of --camera-set mvs. depth-maps: fused (OpenMVS, COLMAP); single-map: one image
+    at each place (SURE); nearest-map: the image nearest in plan; pairs: median of stereo pairs
+    (MicMac)."""
     software: Software | None = option(None, with_cameras=True)
     """Software that reconstructed the cloud: its usual reconstruction types are more likely, if the
     cloud does not show clearly which it is. [default: as named in the header of the cloud]"""
@@ -64,21 +64,21 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
         metavar="DEG",
     )
     """Maximum incidence angle of a ray, from the surface normal; none for no limit. auto: no limit,
-    but 35 for snell and the formulas if the cloud shows clearly that flatter rays were not used to
-    reconstruct it. [deg] [default: auto; must be given for poses without a lens]"""
+    but 35 for snell and the formulas if the cloud was clearly reconstructed without rays at larger
+    angles. [deg] [default: auto; must be given for poses without a lens]"""
     max_cameras: int | None = option(None, with_cameras=True, least=1)
     """Maximum number of rays per point; those closest to nadir are used. [default: no limit]"""
     occlusion: Literal["auto", "on", "off"] = option("auto", with_cameras=True)
     """Skip cameras from which the cloud occludes the point; auto: if there are oblique images."""
     exact: bool = option(False)
-    """Solve every point exactly; this is always done, and the option is for older scripts."""
+    """No effect: every point is solved exactly. The option remains for older scripts."""
     depth_factor: float | str | None = option(
         None, least=1, most=3, needs="method factor", parse=number_or("auto"), metavar="N"
     )
     """Ratio of true to apparent depth; auto: from the height, focal length and base of the cameras.
     [default: the refractive index]"""
     least_r2: float = option(0.5, least=0, most=1)
-    """With --method regression: refuse a fit with a lower r2."""
+    """Minimum r2 of the fit of --method regression."""
     index_from: str = ""
     """Which water the index is of, if it was not given as a number; not an option."""
 
@@ -142,13 +142,13 @@ class BudgetOptions(OptionSet, panel=Panel.BUDGET):
     sigma_level: float | None = option(None, least=0)
     """Standard deviation of the water level. [m] [default: that of its fit, else 0.02]"""
     sigma_tilt: float = option(0.0, least=0)
-    """Standard deviation of the slope of the water, about each axis. [deg]"""
+    """Standard deviation of the tilt of the water surface, about each axis. [deg]"""
     sigma_index: float = option(0.002, least=0)
     """Standard deviation of the refractive index."""
     sigma_waves: float = option(0.0, least=0)
-    """Standard deviation of the slope of waves, from ray to ray. [deg]"""
+    """Standard deviation of the slope of waves, independent for each ray. [deg]"""
     sigma_centre: float = option(0.0, least=0)
-    """Standard deviation of a projection centre, each axis. [m]"""
+    """Standard deviation of a projection centre, along each axis. [m]"""
     sigma_attitude: float = option(0.0, least=0)
     """Standard deviation of the attitude, about each axis. [deg]"""
 
@@ -157,8 +157,8 @@ class RefractionOptions(BudgetOptions, MethodOptions, panel=Panel.OUTPUT):
     """Everything that the correction of points depends on."""
 
     unsure: Unsure = option("keep", with_cameras=True)
-    """Corrected points seen only by oblique images, all rays beyond 35 degrees, without a view
-    list: kept as others, or flagged withheld."""
+    """Corrected points whose rays all have incidence angles above 35 deg, without a view list: keep
+    them as they are, or flag them as withheld."""
     deep: bool = option(False, panel=Panel.WATER)
     """Accept depths of more than 60 m, which usually mean a wrong water level."""
 
@@ -173,7 +173,7 @@ class ScienceOptions(RefractionOptions, panel=Panel.OUTPUT):
     uncorrected: Literal["withhold", "keep", "drop"] = option("withhold", basic=True)
     """Submerged points with fewer than two usable rays: flag, keep or drop them."""
     dimensions: Dimensions = option("all")
-    """Extra dimensions; 'pcfix restore' needs all."""
+    """Extra dimensions to write; 'pcfix restore' needs all."""
 
 
 class CorrectOptions(
@@ -196,7 +196,7 @@ class LabelRules(LandRules, panel=Panel.WATER):
     """Points up to this distance from the surface get the label of their surroundings. [m]
     [default: none]"""
     reset: bool = option(False)
-    """Set points of class 40 or 41 that are neither to class 1."""
+    """Set points of class 40 or 41 to class 1 if they are no longer in either class."""
 
     def check(self) -> None:
         """Check that the dead band is wider."""

@@ -28,10 +28,10 @@ class OrthoOptions(
     """True heights of land and bed: a GeoTIFF, or a corrected cloud (.las, .laz), which is gridded
     to cells twice as wide as those of the orthophoto."""
     resolution: float | None = option(None, basic=True, above=0)
-    """Cell size. [m] [default: a ground pixel]"""
+    """Cell size. [m] [default: one ground pixel]"""
     water: Any = option(None, basic=True, metavar="SPEC")
-    """Water surface, as for 'pcfix photos', for photographs as taken; without it refraction must
-    have been removed from them."""
+    """Water surface, as for 'pcfix photos'. Omit it if refraction was already removed from the
+    photographs."""
 
 
 def _command(given: str) -> str:
@@ -52,15 +52,15 @@ class RebuildOptions(OptionSet, panel=Panel.ROUNDS):
     """Rounds of photographs without refraction and clouds from them."""
 
     rebuild: str | None = option(None, basic=True, then=_command, metavar="COMMAND")
-    """Reconstruct the cloud from the photographs, in rounds: stereo, matching by pcfix, or the
-    command of another program, with {images}, {cameras} and {cloud} for the folder of the
+    """Reconstruct the cloud from the photographs, in rounds: stereo (built in), or the command of
+    another program. In the command, {images}, {cameras} and {cloud} become the folder of the
     photographs, --cameras and the LAZ file to write."""
     until_gsd: float = option(1.0, above=0)
     """Stop if the mean change of the bed is less than this many ground pixels."""
     most_rounds: int = option(4, least=1)
     """Maximum number of rounds."""
     reference: File | None = option(None, basic=True, needs="rebuild")
-    """Compare the clouds of all rounds with it, in OUT/compare; see 'pcfix compare'."""
+    """Reference to compare the clouds of all rounds with, in OUT/compare; see 'pcfix compare'."""
 
 
 class PhotosOptions(
@@ -92,7 +92,7 @@ class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions, pa
     OUT_water, for --water-per-image of 'pcfix correct' and 'photos'."""
     depth: Any = option(None, basic=True, metavar="SPEC", needs="surface")
     """With --surface: true depth in metres, or heights of the bed: a GeoTIFF or cloud, which is
-    apparent unless pcfix corrected it."""
+    taken as apparent unless pcfix corrected it."""
     level: float = option(0.0)
     """With --surface: height of the calm water. [m]"""
     cameras: Any = option(None, basic=True, metavar="PATH", needs="surface")
@@ -102,11 +102,11 @@ class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions, pa
     """With --surface, instead of --cameras, for a nadir view: pixel size at the bed. [m]"""
     interval: float | None = option(None, above=0, needs="surface")
     """With --surface: time between frames, before --every; without it frames are independent. [s]
-    [default: what the video says]"""
+    [default: as stated in the video]"""
     resolution: float | None = option(None, basic=True, above=0)
-    """Cell size of the rasters of the water. [m] [default: that of 2,000 cells]"""
+    """Cell size of the rasters of the water. [m] [default: so that there are 2,000 cells]"""
     every: int = option(1, least=1, most=100_000, panel=Panel.METHOD)
     """Use every Nth frame."""
     still: bool = option(False, panel=Panel.METHOD)
-    """The camera did not move, as on a mast: frames are used as they are. Otherwise they are
-    aligned to the first by what moves least."""
+    """The camera did not move, as on a mast: do not align the frames. Otherwise they are aligned
+    to the first one by the parts of the image that move least."""

@@ -22,8 +22,7 @@ class FlightOptions(OptionSet, panel=Panel.FLIGHT):
     block: BlockKind = option("nadir", basic=True)
     """Only nadir images, or oblique ones too."""
     cameras: int | None = option(None, basic=True, least=9)
-    """Approximate number of nadir images, from which the area follows. [default: as the area needs]
-    """
+    """Approximate number of nadir images; sets the area. [default: as many as the area needs]"""
     flying_height_m: float = option(80.0, least=0.5, most=10_000)
     """Flying height above the water."""
     area_m: tuple[float, float] = option((120.0, 80.0), above=0)
@@ -53,9 +52,9 @@ class CameraOptions(OptionSet, panel=Panel.CAMERA):
     sensor_mm: tuple[float, float] = option((13.2, 8.8), above=0)
     """Width and height of the sensor; pixels are square."""
     sensor_px: tuple[int, int] = option((5472, 3648), above=0)
-    """The same in pixels."""
+    """Width and height of the sensor in pixels."""
     distortion: tuple[float, float, float, float, float] = option((0.0, 0.0, 0.0, 0.0, 0.0))
-    """Brown's k1 k2 k3 p1 p2, in Metashape's order; all are in the camera file."""
+    """Brown's k1 k2 k3 p1 p2, in Metashape's order; written to the camera file."""
     image_noise: float = option(0.5, least=0, most=100)
     """Standard deviation of image points. [px]"""
 
@@ -70,9 +69,9 @@ class SceneWaterOptions(IndexOptions, panel=Panel.WATER):
     wave_length_m: float = option(1.0, least=0.01, most=1000)
     """Length of waves."""
     tilt_percent: float | None = option(None, least=0, most=20)
-    """Slope of the water. [default: 0, of a river 0.3]"""
+    """Slope of the water. [default: 0, for a river 0.3]"""
     tilt_heading_deg: float = option(90.0, least=-360, most=360)
-    """Direction in which it falls, clockwise from north."""
+    """Direction in which the water falls, clockwise from north."""
     bed: BedKind = option("shore", basic=True)
     """Shape of the ground."""
     greatest_depth_m: float | None = option(None, least=0.01, most=1000)
@@ -83,16 +82,16 @@ class SceneCloudOptions(OptionSet, panel=Panel.CLOUDS):
     """The cloud that is reconstructed from the images, and the LiDAR."""
 
     points: int = option(100_000, basic=True, least=1)
-    """Points of the cloud."""
+    """Number of points in the cloud."""
     detection: float = option(1.0, least=0.01, most=1)
     """Probability that an image that shows a point contributes to it; at least three do."""
     lidar_per_m2: float = option(2.0, least=0, most=10_000)
-    """Points of the LiDAR per m2."""
+    """Number of LiDAR points per m2."""
     lidar_noise_m: float = option(0.05, least=0, most=10)
-    """Standard deviation of its heights."""
+    """Standard deviation of the LiDAR heights."""
     seed: int = option(1, basic=True, least=0)
-    """Seed of the random numbers. Each kind of noise has its own, so that one more changes neither
-    terrain nor block."""
+    """Seed of the random numbers. Each kind of noise has a separate stream, so adding noise changes
+    neither terrain nor block."""
 
 
 class SceneOptions(SceneCloudOptions, SceneWaterOptions, CameraOptions, FlightOptions):
@@ -107,7 +106,7 @@ class DemoOptions(OverwriteOption, panel=Panel.OUTPUT):
     """The options of ``pcfix demo``."""
 
     points: int = option(50_000, basic=True)
-    """Points of each scene."""
+    """Number of points in each scene."""
 
 
 def _depths(text: str) -> tuple[float, ...]:
@@ -137,18 +136,18 @@ class PlanOptions(OverwriteOption, SummaryOption, BudgetOptions, IndexOptions, p
     sidelap: float = option(0.7, least=0, most=0.95)
     """Side overlap of the strips, at the water."""
     obliques: float | None = option(None, least=1, most=60)
-    """Also fly oblique images, to four sides, at this angle from nadir. [deg] [default: none]"""
+    """Also fly oblique images in four directions, this far from nadir. [deg] [default: none]"""
     area: tuple[float, float] = option((120.0, 80.0), above=0, most=1e5)
     """Extent along and across the strips. [m]"""
     lens: tuple[float, float, float, float] = option(
         (8.8, 13.2, 8.8, 5472.0), basic=True, above=0, most=1e6, parse=numbers, metavar="F,W,H,N"
     )
-    """Focal length, width and height of the sensor in mm, pixels along its width."""
+    """Focal length, sensor width and sensor height in mm, and number of pixels along the width."""
     depth: tuple[float, ...] = option(
         (0.5, 1.0, 2.0, 3.0, 5.0), basic=True, above=0, parse=_depths, metavar="M,M"
     )
     """Depths of the bed: the greatest, a list, or FROM:TO:STEP. [m]"""
     gnss_sigma: float = option(0.03, above=0)
-    """Standard deviation of GNSS positions of the images, each axis. [m]"""
+    """Standard deviation of GNSS positions of the images, along each axis. [m]"""
     plot: File | None = option(None, writes=True, basic=True, panel=Panel.OUTPUT)
     """PNG of the block and of the errors by depth."""

@@ -26,7 +26,7 @@ class Panel(StrEnum):
     TESTS = "Tests"
     RASTER = "Raster"
     FIGURES = "Figures"
-    UNKNOWNS = "What moves, and how much counts"
+    UNKNOWNS = "Unknowns and weights"
     CLOUDS = "Clouds"
     ROUNDS = "Rounds"
     OUTPUT = "Output"
@@ -56,7 +56,7 @@ class WaterOptions(OptionSet, panel=Panel.WATER):
     """Surface fitted to shoreline points: level, plane, plane tilted along the points only, or
     river; auto chooses among the first three."""
     water_crs: str | None = option(None, metavar="CRS", needs="water")
-    """CRS of the shoreline points. [default: what their file says]"""
+    """CRS of the shoreline points. [default: as stated in their file]"""
 
 
 class NeededOptions(WaterOptions, panel=Panel.NEED):
@@ -81,7 +81,7 @@ class LandRules(OptionSet, panel=Panel.WATER):
     connected: bool = option(False, basic=True, off=True, needs="water")
     """Correct only the main water body and its connected parts; ignore separate pools."""
     least_pool: float | None = option(None, least=0.0, needs="connected")
-    """Pools of at least this area are not ignored. [m2] [default: a tenth of the largest water]"""
+    """Also correct pools of at least this area. [m2] [default: a tenth of the largest water]"""
     respect_classes: tuple[int, ...] = option(
         (),
         least=0,
@@ -106,7 +106,7 @@ class PortOptions(OptionSet, panel=Panel.WATER):
     """A housing under water."""
 
     port: Any = option(None, basic=True, metavar="SPEC")
-    """Housing port, for a cloud taken under water, instead of --water:
+    """Housing port, for images taken under water; replaces --water:
     flat:distance=M[,thickness=M,glass=N,nx=,ny=] or
     dome:radius=M[,thickness=M,glass=N,x=M,y=M,z=M], seen from the projection centre."""
 
@@ -116,19 +116,19 @@ class CameraFileOptions(OptionSet, panel=Panel.CAMERAS):
 
     sensor: File | None = option(None, with_cameras=True)
     """Interior orientation, if the cameras have none: CSV focal,sensor_x,sensor_y in mm, or a
-    Metashape calibration. [default: sensor.csv beside the cameras]"""
+    Metashape calibration. [default: sensor.csv next to the cameras]"""
     angles: Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"] | None = option(
         None, with_cameras=True
     )
     """Angles of a table whose header does not name them; in aircraft, pitch -90 is straight down.
     [default: yaw-pitch-roll]"""
     cameras_crs: str | None = option(None, with_cameras=True, basic=True, metavar="CRS")
-    """CRS of the cameras, such as EPSG:25830; 'local' uses the numbers as they are. [default: what
-    their file says, else the cloud's]"""
+    """CRS of the cameras, such as EPSG:25830; 'local' uses the numbers as they are. [default: as
+    stated in their file, else that of the cloud]"""
     cameras_offset: tuple[float, float, float] | None = option(
         None, with_cameras=True, parse=numbers, metavar="X,Y,Z"
     )
-    """Added to the projection centres, for models shifted to the origin. [m]"""
+    """Offset added to the projection centres, for models shifted to the origin. [m]"""
 
 
 class CamerasOptions(CameraFileOptions, panel=Panel.NEED):
@@ -146,7 +146,7 @@ class ViewOptions(OptionSet, panel=Panel.CAMERAS):
     """View list: the images that contributed to each point. COLMAP's fused.ply.vis, the dense PLY
     of OpenMVS, or the camera file itself for the tracks of its tie points."""
     views_are: Literal["auto", "tracks", "depth-maps", "pairs"] = option("auto", with_cameras=True)
-    """Images in the view list: those of a track, of depth maps that were averaged, or of stereo
+    """What the images in the view list are: those of a track, of averaged depth maps, or of stereo
     pairs; auto detects it from the cloud."""
 
 
@@ -161,14 +161,14 @@ class SurveyOptions(ViewOptions, CamerasOptions, NeededOptions, panel=Panel.CAME
     """Original camera file, if --cameras is the output of 'pcfix adjust'. The cloud is first
     transferred to the adjusted poses."""
     check_depths: File | None = option(None, needs="method regression")
-    """With --method regression: CSV x,y,depth of measured depths, m."""
+    """Measured depths for --method regression: CSV x,y,depth. [m]"""
     regression: File | None = option(None, needs="method regression")
-    """Line that --save-regression wrote for another cloud, instead of --check-depths."""
+    """Line fitted to another cloud, from --save-regression; replaces --check-depths."""
     tide: File | None = option(None, with_cameras=True, panel=Panel.WATER, needs="water")
-    """CSV time,level_m: each image gets the water level of its time."""
+    """Tide table, CSV time,level_m: each image gets the water level at its time."""
     image_times: File | None = option(None, with_cameras=True, panel=Panel.WATER, needs="tide")
-    """With --tide: CSV label,time, or the folder of the images. [default: what the camera file
-    says]"""
+    """Times of the images, for --tide: CSV label,time, or the folder of the images. [default: as
+    stated in the camera file]"""
     salinity: float | None = option(None, panel=Panel.WATER)
     """Salinity of the water, to compute the refractive index. [PSU] [default: 35]"""
     temperature: float | None = option(None, panel=Panel.WATER)
@@ -204,8 +204,8 @@ class JobOptions(OverwriteOption, panel=Panel.OUTPUT):
     """How the work is done."""
 
     jobs: int | None = option(None, basic=True, least=1)
-    """Number of threads; with many files, of files processed at the same time. [default: all cores]
-    """
+    """Number of threads or, for many files, of files processed at the same time. [default: all
+    cores]"""
 
 
 class TileOptions(JobOptions, panel=Panel.OUTPUT):

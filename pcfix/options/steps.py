@@ -44,27 +44,28 @@ class CleanRules(OptionSet, panel=Panel.TESTS):
     statistical: bool = option(True)
     """Test the mean distance to the nearest points in space."""
     neighbours: int = option(20, least=LEAST_NEIGHBOURS, most=MOST_NEIGHBOURS)
-    """Nearest points of the statistical test, including the point itself."""
+    """Number of nearest points in the statistical test, including the point itself."""
     deviations: float | None = option(4.0, above=0)
     """Noise if the mean distance to the neighbours exceeds that of all points by this many standard
     deviations."""
     radius: float | None = option(None, basic=True, above=0)
-    """Noise if fewer than --radius-neighbours others are nearer. [m] [default: no such test]"""
+    """Noise if fewer than --radius-neighbours other points are within this distance. [m] [default:
+    no such test]"""
     radius_neighbours: int = option(3, least=1, most=MOST_NEIGHBOURS)
-    """See --radius."""
+    """Minimum number of other points within --radius."""
     weak: bool = option(True)
     """Test rays, ray distance and incidence of corrected points."""
     min_rays: int | None = option(3, basic=True, least=2)
-    """Noise if corrected from fewer rays."""
+    """Noise if a point was corrected from fewer rays."""
     max_ray_miss: float | None = option(0.5, basic=True, above=0)
-    """Noise if the rays are further from the point (RayMiss). [m]"""
+    """Noise if the ray distance (RayMiss) is larger. [m]"""
     max_incidence: float | None = option(75.0, basic=True, above=0, most=90)
     """Noise if a ray has a larger incidence angle. [deg]"""
     bed_neighbours: int = option(32, least=LEAST_NEIGHBOURS, most=MOST_NEIGHBOURS)
-    """Nearest submerged points in plan from which the bed is estimated."""
+    """Number of nearest submerged points, in plan, from which the bed is estimated."""
     fences: float = option(3.0, above=0)
-    """Noise if outside the interquartile range of their heights by this many times the range, and
-    by more than --below or --floating."""
+    """Noise if the height is outside the interquartile range of its neighbours by this many times
+    the range, and by more than --below or --floating."""
     below: float | None = option(0.3, off=True, above=0)
     """Minimum distance of noise below the bed. [m]"""
     floating: float | None = option(0.5, basic=True, off=True, above=0)
@@ -100,7 +101,7 @@ class CleanOptions(TileOptions, SummaryOption, CleanRules, panel=Panel.OUTPUT):
     """Water surface, as for 'pcfix correct': points below it are tested against the bed. [default:
     the points that pcfix corrected]"""
     drop: bool = option(False, basic=True)
-    """Drop noise. Otherwise it gets class 7 and the withheld flag."""
+    """Drop noise instead of giving it class 7 and the withheld flag."""
 
 
 class DsmRules(OptionSet, panel=Panel.RASTER):
@@ -109,8 +110,8 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
     resolution: float | None = option(None, basic=True, least=MIN_RESOLUTION_M)
     """Cell size. [m] [default: 2 to 4 points a cell]"""
     what: str = option("height", metavar="height|depth|uncertainty|DIMENSION")
-    """Value of a cell: height; depth of the bed below the water; uncertainty, the vertical one of
-    the bed at 95 %; or a dimension, by its name."""
+    """Value of a cell: height; depth (of the bed below the water); uncertainty (vertical, of the
+    bed, at 95 %); or the name of a dimension."""
     method: DsmMethod = option("mean", basic=True)
     """Gridding method."""
     surface: SurfaceChoice = option("all", basic=True)
@@ -118,9 +119,9 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
     fill: float | None = option(None, above=0)
     """Fill holes up to this width; they get count 0. [m]"""
     azimuth: float = option(315.0)
-    """Sun of the hillshade, clockwise from north. [deg]"""
+    """Azimuth of the sun in the hillshade, clockwise from north. [deg]"""
     altitude: float = option(45.0, above=0, most=90)
-    """Sun of the hillshade, above the horizon. [deg]"""
+    """Altitude of the sun in the hillshade, above the horizon. [deg]"""
 
     @property
     def cell_m(self) -> float:
@@ -136,8 +137,8 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
         if self.what == "uncertainty" and (self.method != "mean" or self.fill is not None):
             raise SettingError(
                 "option.excludes",
-                "what uncertainty is the root mean square of the points of a cell. Leave --method"
-                " and --fill out.",
+                "what uncertainty is the root mean square of the points of a cell. Omit --method"
+                " and --fill.",
                 option="what",
             )
         if self.what in ("depth", "uncertainty"):
@@ -147,7 +148,7 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
             raise SettingError(
                 "option.range",
                 f"fill {self.fill:g} must be at most {most:g}, {MAX_HOLE_CELLS:,} cells."
-                " Fill less, or use a coarser resolution.",
+                " Use a smaller width, or a coarser resolution.",
                 option="fill",
                 value=self.fill,
                 most=most,
@@ -223,7 +224,7 @@ class DistanceOptions(OptionSet, panel=Panel.FIGURES):
     """
 
     m3c2: bool = option(False, needs="reference")
-    """Also compare by M3C2, with py4dgeo: the extra m3c2."""
+    """Also compare by M3C2; needs py4dgeo (the extra m3c2)."""
     direction: Literal["to-reference", "from-reference", "both"] | None = option(
         None, needs="reference"
     )
@@ -253,13 +254,13 @@ class CompareRules(DistanceOptions, panel=Panel.FIGURES):
     submerged: bool = option(False, basic=True)
     """Compare only points of class 40, or below --water."""
     c2c_only: bool = option(False)
-    """Only distances to the nearest point; no signed differences."""
+    """Compute only distances to the nearest point, no signed differences."""
     neighbours: int = option(PLANE_POINTS, least=LEAST_PLANE_POINTS)
-    """Reference points of each fitted plane."""
+    """Number of reference points in each fitted plane."""
     bin_width: float = option(1.0, above=0)
-    """Bins of the table by depth. [m]"""
+    """Bin width of the table by depth. [m]"""
     shore_bin_width: float = option(10.0, above=0)
-    """Bins of the table by distance from shore. [m]"""
+    """Bin width of the table by distance from shore. [m]"""
     max_gap: float | None = option(None, above=0)
     """Points up to this distance outside the reference are compared. [m] [default: 5 point
     spacings, at least 1]"""
@@ -287,7 +288,7 @@ class CompareOptions(OverwriteOption, SummaryOption, CompareRules, panel=Panel.O
     out_dir: File | None = option(None, writes=True, basic=True)
     """Folder for compare.json, depth tables and sections (CSV)."""
     water: Any = option(None, basic=True, metavar="SPEC")
-    """Water surface, as for 'pcfix correct'. [default: what the cloud says]"""
+    """Water surface, as for 'pcfix correct'. [default: as recorded in the cloud]"""
     section: tuple[Any, ...] = option((), basic=True, metavar="X,Y,X,Y")
     """A cross-section x1,y1,x2,y2; may be repeated."""
     plot: File | None = option(None, writes=True, basic=True)
@@ -310,7 +311,7 @@ class ViewerOptions(OverwriteOption, CameraFileOptions, WaterOptions, panel=Pane
     cameras: Any = option(None, basic=True, metavar="PATH")
     """Camera poses to show, as for 'pcfix correct'."""
     water: Any = option(None, basic=True, metavar="SPEC")
-    """Water surface to show, as for 'pcfix correct'; also for depths of clouds without them."""
+    """Water surface to show, as for 'pcfix correct'; also for clouds without depths."""
     image: File | None = option(None, writes=True)
     """PNG to draw instead of opening a window."""
     points: int = option(2_000_000, basic=True, least=1)

@@ -39,9 +39,9 @@ class SurveyedOptions(OptionSet, panel=Panel.CAMERAS):
     name,x,y,z,image,u,v[,role,under_water], ODM's gcp_list.txt, or Metashape's markers."""
     gnss: File | None = option(None, basic=True)
     """GNSS positions of the images: CSV image,x,y,z[,sx,sy,sz], a geotag list, or a camera file.
-    [default: what the cameras have]"""
+    [default: those of the camera file]"""
     lens: File | None = option(None, basic=True)
-    """Calibrated lens, held fixed: as --sensor, or a Metashape calibration."""
+    """Calibrated lens, which is held fixed: a file as for --sensor, or a Metashape calibration."""
 
 
 class CamerasCheckOptions(
@@ -98,30 +98,30 @@ class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
     """How a block is adjusted."""
 
     free: tuple[WaterUnknown, ...] = option((), basic=True, parse=words, metavar="NAMES")
-    """Unknowns of the water: some of level,tilt,index,shape (curved, to the second order); of a
-    port: distance (flat), centre (dome), index. [default: nothing]"""
+    """Unknowns of the water: any of level,tilt,index,shape (second-order curvature); of a port:
+    distance (flat), centre (dome), index. [default: none]"""
     parallel: tuple[str, ...] = option((), parse=words, metavar="NAMES")
-    """Planes of --gcps that are parallel, such as floor,deck; water is one too."""
+    """Parallel planes of --gcps, such as floor,deck; water may be one of them."""
     sigma_level: float | None = option(None, above=0)
-    """Let the level move, with this standard deviation. [m]"""
+    """Estimate the water level too, with this standard deviation of the given one. [m]"""
     sigma_tilt: float | None = option(None, above=0)
-    """Let the tilt move, with this standard deviation. [deg]"""
+    """Estimate the tilt too, with this standard deviation of the given one. [deg]"""
     sigma_index: float | None = option(None, above=0)
-    """Let the refractive index move, with this standard deviation."""
+    """Estimate the refractive index too, with this standard deviation of the given one."""
     lens_unknowns: tuple[LensUnknown, ...] | None = option(None, parse=_lens_names, metavar="NAMES")
-    """Unknowns of the lens: none, or some of f,cx,cy,k1...,p1,p2,b1,b2. [default: those that the
+    """Unknowns of the lens: none, or any of f,cx,cy,k1...,p1,p2,b1,b2. [default: those that the
     block determines]"""
     poses: Literal["free", "fixed", "similarity"] = option("free")
-    """Adjust poses one by one, not at all, or all together."""
+    """Adjust each pose, none, or all together by one similarity transformation."""
     fixed_images: tuple[str, ...] = option((), parse=words, metavar="A,B")
-    """Images that keep their pose."""
+    """Images whose poses are held fixed."""
     datum: Literal["observed", "free"] = option("observed")
     """Datum of the block: from observations, or free: mean position, direction and scale of the
     original poses."""
     ties: Literal["auto", "measured", "cloud"] = option("auto")
     """Use measured tie points, or points of the cloud; auto: measured if there are any."""
     gnss_sigma: float | None = option(None, above=0)
-    """Standard deviation of GNSS positions that have none. [m] [default: from their residuals]"""
+    """Standard deviation of GNSS positions that state none. [m] [default: from their residuals]"""
     sigma_image: float | None = option(None, above=0)
     """Standard deviation of tie points in the images. [px] [default: from their residuals]"""
     outliers: bool = option(True)
@@ -135,7 +135,7 @@ class AdjustOptions(
     """The options of ``pcfix adjust``."""
 
     cloud: File | None = option(None, basic=True)
-    """Cloud made with these poses; used if there are no tie points."""
+    """Cloud reconstructed with these poses; used if there are no tie points."""
     gnss_crs: str | None = option(None, metavar="CRS")
     """CRS of the GNSS positions."""
     gcps_crs: str | None = option(None, metavar="CRS")

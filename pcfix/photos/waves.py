@@ -118,7 +118,7 @@ def nodes_of(view: View, cell_m: float | None) -> Nodes:
     if not np.isfinite(outline).all():
         raise GeometryError(
             "cameras.pose",
-            "The camera does not see the water with its whole image. Check pose and level.",
+            "Part of the image does not show the water. Check pose and level.",
             level=view.level_m,
         )
     cell = cell_m or float(np.sqrt(np.ptp(outline, axis=0).prod() / CELLS))

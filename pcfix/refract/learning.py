@@ -49,7 +49,7 @@ def resolved(
             raise SettingError(
                 "method.own_water",
                 f"Method {method} needs one water surface for all images"
-                f"{' if the cloud is dense' if dense else ''}. Use method snell, or leave out"
+                f"{' if the cloud is dense' if dense else ''}. Use method snell, or omit"
                 " water-per-image.",
                 method=method,
             )

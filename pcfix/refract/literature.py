@@ -321,7 +321,7 @@ class StereoFactor:
 
     def __str__(self) -> str:
         aside = (
-            f" {self.aside} images look aside by more than {NADIR_DEG:g} degrees; points from these"
+            f" {self.aside} images are tilted by more than {NADIR_DEG:g} degrees; points from these"
             " need a larger factor."
         )
         return (

@@ -88,8 +88,8 @@ def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
     if np.ptp(x) < _SAME_M:
         raise GeometryError(
             "check_depths.one_depth",
-            f"All {len(x)} check depths have the apparent depth {x.mean():.3f} m, which leaves the"
-            " slope open. Give check depths from shallow to deep.",
+            f"All {len(x)} check depths have the apparent depth {x.mean():.3f} m, so the slope is"
+            " undetermined. Give check depths from shallow to deep.",
             apparent_m=float(x.mean()),
         )
     line = linregress(x, y)
@@ -149,7 +149,7 @@ def notes_of(count: int, slope: float) -> tuple[str, ...]:
     if count < FEW:
         notes.append(
             f"The regression has only {count} check depths; with fewer than {FEW} its standard"
-            " errors are hardly known."
+            " errors are unreliable."
         )
     if not 1.0 <= slope <= 2.0:
         notes.append(

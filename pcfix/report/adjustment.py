@@ -28,7 +28,7 @@ _FACTS: RowTable = (
     ("images", "{images:,}, {poses_words}", "images"),
     ("points", "{points[all]:,}: {points[land]:,} on land, {points[water]:,} under water",
      "points"),
-    ("observations", "{o[used]:,} {kind} used, {o[left_out]:,} left out ({o_share})", "o"),
+    ("observations", "{o[used]:,} {kind} used, {o[left_out]:,} excluded ({o_share})", "o"),
     ("sigma0", "{sigma0:.3f}, redundancy {redundancy:,}, {rounds} rounds, {steps} steps", "images"),
     ("water", "{water[surface]}", "has_shape"),
     ("lens", "fixed", "lens_is_fixed"),
@@ -121,7 +121,7 @@ def adjustment_tables(d: Plain, page: str) -> list[Table]:
 
     facts = _fact_table(d)
     rows: list[list[str]] = [["Note", note] for note in all_notes(d)]
-    rows.append(["All of it", Markup('<a href="{0}">{0}</a>').format(page)])
+    rows.append(["Full report", Markup('<a href="{0}">{0}</a>').format(page)])
     title = "Refractive bundle adjustment"
     return [Table(title, [], [*facts.rows, *rows]), _residual_table(d)]
 
@@ -165,7 +165,7 @@ def _poses_words(d: Plain) -> str:
     network = ", a free network" if d["unknowns"]["free_network"] else ""
     return {
         "free": f"poses free{held}{network}", "fixed": "poses fixed",
-        "similarity": "shifted, turned and scaled together",
+        "similarity": "poses shifted, rotated and scaled together",
     }[d["poses_are"]]  # fmt: skip
 
 

@@ -197,8 +197,8 @@ def _pictures(run: RunResults) -> list[Picture]:
     if s.uncertainty is not None and known.any():
         bins = run.compared["depth_bins"] if run.compared.get("tvu") else []
         dots = (
-            " Dots: the limit that 95 % of the differences to the reference keep, its noise"
-            " included."
+            " Dots: 95 % of the differences from the reference are smaller, noise of the"
+            " reference included."
         )
         alt = (
             "Total vertical uncertainty at 95 % (1.96 standard errors of Z) over depth, and the"

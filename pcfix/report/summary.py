@@ -20,9 +20,9 @@ class Summary(Figures):
         """Why no order of S-44 is claimed, as the whole bed may be off; empty if one is."""
         made = self.made or {}
         if self.settings["method"] == "regression":  # measured depths hold the bed
-            return "the line is of another cloud" if "regression" in self.settings else ""
+            return "the regression is of another cloud" if "regression" in self.settings else ""
         if made.get("method") != "consistent" or not made.get("sure", bool(made.get("views_are"))):
-            return "the reconstruction type is not certain, or the method is for another one"
+            return "the reconstruction type is uncertain, or the method assumes another one"
         return {
             True: "the poses absorbed the refraction",
             None: "the poses were not checked for absorbed refraction",

@@ -29,20 +29,16 @@ FEWEST = 59
 SHOWN_NAMES = 5
 
 _PART = ("Read", "{part_words}", "part_words")
-_NO_SURFACE = (
-    "No surface",
-    "{water_unknown:,} points have no known water surface",
-    "water_unknown",
-)
+_NO_SURFACE = ("No surface", "{water_unknown:,} points have no water surface", "water_unknown")
 _SHORELINE: RowTable = (
     ("Shoreline", "{lines} lines, {length_m:.1f} m, standard error in plan {sigma_m:.2f} m: {path}",
      "lines"),
-    ("Shoreline", "none: the water does not meet the cloud; {path} is empty", "is_empty"),
+    ("Shoreline", "none: the water does not intersect the cloud; {path} is empty", "is_empty"),
 )  # fmt: skip
 _LABELLING: RowTable = (
-    ("Mask", "{outside_mask:,} points below the surface lie outside and stay land", "water_mask"),
-    ("Kept class", "{respected:,} points below the surface keep their class", "respected"),
-    ("Pools", "{pools[points]:,} points in {pools[pools]:,} separate pools stay land", "pools"),
+    ("Mask", "{outside_mask:,} points below the surface are outside: land", "water_mask"),
+    ("Respected", "{respected:,} points below the surface have classes of land", "respected"),
+    ("Pools", "{pools[points]:,} points in {pools[pools]:,} separate pools: land", "pools"),
     ("Pools", "none separate from the water", "no_pools"),
 )  # fmt: skip
 _CORRECTED: RowTable = (
@@ -50,7 +46,8 @@ _CORRECTED: RowTable = (
     ("Transferred", "{transfer[points]:,} points ({transfer[land]:,} on land) to the adjusted"
      " poses: {transfer[shift_m][rms]:.3f} m rms, at most {transfer[shift_m][max]:.3f} m, mean Z"
      " {transfer[shift_m][mean_z]:+.3f} m", "transfer"),
-    ("", "{not_transferred:,} not: {transfer[not_transferred_reason]} ({fate})", "not_transferred"),
+    ("", "{not_transferred:,} not transferred: {transfer[not_transferred_reason]} ({fate})",
+     "not_transferred"),
     ("Submerged", "{submerged:,} points ({submerged_share}), {corrected_words}", "points"),
     ("", "{count:,} not corrected: {reason} ({fate})", "*not_corrected"),
     _NO_SURFACE,
@@ -79,7 +76,7 @@ _LABELLED: RowTable = (
     _PART,
     ("Class 40", "{submerged:,} points ({submerged_share})", "points"),
     ("Class 41", "{water_surface:,} points within {settings[band]:g} m of the surface", "has_band"),
-    ("Reclassified", "{stale:,} points of class 40 or 41 are neither now: {stale_fate}", "stale"),
+    ("Reclassified", "{stale:,} former points of class 40 or 41: {stale_fate}", "stale"),
     _NO_SURFACE,
 )  # fmt: skip
 _CLEANED: RowTable = (
@@ -120,7 +117,7 @@ _MAPPED: RowTable = (
      "images"),
     ("Black", "{black_percent:.1f} % of the pixels: no ground, occluded, or outside the image",
      "images"),
-    ("Kept", "{done_before:,} images of an earlier call", "done_before"),
+    ("Skipped", "{done_before:,} images, already done", "done_before"),
     ("Ground", "{dsm}", "dsm"),
     ("Water", "{water}, refractive index {refractive_index:g}", "water"),
 )  # fmt: skip
@@ -303,7 +300,7 @@ def tvu_sentence(uncertainty: Plain) -> str:
     order = next((one.name for one in ORDERS if shares[one.name] >= 0.95), None)
     if order is None:
         within = shares[ORDERS[-1].name]
-        return f"fewer than 95 % of the points keep any order of IHO S-44 ({within:.0%} order 2)"
+        return f"fewer than 95 % of the points meet any order of IHO S-44 ({within:.0%} order 2)"
     name = f"order {order}" if order[0].isdigit() else f"{order} Order"
     return f"{100.0 * shares[order]:.4g} % of the points are within the TVU of IHO S-44 {name}"
 
@@ -316,7 +313,7 @@ def uncertainty_sentence(s: Summary, measured: Plain | None = None) -> str:
     mean = "" if s.uncertainty is None else f"{s.uncertainty['tvu_95_m']['mean']:.3f} m on average"
     if measured is None:
         return f"TVU at 95 % {mean}, predicted; {order_sentence(s)}" if mean else ""
-    few = f"fewer than {FEWEST} points claim no order of IHO S-44"
+    few = f"fewer than {FEWEST} points, too few for an order of IHO S-44"
     return (
         f"TVU at 95 %{f' predicted {mean},' if mean else ''} measured"
         f" {measured['tvu_95_m']:.3f} m at {measured['count']:,} points of the bed;"
@@ -330,7 +327,7 @@ def labelling_text(s: Figures) -> str:
         "part_words": _part_words(s.part),
         "submerged_share": share(s.submerged, s.points),
         "has_band": s.settings["band"] > 0.0,
-        "stale_fate": "class 1" if s.settings["reset"] else "kept; --reset makes them class 1",
+        "stale_fate": "class 1" if s.settings["reset"] else "kept; --reset sets them to class 1",
     }
     rows = [*filled(_LABELLED, values), *_labelling_rows(s.labelling), ("Water", s.water)]
     return aligned(_head("Labelled", s), rows)

@@ -308,7 +308,7 @@ def _judged(coarse: Scan) -> WaterProposal:
         reason, why = "no_shoreline", "nearly all of the cloud is on one side of it"
     elif not LIFTS[0] <= lift <= LIFTS[1]:  # a break that refraction does not make
         reason = "bank"
-        why = f"slopes change by {1.0 + lift:.2f} times there, and refraction makes about 1.36"
+        why = f"slopes change there by a factor of {1.0 + lift:.2f}, refraction gives about 1.36"
     elif total < least:
         reason, why = "weak", f"its evidence is {total:.0f}, and {least:.0f} is needed"
     elif rival > most_rival * total:

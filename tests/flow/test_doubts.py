@@ -202,7 +202,7 @@ def test_list_of_half(tmp_path):
         out[name] = laspy.read(tmp_path / f"{name}.las")
         assert summary.corrected > 0.95 * summary.submerged
         said = " ".join(one["message"] for one in summary.warnings)
-        assert ("Points in no view list" in said) == (name == "half")
+        assert ("Points missing in the view list" in said) == (name == "half")
     # within a twentieth of the spacing a point gets its neighbour's list
     near_m = cKDTree(scene.apparent_xyz[rows]).query(scene.apparent_xyz)[0]
     unlisted = near_m > 0.1

@@ -175,6 +175,6 @@ def test_run(tmp_path):
     expected = np.sqrt(np.nanmean(line.sigma_m(measured / line.slope) ** 2))
     assert np.sqrt(np.nanmean(residual**2)) == pytest.approx(expected, rel=0.5)
     again = run_pcfix(*words, folder=tmp_path)
-    assert again.stdout.splitlines()[0].startswith("correct   done before")
+    assert again.stdout.splitlines()[0].startswith("correct   already done")
     refused = run_pcfix(*words, "--adjust", "yes", "--overwrite", folder=tmp_path)
     assert refused.returncode == 1

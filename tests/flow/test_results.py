@@ -57,7 +57,7 @@ def test_opened(result):
         "scene/cloud.laz", "out", cameras="scene/cameras.csv", water="0.37",
         reference="scene/lidar.laz", say=said.append,
     )  # fmt: skip
-    assert said and all("done before" in line for line in said[1:])
+    assert said and all("already done" in line for line in said[1:])
     assert pcfix.open_run("out") == again == result
 
 

@@ -185,7 +185,7 @@ def test_done_before(copied):
     before = {path: path.stat().st_mtime_ns for path in (copied / "out").glob("*.*")}
     done = run(copied, *WORDS)
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.count("done before") == 6
+    assert done.stdout.count("already done") == 6
     after = {path: path.stat().st_mtime_ns for path in (copied / "out").glob("*.*")}
     changed = {path.name for path in before if before[path] != after[path]}
     assert changed == {"run.json"}
@@ -196,7 +196,7 @@ def test_file_missing(copied):
     (copied / "out" / "surface.tif").unlink()
     done = run(copied, *WORDS)
     assert (done.returncode, done.stderr) == (0, "")
-    steps = {line.split()[0]: "done before" in line for line in done.stdout.splitlines()}
+    steps = {line.split()[0]: "already done" in line for line in done.stdout.splitlines()}
     assert steps == {
         "adjust": False, "correct": True, "clean": True, "dsm": False, "compare": False,
         "map": False, "report": False,
@@ -210,7 +210,7 @@ def test_other_request(copied):
     assert (done.code, done.error.values["changed"]) == ("run.other", ["index"])
     done = run(copied, *WORDS, "--index", "1.33", "--overwrite")
     assert (done.returncode, done.stderr) == (0, "")
-    assert "done before" not in done.stdout
+    assert "already done" not in done.stdout
     record = json.loads((copied / "out" / "run.json").read_text())
     assert record["request"]["index"] == 1.33
 
@@ -348,7 +348,7 @@ def test_tiles(finished, tiled, tmp_path):
         assert before.items() < finished_in(out / "corrected").items()
         said = []
         pcfix.run(tiled / "cloud", out, say=said.append, **asked)
-    assert [line.split()[1:3] for line in said[1:]] == [["done", "before:"]] * 6
+    assert [line.split()[1:3] for line in said[1:]] == [["already", "done:"]] * 6
     for name in ("corrected", "cleaned"):
         whole = laspy.read(finished[0] / f"{name}.laz").points.array
         np.testing.assert_array_equal(records(*sorted((out / name).glob("*.laz"))), whole)

@@ -98,7 +98,7 @@ def test_resumed(scene, finished):
     folder, _ = finished
     said = []
     run_all(scene.whole(), folder, say=said.append)
-    assert sum("done before" in line for line in said) == len(STEPS)
+    assert sum("already done" in line for line in said) == len(STEPS)
 
 
 def test_auto(scene, tmp_path, monkeypatch):
@@ -123,7 +123,7 @@ def test_auto_without_datum(scene, tmp_path):
     assert not (tmp_path / "out" / "adjusted").exists()
     lines = [line for line in said if line.startswith("adjust")]
     assert len(lines) == 1
-    assert lines[0].startswith("adjust    not done: there is no datum")
+    assert lines[0].startswith("adjust    skipped: there is no datum")
     assert "not adjusted: there is no datum" in page.read_text()
 
 

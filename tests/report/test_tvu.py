@@ -76,7 +76,7 @@ def test_measured_replaces_predicted(summary):
     unknown = Summary(**vars(summary) | {"uncertainty": None})
     assert "predicted" not in uncertainty_sentence(unknown, far)
     few = tvu_of(np.full(FEWEST - 1, 0.01), np.full(FEWEST - 1, 2.0)).as_dict()
-    assert f"fewer than {FEWEST} points claim no order" in uncertainty_sentence(summary, few)
+    assert f"fewer than {FEWEST} points, too few for an order" in uncertainty_sentence(summary, few)
 
 
 def test_model_uncertainty(summary):

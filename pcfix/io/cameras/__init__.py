@@ -114,7 +114,7 @@ def read_cameras(
             elif cameras.rotations is None or form not in TAKE_SENSOR:
                 if source.sensor is not None and len(cameras):
                     why = "no angles" if cameras.rotations is None else "its own lenses"
-                    sentence = f"has {why}, so --sensor {sensor} has no use. Leave it out."
+                    sentence = f"has {why}, so --sensor {sensor} has no effect. Omit it."
                     raise bad_file(source.path, "cameras.sensor_unused", sentence, sensor=sensor)
             elif cameras.lenses is None and form == "table":
                 raise checks.no_sensor(source.path, "focal,sensor_x,sensor_y (mm)")
@@ -149,7 +149,7 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
     with reading(path):
         ties: TiePoints = reader_of(form).tie_points(source, cameras)
     if not len(ties.views.camera):
-        raise checks.no_tie_points(source.path, "its images saw no points")
+        raise checks.no_tie_points(source.path, "no point is visible in its images")
     return ties
 
 

@@ -163,7 +163,7 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
     twice = [p.label for p in photos if block_of.setdefault(p.label, p.key[0]) != p.key[0]]
     if twice or len({photo.srs for photo in photos}) > 1:
         why = f"image {twice[0]} is in several blocks" if twice else "it has several SRS"
-        sentence = f"{why}. Export the one block that the cloud was made from, in one SRS."
+        sentence = f"{why}. Export only the block of the cloud, in one SRS."
         raise bad_file(path, "cameras.several_blocks", sentence)
     gnss = None
     priors = {photo.key: photo.prior for photo in photos if photo.prior is not None}

@@ -109,9 +109,9 @@ def repeated(path: Path, labels: Sequence[str], dropped: int = 0) -> tuple[Pcfix
     names = [label for label, count in Counter(labels).items() if count > 1]
     if not names:
         return ()
-    copies = f"; {dropped} exact copies are dropped" if dropped else ""
+    copies = f"; {dropped} exact copies are ignored" if dropped else ""
     listed = ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
-    sentence = f"{len(names)} labels repeat ({listed}). Different positions stay{copies}."
+    sentence = f"{len(names)} labels repeat ({listed}). Different positions are all used{copies}."
     return (note(path, "cameras.repeated", sentence, labels=names, dropped=dropped),)
 
 
@@ -143,7 +143,7 @@ def unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
     with reading(archive.filename):
         entry = archive.getinfo(name)
         if entry.file_size > LARGEST_RATIO * (entry.compress_size + 1):
-            raise damaged(archive.filename, f"{name} unpacks to far too much")
+            raise damaged(archive.filename, f"{name} unpacks to an impossible size")
         return archive.read(entry)
 
 

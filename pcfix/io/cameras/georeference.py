@@ -241,7 +241,7 @@ def georeference(
     else:
         words = project.name
         found = _into(project, frame, project, cameras, offset, name, trusted=trusted)
-    sentence = f"no cloud names a CRS; it is taken to be in {words} as the cameras are."
+    sentence = f"the cloud names no CRS; that of the cameras is assumed ({words})."
     return replace(found, notes=(note(name, "cloud.crs_assumed", sentence), *found.notes))
 
 
@@ -296,9 +296,9 @@ def _assumed_heights(frame: Frame, target: CRS, project: CRS | None, trusted: bo
     other_datum = bool(axes) and max(axes) - min(axes) > 1.0
     is_guess = other_datum or (project is None and not frame.topocentric)
     if own == "unstated" and frame.crs.is_projected and size != 1.0:
-        return f"heights are taken to be in {unit}, as x and y are"
+        return f"heights are assumed to be in {unit}, like x and y"
     if own == "unstated" != cloud and not trusted:
-        return f"does not say what its heights are; taken to be the cloud's ({target.name})"
+        return f"names no vertical datum; that of the cloud is assumed ({target.name})"
     if own == "ellipsoidal" and cloud == "unstated" and is_guess and not trusted:
         return f"the cloud's CRS ({target.name}) names no vertical datum; ellipsoidal is assumed"
     return ""

@@ -101,5 +101,5 @@ def model_of(
         if is_alike and needed <= {*names} and (model.in_turn == lens.in_turn or not turns):
             return name, {one: values.get(one, 0.0) for one in names}
     kind = f"{lens.sensor or 'of the images'} ({lens.projection} in {lens.unit})"
-    sentence = f"the format cannot hold the lens {kind} exactly. Take another format."
+    sentence = f"the format cannot hold the lens {kind} exactly. Use another format."
     raise bad_file(path, "output.lens", sentence, lens=lens.sensor)

@@ -297,7 +297,7 @@ def aligned_images(chunk: Chunk) -> tuple[list[Image], tuple[str, ...], list[Pcf
             unused += 1
         else:
             images.append(Image(name, label, camera, sensor, home, pose, place))
-    why = "disabled, of a sensor that is no frame or fisheye, or in a component without transform"
+    why = "disabled, not from a frame or fisheye sensor, or in a component without transform"
     if not images:
         named = element.get("label") or "without a name"
         reason = f"{len(others) - unused} are not aligned, {unused} {why}"

@@ -116,7 +116,7 @@ def _calibration_file(path: Path, places: Sequence[Path]) -> Path:
     for place in places:
         if place.is_file():
             return place
-    sentence = f"its calibration '{places[0].name}' is not there. Copy it beside the orientation."
+    sentence = f"its calibration '{places[0].name}' is missing. Copy it next to the orientation."
     raise bad_file(path, "cameras.missing_file", sentence, file=places[0].name)
 
 

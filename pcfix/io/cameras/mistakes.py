@@ -78,7 +78,7 @@ def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str,
     plan = None if crs is None else parts(parse_crs(crs, "the cloud"))[0]
     if plan is None or not plan.is_projected:
         return
-    say = "; say so with --cameras-crs"
+    say = "; set it with --cameras-crs"
     others = [
         (f"longitude and latitude in degrees{say} EPSG:4326", 4326, centres),
         ("degrees, latitude before longitude; exchange the columns", 4326, swapped),

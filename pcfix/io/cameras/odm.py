@@ -234,7 +234,7 @@ def _read_shots(files: Files) -> Cameras:
         found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else None)
         plain += found is None
         lenses.append(found or lens_by_name({"f": focal * scale}, width, height))
-    sentence = f"cameras.json has no camera of {plain} images; they get a lens without distortion."
+    sentence = f"cameras.json has no camera of {plain} images; no distortion is assumed."
     said = note(files["poses"], "cameras.no_distortion", sentence, images=plain)
     gnss, listed = read_images(files.get("images.json"), labels)
     return Cameras(

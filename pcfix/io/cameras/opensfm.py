@@ -73,10 +73,10 @@ def read_reconstruction(path: Path) -> Reconstruction:
         panoramas = [k for k, shot in sets[best].items() if is_panorama(entries[shot["camera"]])]
         shots = {k: shot for k, shot in sets[best].items() if k not in set(panoramas)}
         if panoramas:
-            sentence = f"{len(panoramas)} images of all-round cameras are left out."
+            sentence = f"{len(panoramas)} images of spherical cameras are skipped."
             notes.append(checks.note(path, "cameras.panoramas", sentence, images=panoramas))
         if not shots:
-            raise checks.no_pose(path, "all images are of all-round cameras (spherical)")
+            raise checks.no_pose(path, "all images are of spherical cameras")
         lenses = {k: lens(path, k, entries[k]) for k in {shot["camera"] for shot in shots.values()}}
         rotations, shifts = _poses(chosen, shots)
         dops = {k: shot.get("gps_dop") for k, shot in shots.items()}
@@ -158,7 +158,7 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
     path, cameras, _, points = reconstruction
     beside = path.with_name("tracks.csv")
     if not points or not beside.is_file():
-        why = "it has no points" if not points else "tracks.csv is not beside it"
+        why = "it has no points" if not points else "there is no tracks.csv next to it"
         raise checks.no_tie_points(path, why)
     xyz = np.array([point["coordinates"] for point in points.values()], float).reshape(-1, 3)
     camera_of, point_of = (

@@ -150,7 +150,7 @@ def _frame_of(project: Project) -> tuple[AffineFrame, tuple[PcfixWarning, ...]]:
     said = checks.crs(path, scene["crs"]["definition"])
     crs, unit = (said, 1.0) if said == "local" else _with_heights(said, str(path))
     geoid_m = float(scene["crs"].get("geoid_height") or 0.0)
-    sentence = f"its heights are above a constant geoid, {geoid_m:g} m, taken for its CRS."
+    sentence = f"its heights refer to a constant geoid height of {geoid_m:g} m."
     geoid = note(path, "cameras.constant_geoid", sentence, geoid_m=geoid_m)
     size = [1.0, 1.0, unit] / scale
     frame = AffineFrame(np.diag(size), -shift * size, crs, None if crs == said else said)
@@ -180,7 +180,7 @@ def _lens(path: Path, sensor: Part, given: Part) -> Lens:
         lens = fisheye(values, [float(one) for one in inner["polynomial"]], *frame)
     else:
         what = f"the type {inner.get('type')!r:.40} of sensor {name}"
-        remedy = "Leave its images out and calibrate again"
+        remedy = "Remove its images and calibrate again"
         raise checks.unsupported(path, what, remedy, sensor=name)
     return replace(lens, sensor=name)
 

@@ -364,9 +364,9 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     files = _find(source)
     path = files.get("bingo") or files.get("ties")
     if path is None:
-        raise checks.no_tie_points(source.path, "no tp_bingo.txt or tp_pix4d.txt is beside it")
+        raise checks.no_tie_points(source.path, "no tp_bingo.txt or tp_pix4d.txt is next to it")
     if cameras.lenses is None:
-        raise checks.no_tie_points(path, "the cameras have no lenses, which it needs")
+        raise checks.no_tie_points(path, "it needs lenses, and the cameras have none")
     labels = list(enumerate(cameras.labels))[::-1]  # of equal names the first counts
     rows = {PurePath(label).stem: i for i, label in labels} | {label: i for i, label in labels}
     with checks.reading(path):

@@ -126,7 +126,7 @@ def write_table(folder: File, cameras: Cameras) -> None:
     given, *others = dict.fromkeys(lenses)
     if others:
         sentence = (
-            f"a table holds one lens, the images have {1 + len(others)}. Take another format."
+            f"a table holds one lens, but the images have {1 + len(others)}. Use another format."
         )
         raise bad_file(target, "output.lens", sentence)
     is_mm = given.unit == "mm"

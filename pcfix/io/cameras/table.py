@@ -166,7 +166,7 @@ def open_table(path: Path) -> Table:
     for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
         alike = [name for name in table.header if name in spellings]
         if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
-            sentence = f"the columns {', '.join(alike)} may all be {role}. Take out all but one."
+            sentence = f"the columns {', '.join(alike)} may all be {role}. Remove all but one."
             raise bad_file(path, "table.columns_alike", sentence, columns=alike)
     if table.has(*TRANSLATION) and axes(table.place) is None:
         sentence = "tx, ty, tz may be translations. Give the projection centres as x, y, z."

@@ -65,7 +65,7 @@ COLUMNS = (
     Column("RayCount", "ray_count", "uint16", 1.0, "rays intersected", True),
     Column("SourceClass", "", "uint8", 1.0, "class before the correction"),
 )  # fmt: skip
-UNSURE = Column("Unsure", "unsure", "uint8", 1.0, "withheld: only flat rays see it")
+UNSURE = Column("Unsure", "unsure", "uint8", 1.0, "withheld: only oblique rays")
 """Written where such points are withheld."""
 SHIFTS = ("ShiftX", "ShiftY", "ShiftZ")
 MINIMAL = ("ShiftZ", "RayCount")
