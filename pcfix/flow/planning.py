@@ -258,7 +258,7 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
         notes.append(PcfixWarning("cloud.corrected_before", sentence, ratio=ratio))
     hint = hint_of((plan.options.software or view.software,))
     if plan.kind is None:
-        survey, verdicts = learning.learn_of_sample(sample, view.points, ties, hint, near)
+        survey, verdicts = learning.learn_of_sample(sample, ties, hint, near)
         notes += _note_flat(sample, survey)
         return replace(plan, survey=survey, verdicts=verdicts, notes=tuple(notes))
     survey = learning.with_matcher(sample, ties)
@@ -267,7 +267,7 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
         settings = learning.resolved(given, plan.cameras, None)
         bare = replace(survey, settings=settings, learned=learned)
         unlisted, verdicts = learning.learn_of_sample(
-            replace(sample, survey=bare), view.points, ties, hint, near
+            replace(sample, survey=bare), ties, hint, near
         )
         survey = replace(survey, parts={UNLISTED: unlisted})
         words = ["Points missing in the view list are corrected without it.", *map(str, verdicts)]
@@ -295,7 +295,7 @@ def _note_flat(sample: Batch, survey: Survey) -> list[PcfixWarning]:
 
 def _scanned(
     plan: Plan, chunks: Chunks, *, sample: bool, occluder: bool
-) -> tuple[Batch | None, learning.Near | None, Occluder | None]:
+) -> tuple[Batch | None, Batch | None, Occluder | None]:
     """Read the whole cloud once, for a sample of it and for the surface that hides points.
 
     The sample is evenly spread over the order of the cloud, without noise. If its points may be too
@@ -339,6 +339,6 @@ def _scanned(
         row += len(points.xyz)
     return (
         stacked(taken) if sample else None,
-        None if squares is None else learning.Near(squares.all(), near_step),
+        None if squares is None else squares.all(),
         None if builder is None else builder.build(),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -115,35 +115,19 @@ def wants_matcher(survey: Survey, views: ViewKind | None) -> bool:
     return compared or (dense and settings.method == "consistent")
 
 
-class Near(NamedTuple):
-    """Submerged points with their neighbours, and how many points of the cloud each represents."""
-
-    batch: Batch
-    step: float
-
-    def of_source(self, source: int) -> Near:
-        """Return those of one point source."""
-        rows = np.flatnonzero(self.batch.source == source)
-        return Near(replace(self.batch.take(rows), source=None), self.step)
-
-
 def learn_of_sample(
-    batch: Batch,
-    points: int,
-    ties: TiePoints | None = None,
-    hint: Hint | None = None,
-    near: Near | None = None,
+    batch: Batch, ties: TiePoints | None = None, hint: Hint | None = None, near: Batch | None = None
 ) -> tuple[Survey, tuple[Verdict, ...]]:
     """Resolve ``auto`` and estimate the partners of the images and the bed, as needed.
 
-    The batch are points of the whole cloud of `points` points, evenly spread, with land; their view
-    lists have a kind. `ties` are tie points of the original model; by default the points show which
-    images overlap. `hint` is the type that the software is known for, `near` are points for the
-    detection of the type, if those of the batch are too far apart. Returns the survey without
-    ``auto`` and the verdicts.
+    The batch are points of the whole cloud, evenly spread, with land; their view lists have a kind.
+    `ties` are tie points of the original model; by default the points show which images overlap.
+    `hint` is the type that the software is known for, `near` are submerged points with their
+    neighbours for the detection of the type, if those of the batch are too far apart. Returns the
+    survey without ``auto`` and the verdicts.
     """
     if batch.views is None and batch.survey.settings.method == "auto":
-        found = _learn_of_sources(batch, points, ties, hint, near)
+        found = _learn_of_sources(batch, ties, hint, near)
         if found is not None:
             return found
     survey = batch.survey
@@ -155,8 +139,8 @@ def learn_of_sample(
         verdict = weigh_lists(sample, is_open=False)
         survey = with_verdict(survey, verdict)
         return survey, () if verdict is None else (verdict,)
-    near = near or Near(sample, points / max(len(batch), 1))
-    survey, verdicts = _weighed(replace(near.batch, survey=survey), near.step, hint)
+    of_type = sample if near is None else replace(near, survey=survey)
+    survey, verdicts = _weighed(of_type, hint)
     settings, learned = survey.settings, survey.learned._replace(land=None)
     if batch.original_model is not None:
         # land has the reconstruction type of the cloud, also where a formula corrects the bed
@@ -189,7 +173,7 @@ MOST_SOURCES = 8
 
 
 def _learn_of_sources(
-    batch: Batch, points: int, ties: TiePoints | None, hint: Hint | None, near: Near | None
+    batch: Batch, ties: TiePoints | None, hint: Hint | None, near: Batch | None
 ) -> tuple[Survey, tuple[Verdict, ...]] | None:
     """Learn from each point source separately; None if all have one reconstruction type."""
     if batch.source is None:
@@ -201,9 +185,9 @@ def _learn_of_sources(
         return None
     surveys, verdicts = dict[int, Survey](), list[Verdict]()
     for one in large.tolist():
-        part = replace(batch.take(np.flatnonzero(batch.source == one)), source=None)
-        own, of_it = points * len(part) // len(batch), near and near.of_source(one)
-        surveys[one], told = learn_of_sample(part, own, ties, hint, of_it)
+        part = _of_source(batch, one)
+        own = None if near is None else _of_source(near, one)
+        surveys[one], told = learn_of_sample(part, ties, hint, own)
         of = f"point source {one} ({100.0 * len(part) / len(batch):.0f} % of the points)"
         verdicts += [verdict._replace(of=of) for verdict in told]
     if len({verdict.chosen.words for verdict in verdicts if verdict.is_sure}) < 2:
@@ -213,31 +197,36 @@ def _learn_of_sources(
     return replace(surveys[most], parts=others), tuple(verdicts)
 
 
-def _weighed(sample: Batch, step: float, hint: Hint | None) -> tuple[Survey, tuple[Verdict, ...]]:
+def _of_source(batch: Batch, source: int) -> Batch:
+    """Return the points of one point source."""
+    return replace(batch.take(np.flatnonzero(batch.source == source)), source=None)
+
+
+def _weighed(sample: Batch, hint: Hint | None) -> tuple[Survey, tuple[Verdict, ...]]:
     """Resolve ``auto`` and set the model uncertainty, for submerged points without lists."""
     survey, verdicts = sample.survey, list[Verdict | None]()
     if survey.settings.method == "auto":
         reconstructions = reconstructions_of(sample)
-        verdicts.append(weigh(sample, reconstructions, step, hint=hint))
+        verdicts.append(weigh(sample, reconstructions, hint=hint))
         survey = with_verdict(survey, verdicts[0], reconstructions[0])
         if len(reconstructions) > 1:
             return survey, tuple(filter(None, verdicts))
     if _wants_limit(survey.settings, None):
         # which rays were used in the reconstruction does not depend on the formula: test by snell
         sample = replace(sample, survey=survey)
-        limit = weigh(sample, LIMITS, step)
+        limit = weigh(sample, LIMITS)
         if limit is not None and limit.chosen == LIMITS[1] and limit.is_strong:
             survey = replace(survey, learned=survey.learned._replace(limit_deg=FLAT_DEG))
             verdicts.append(limit)
         elif survey.settings.dimensions == "all" and not _wants_comparison(survey):
             # no reconstruction types are compared: the uncertainty is that of the rays
-            free = weigh(sample, LIMITS, step, given=LIMITS[0])
+            free = weigh(sample, LIMITS, given=LIMITS[0])
             if free is not None:
                 learned = survey.learned._replace(model_uncertainty=free.model_uncertainty)
                 survey = replace(survey, learned=learned)
     if _wants_comparison(survey):
         sample = replace(sample, survey=survey)
-        verdicts.append(weigh(sample, IN_FRAME, step, given=type_given(sample)))
+        verdicts.append(weigh(sample, IN_FRAME, given=type_given(sample)))
         survey = with_verdict(survey, verdicts[-1])
     return survey, tuple(filter(None, verdicts))
 
@@ -319,7 +308,7 @@ def weigh_lists(batch: Batch, *, is_open: bool) -> Verdict | None:
     None if there are too few points, or nothing is to be decided.
     """
     if is_open and batch.survey.settings.method == "consistent":
-        return weigh(batch, reconstructions_of(batch), 1.0)
+        return weigh(batch, reconstructions_of(batch))
     if not _wants_comparison(batch.survey):
         return None
-    return weigh(batch, reconstructions_of(batch), 1.0, given=type_given(batch))
+    return weigh(batch, reconstructions_of(batch), given=type_given(batch))

@@ -58,7 +58,6 @@ class Patches(NamedTuple):
 
     rows: IntArray  # (m,), the rows of a batch that are in a patch
     place: IntArray  # (p, 32) or (p, 16), rows of `rows`, patch by patch
-    step: int  # one in so many points of the batch was taken
 
 
 def patches_of(batch: Batch, *, at_borders: bool) -> Patches | None:
@@ -101,7 +100,7 @@ def _patches_of(batch: Batch, points: int, at_borders: bool) -> Patches | None:
     if batch.views is None and is_wide:
         return None
     rows, place = np.unique(patch, return_inverse=True)
-    return Patches(rows, place.reshape(patch.shape), step)
+    return Patches(rows, place.reshape(patch.shape))
 
 
 def _border_distance_m(xy: FloatArray, centres: FloatArray) -> FloatArray:
@@ -215,15 +214,6 @@ def smooth_surfaces(patch: FloatArray) -> FloatArray:
 def _rest(smooth: FloatArray, z: FloatArray) -> FloatArray:
     """Return what is left of heights, (p, k), without the nearest smooth surface."""
     return z - np.einsum("pki,pi->pk", smooth, np.einsum("pki,pk->pi", smooth, z))
-
-
-def spacing_gsd(part: Batch, place: IntArray, step: float) -> float:
-    """Return the spacing of the points of the cloud, in ground pixels.
-
-    `step` says how many points of the cloud there are for each of these.
-    """
-    extent = np.ptp(part.xyz[place, :2], axis=1).prod(axis=1)
-    return math.sqrt(float(np.median(extent)) / place.shape[1] / step) / gsd_m(part)
 
 
 def grid_m(xyz: FloatArray) -> float | None:

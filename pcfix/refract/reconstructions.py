@@ -23,12 +23,9 @@ from pcfix.refract.patches import SMOOTH_GSD, Patches, scatter_m, shares
 
 SURE = 2.3264
 """Standard errors of a significant difference: 99 %."""
-SPACING_GSD, PRIOR_SPARSE = (8.0, 14.0), 8.0
-"""What a large spacing of the points counts against single maps, in standard errors: their clouds
-are dense, and neighbours that are far apart show little of their scatter."""
-PRIOR_TRACKS, PRIOR_SOFTWARE = (-0.5, 0.7), 1.0
-"""What a small and a large spacing count for tracks, as tie points are tens of pixels apart, and
-what the software counts."""
+PRIOR_SPARSE, PRIOR_TRACKS, PRIOR_SOFTWARE = 8.0, (-0.5, 0.7), 1.0
+"""In standard errors: against single maps in a sparse cloud, as theirs are dense; for tracks in a
+dense and in a sparse one, as tie points are tens of pixels apart; and for the software."""
 SHARE_ERROR = 0.08
 """Standard error of a share from what the models neglect."""
 WEAK = 3.0
@@ -281,14 +278,13 @@ class _Beds(NamedTuple):
 def weigh(
     batch: Batch,
     reconstructions: tuple[Reconstruction, ...],
-    step: float,
     *,
     given: Reconstruction | None = None,
     hint: Hint | None = None,
 ) -> Verdict | None:
     """Choose the reconstruction that best explains the points, or test the one set by the user.
 
-    The submerged points are evenly spread over the cloud, and each represents `step` of its points;
+    The submerged points are evenly spread over the cloud, and
     `batch.survey.learned` has the matcher. `given` is set by the user, `hint` decides if the points
     do not. None with a single type, or too few points for patches.
     """
@@ -302,11 +298,8 @@ def weigh(
     part = batch.take(sample.rows)
     survey = replace(part.survey, level_offset_m=None)
     part = replace(part, survey=survey, level_sigma_m=None)
-    sparse = 1.0
-    if part.survey.cameras.lenses is not None:
-        spacing = patches.spacing_gsd(part, sample.place, step * sample.step)
-        sparse = float(np.interp(np.log(spacing), np.log(SPACING_GSD), (0.0, 1.0)))
-    beds = _beds(part, replace(batch, survey=part.survey), sample, types, sparse)
+    is_dense = sample.place.shape[1] == patches.PATCH_POINTS[0]
+    beds = _beds(part, replace(batch, survey=part.survey), sample, types)
     if beds is None or (given is not None and given not in beds.types):
         return None
     remarks, among, by = _remarks(part, sample.place), list(range(len(beds.types))), ""
@@ -314,7 +307,7 @@ def weigh(
         beds = beds._replace(errors=beds.errors / WEAK)
     if given is None:
         if part.views is None and reconstructions is not LIMITS:
-            beds, by = _with_prior(beds, sparse, hint)
+            beds, by = _with_prior(beds, is_dense, hint)
         best, other = beds.rank(among)
     else:
         best = beds.types.index(given)
@@ -350,12 +343,9 @@ def weigh(
 
 
 def _beds(
-    part: Batch, batch: Batch, sample: Patches, types: tuple[Reconstruction, ...], sparse: float
+    part: Batch, batch: Batch, sample: Patches, types: tuple[Reconstruction, ...]
 ) -> _Beds | None:
-    """Correct the points of the patches for each type; None if fewer than two can.
-
-    The cloud is dense (0) or `sparse` (1), or in between.
-    """
+    """Correct the points of the patches for each type; None if fewer than two can."""
     around = patches.others_around(batch, sample.rows)
     z = np.array([_heights(part, around, one) for one in types])
     covered = np.isfinite(z).sum(axis=1)
@@ -371,13 +361,13 @@ def _beds(
     errors = (0.5 - share) / np.maximum(sigma, 1e-9)
     if part.views is None and LIMITS[0] not in types:
         errors = (0.5 - share) / np.hypot(sigma, SHARE_ERROR)
-        likely = [_log_likelihood(part, place, one, z[i]) for i, one in enumerate(types)]
-        from_maps = np.array([one.words not in (_TRACKS, _PAIRS) for one in types])
-        # the maps of a point are chosen by a smooth bed: their likelihood allows for that, the
-        # discontinuities do not; but neighbours that are far apart show little of their scatter
-        for a, b in zip(*np.nonzero(from_maps[:, None] | from_maps), strict=True):
-            by_scatter = standard_errors(likely[a], likely[b])
-            errors[a, b] = sparse * errors[a, b] + (1.0 - sparse) * by_scatter
+        # The maps of a point are chosen by a smooth bed: their likelihood allows for that, the
+        # discontinuities do not. But neighbours in sparse clouds show little of their scatter.
+        if place.shape[1] == patches.PATCH_POINTS[0]:
+            likely = [_log_likelihood(part, place, one, z[i]) for i, one in enumerate(types)]
+            from_maps = np.array([one.words not in (_TRACKS, _PAIRS) for one in types])
+            for a, b in zip(*np.nonzero(from_maps[:, None] | from_maps), strict=True):
+                errors[a, b] = standard_errors(likely[a], likely[b])
     np.fill_diagonal(share, -np.inf)
     np.fill_diagonal(errors, np.inf)
     return _Beds(types, z, place, len(place), share, sigma, errors)
@@ -404,11 +394,15 @@ def _log_likelihood(part: Batch, place: IntArray, one: Reconstruction, z: FloatA
     return log_likelihood(terms, part.xyz[place, 2], level, each, patches.gsd_m(part))
 
 
-def _with_prior(beds: _Beds, sparse: float, hint: Hint | None) -> tuple[_Beds, str]:
-    """Add what is known of the types by spacing and software; return what decided, if these did."""
+def _with_prior(beds: _Beds, is_dense: bool, hint: Hint | None) -> tuple[_Beds, str]:
+    """Add what is known of the types by density and software; return what decided, if these did."""
     words = [one.words for one in beds.types]
     is_single, tracks = _is_single(beds.types), np.array([one == _TRACKS for one in words])
-    prior = np.interp(sparse, (0.0, 1.0), PRIOR_TRACKS) * tracks - sparse * PRIOR_SPARSE * is_single
+    prior = (
+        PRIOR_TRACKS[0] * tracks
+        if is_dense
+        else PRIOR_TRACKS[1] * tracks - PRIOR_SPARSE * is_single
+    )
     errors = beds.errors + prior[:, None] - prior
     if hint is not None:
         likely = np.array([PRIOR_SOFTWARE * (one in hint.words) for one in words])

@@ -46,7 +46,7 @@ def detected(kind: str, block: str, seed: int, points: int) -> tuple[str, float,
     xyz, water = scene.xyz[rows], scene.water
     settings = ScienceOptions(method="auto", index=scene.refractive_index)
     batch = Batch(xyz, surface_above(water, xyz), Survey(water, scene.cameras, settings))
-    _, verdicts = learn_of_sample(batch, len(xyz))
+    _, verdicts = learn_of_sample(batch)
     found = pcfix.correct_points(
         xyz, scene.cameras, water, method="auto", index=scene.refractive_index
     )

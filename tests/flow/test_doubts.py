@@ -150,7 +150,7 @@ def gridded(scene, step_m):
 def told(xyz, scene):
     above = surface_above(scene.water, xyz)
     batch = Batch(xyz, above, Survey(scene.water, scene.cameras, ScienceOptions()))
-    return learn_of_sample(batch, len(xyz))[1]
+    return learn_of_sample(batch)[1]
 
 
 def test_grid():

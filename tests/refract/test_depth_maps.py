@@ -218,7 +218,7 @@ def test_any_chunk():
     settings = ScienceOptions(method="consistent", camera_set="mvs", dimensions="none")
     above = surface_above(scene.water, scene.xyz)
     whole = Batch(scene.xyz, above, Survey(scene.water, scene.cameras, settings))
-    survey, _ = learn_of_sample(whole, len(whole))
+    survey, _ = learn_of_sample(whole)
     part = replace(whole, survey=survey).take(np.flatnonzero(is_submerged(scene.xyz[:, 2], above)))
     listed = replace(scene.views.take(np.arange(len(part))), kind="depth-maps")
     for one in (part, replace(part, views=listed)):

@@ -22,7 +22,7 @@ AUTO = ScienceOptions(method="auto", index=1.34)
 
 def told(xyz, cameras, water, settings=AUTO):
     batch = Batch(xyz, surface_above(water, xyz), Survey(water, cameras, settings))
-    survey, verdicts = learn_of_sample(batch, len(xyz))
+    survey, verdicts = learn_of_sample(batch)
     return survey.settings, verdicts[0] if verdicts else None
 
 
@@ -69,9 +69,9 @@ def test_software_is_a_prior():
     rows = np.diff(scene.views.start) > 0
     xyz, water = scene.xyz[rows], scene.water
     batch = Batch(xyz, surface_above(water, xyz), Survey(water, scene.cameras, AUTO))
-    _, (free,) = learn_of_sample(batch, len(xyz))
-    _, (against,) = learn_of_sample(batch, len(xyz), hint=hint_of(("openmvs",)))
-    _, (agreeing,) = learn_of_sample(batch, len(xyz), hint=hint_of(("SURE 5.0",)))
+    _, (free,) = learn_of_sample(batch)
+    _, (against,) = learn_of_sample(batch, hint=hint_of(("openmvs",)))
+    _, (agreeing,) = learn_of_sample(batch, hint=hint_of(("SURE 5.0",)))
     assert free.chosen is against.chosen is agreeing.chosen is IN_FRAME[3]
     assert against.errors <= free.errors <= agreeing.errors
 
