@@ -81,8 +81,8 @@ DOUBTED = {
 }
 """Of the sample scene, which has neither tie points nor GNSS positions."""
 UNCHECKED = {
-    "47 m too high": "heights (no tie points; by them 129 m above the cloud)",
-    "feet": "heights (no tie points; by them 26",
+    "47 m too high": "heights (no tie points; cameras 129 m above the cloud)",
+    "feet": "heights (no tie points; cameras 26",
     "yaw + 90": "yaw (the images lie across the flight lines)",
     "40 m beside": "a shift in plan (the frames reach far beyond the cloud)",
 }
