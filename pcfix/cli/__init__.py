@@ -9,6 +9,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Sequence
+from threading import Timer
 from typing import Any
 
 from cyclopts import App, CycloptsError
@@ -96,6 +97,13 @@ def _end_by_signals(ended: list[int]) -> None:
     """
 
     def end(number: int, frame: Any) -> None:
+        caller = frame
+        while caller is not None:
+            if "llvmlite" in caller.f_code.co_filename:
+                # an exception in a callback of LLVM would crash the process: once more, later
+                Timer(0.05, signal.raise_signal, (number,)).start()
+                return
+            caller = caller.f_back
         ended.append(number)
         raise _EndedError(number)
 

@@ -63,7 +63,7 @@ from pcfix.refract.batch import (
     to_original,
 )
 from pcfix.refract.likelihood import Candidates
-from pcfix.refract.matcher import LEAST_NEAR, Matcher
+from pcfix.refract.matcher import LEAST_NEAR, NEAR, Matcher
 from pcfix.refract.rays import light_near, refracted
 from pcfix.refract.tiling import TILE, are_same, put, slots, three
 
@@ -148,7 +148,8 @@ def invert_depth_maps(batch: Batch) -> Intersection:
     The views of the batch are, if their kind is depth-maps, the images whose maps were fused, with
     their weights; else all images that see each point. `batch.survey.learned` has the matcher and
     perhaps the bed of the surroundings; without it the largest group made a point. The surface
-    above each point is taken as a plane. The rays of the result are the maps with a weight.
+    above each point is taken as a plane. The rays of the result are the maps with a weight or, of
+    a single map, its image and the visible ones that it can have been matched with: at most `NEAR`.
     """
     rays, bed = batch.rays, batch.survey.learned.bed
     listed = rays.kind == "depth-maps"
@@ -160,7 +161,8 @@ def invert_depth_maps(batch: Batch) -> Intersection:
     none: FloatArray = np.zeros((0, 0), np.float32)
     _invert_all(batch, listed, given, result, none)
     few = np.flatnonzero(result[:, OUTCOME] == ONE_CAMERA)
-    if batch.survey.settings.matcher in SINGLE and not listed and len(few):
+    is_single = batch.survey.settings.matcher in SINGLE and not listed
+    if is_single and len(few):
         # no image shows the point with `LEAST_NEAR` others: at the edge of the block
         again = np.zeros((len(few), COLUMNS))
         _invert_all(batch.take(few), listed, given[few], again, none, least=1)
@@ -168,9 +170,10 @@ def invert_depth_maps(batch: Batch) -> Intersection:
     outcome = result[:, OUTCOME].astype(np.uint8)
     found = batch.result(result[:, :3], outcome=outcome, ray_miss_m=result[:, _DISTANCE])
     moved = outcome == CORRECTED
+    count = np.minimum(batch.counts, 1 + NEAR) if is_single else result[:, _COUNT]
     return found._replace(
         ambiguity_m=np.where(moved, result[:, AMBIGUITY], 0.0),
-        ray_count=np.where(moved, result[:, _COUNT], 0).astype(np.int32),
+        ray_count=np.where(moved, count, 0).astype(np.int32),
     )
 
 

@@ -141,6 +141,7 @@ def test_river(tmp_path):
     done = run_pcfix(
         "correct", tmp_path / "points.las", out, "--cameras", RIVER / "cameras.csv",
         "--water", "dim:w_surf", "--index", "1.337", "--max-angle", "35",
+        "--method", "consistent", "--camera-set", "all",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("\n") == 1  # the labels that occur twice

@@ -183,3 +183,13 @@ def test_list_of_base_images():
     error = (found.xyz - scene.true_xyz[rows])[deep, 2] / scene.gsd_m
     assert abs(error.mean()) < 0.5
     assert np.sqrt(np.mean(error**2)) < 2.0
+
+
+def test_rays_of_single_maps():
+    """Their images were matched with others: 'pcfix clean' takes points of fewer rays for noise."""
+    scene = simulated(8000, cloud="single-map", seed=1, lidar_per_m2=0.0, sensor_px=(1824, 1216))
+    found = pcfix.correct_points(
+        scene.xyz, scene.cameras, scene.water, method="consistent", matcher="single-map"
+    )
+    rays = found.ray_count[found.corrected]
+    assert rays.min() >= 2 and np.median(rays) == 13
