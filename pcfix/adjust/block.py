@@ -419,7 +419,7 @@ def used_as_dry(
 ) -> list[str]:
     """Return the names of points below the water that are not marked as under water.
 
-    An adjustment without water that used them is bent, as its images show them higher.
+    Their images show them too high, so an adjustment without water that used them is wrong.
     """
     level = surface_above(water, control.xyz).height_m
     least = level - 3.0 * np.hypot(control.sigma_m[:, 2], level_sigma_m)

@@ -127,7 +127,7 @@ def _pulls_of(
 
     The first is that with the weighted residuals `drawn`, shape (o, 2), instead of those found.
     Then, for shifts along u and v of the t tiles of the frame: B', shape (2 t, 6 k + g), and C
-    beside their right sides, shape (2 t, 2 t + 1).
+    with their right sides, shape (2 t, 2 t + 1).
     """
     size, count = 6 * len(problem.moves) + problem.given.shared, 2 * (int(frame.max(initial=0)) + 1)
     pulls = [np.zeros((int(group.max(initial=0)) + 1, size)) for group in groups]

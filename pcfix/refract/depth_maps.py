@@ -90,7 +90,7 @@ SHALLOW, DEEP = 0.3, 3.5
 """Range of the bed of the surroundings, in likely heights; outliers have it elsewhere."""
 
 _ROUNDS, _BEDS = 4, 3
-FAR = 0.1  # of the way to the bed: farther off, it is decided anew which depths were averaged
+FAR = 0.1  # of the way to the bed: farther off, the averaged depths are chosen again
 
 SINGLE = ("single-map", "nearest-map")
 """Names of `pcfix.options` for software that keeps one map at each place."""

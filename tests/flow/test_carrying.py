@@ -12,6 +12,7 @@ import pcfix
 from pcfix.flow.inputs import Inputs, both_models
 from pcfix.model import Cameras, Outcome, Views
 from pcfix.report.text import summary_text
+from tests.flow.test_adjust_shared import errors_gsd
 from tests.utils.beyond_frames import BEYOND_FRAMES
 from tests.utils.clouds import (
     EAST_M,
@@ -226,7 +227,7 @@ def test_offset(tmp_path, old, local, said):
 @true
 @pytest.mark.parametrize("views", mostly_nightly([None, "dense.vis"], "dense.vis"))
 def test_rendered_block(tmp_path, views):
-    """With true poses; before, land lies 19 GSD (of 5 cm) too low and the bed is 27 off."""
+    """With true poses; without the transfer land is 19 GSD (of 5 cm) too low, the bed 27 off."""
     told = pcfix.correct_file(
         FREE / "cloud.las", tmp_path / "out.las", cameras=TRUE / "colmap", water=0.37,
         adjusted_from=FREE / "sparse", cameras_offset=tuple(np.loadtxt(FREE / "offset.txt")),
@@ -241,20 +242,3 @@ def test_rendered_block(tmp_path, views):
     assert told.transfer["shift_m"]["mean_z"] > 1.0
     pcfix.restore_file(tmp_path / "out.las", tmp_path / "back.las")
     assert (tmp_path / "back.las").read_bytes() == (FREE / "cloud.las").read_bytes()
-
-
-def errors_gsd(las):
-    """Return height errors against the true surface, bed and land apart, in GSD of 5 cm."""
-    import rasterio
-    from scipy.interpolate import RegularGridInterpolator
-
-    with rasterio.open(TRUE / "truth_dsm.tif") as truth:
-        heights, way = truth.read(1).astype(float), truth.transform
-    rows = (np.arange(len(heights)) + 0.5, np.arange(heights.shape[1]) + 0.5)
-    at = RegularGridInterpolator(rows, heights, bounds_error=False)
-    xyz = np.array(las.xyz)
-    column, row = (xyz[:, 0] - way.c) / way.a, (xyz[:, 1] - way.f) / way.e
-    z = at(np.column_stack([row, column]))
-    error = (xyz[:, 2] - z) / 0.05
-    known = np.isfinite(error)
-    return error[known & (z < 0.27)], error[known & (z > 0.47)]
