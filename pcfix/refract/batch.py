@@ -259,6 +259,13 @@ class Intersection(NamedTuple):
         known.pop("camera_used")
         return self._replace(**{name: value[rows] for name, value in known.items()})
 
+    def with_rows(self, rows: IntArray, other: Intersection) -> Intersection:
+        """Return the results with those of some points replaced, in the same arrays."""
+        for name, value in other._asdict().items():
+            if value is not None and name != "camera_used":
+                getattr(self, name)[rows] = value
+        return self._replace(camera_used=self.camera_used | other.camera_used)
+
 
 @kernel
 def _incidence(span: Span, points: Chosen, cosine: FloatArray) -> None:

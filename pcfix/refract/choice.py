@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +24,7 @@ from pcfix.options.correct import ScienceOptions
 from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Chosen, Survey, normal_above
 from pcfix.refract.rays import light_near, pierce
-from pcfix.refract.tiling import TILE
+from pcfix.refract.tiling import TILE, three
 from pcfix.water.surface import Field, SurfaceAbove, Tin, build_fields, build_tin
 
 NOMINAL_FOCAL_PX = 3700.0
@@ -98,21 +97,25 @@ def shapes_of(survey: Survey) -> tuple[Tin | None, Field | None]:
     )
 
 
-def chosen_views(batch: Batch) -> Views:
+def chosen_views(batch: Batch, shift_m: FloatArray | None = None) -> Views:
     """Return the cameras whose rays each point gets, as a list.
 
     Those of the list of the batch, in its order and with its weights, that can have imaged the
-    point (`pcfix.lens.frames.BESIDE`); or, without a list, all in whose frame the point lies.
+    point (`pcfix.lens.frames.BESIDE`); or, without a list, all in whose frame the point lies. With
+    `shift_m`, shape (m, 3), the frames hold the image of the true point instead, which is the
+    apparent one plus the shift.
     """
     survey, views = batch.survey, batch.views
     if not len(survey.cameras):
         return Views(np.zeros(len(batch) + 1, np.int64), np.zeros(0, np.int64))
     points, rig = (tiling.spatial_order(batch.xyz), batch.chosen()), rig_of(survey)
     frames = frames_of(survey.cameras) if views is None else listed_frames_of(survey.cameras)
+    wide = frames if shift_m is None else frames_of(narrower(survey.cameras, -REACH))
+    shift = np.zeros((0, 3)) if shift_m is None else shift_m
     tiles = tiling.tiles_of(batch)
     first, count = np.zeros(tiles + 1, np.int64), np.zeros(len(batch) + 1, np.int64)
     if views is None:
-        in_tiles(_make_room, tiles, points, rig, frames, first)
+        in_tiles(_make_room, tiles, points, rig, wide, first)
         begin = np.empty(len(batch), np.int64)
         place = np.empty(np.cumsum(first, out=first)[-1], np.int32)
     else:
@@ -120,7 +123,8 @@ def chosen_views(batch: Batch) -> Views:
         place = np.empty(len(views.camera), np.int32)
     found = first, begin, count, place
     in_tiles(
-        _choose_all, tiles, points, rig, frames, rule_of(survey), *shapes_of(survey), found
+        _choose_all, tiles, points, rig, frames, wide, shift, rule_of(survey), *shapes_of(survey),
+        found,
     )  # fmt: skip
     start = np.cumsum(count)
     # tiles left gaps between the entries of their points
@@ -141,29 +145,17 @@ def views_in_frame(xyz: FloatArray, cameras: Cameras) -> Views:
 
 
 def near_borders(batch: Batch, shift_m: FloatArray) -> IntArray:
-    """Return the points that are imaged in other frames than their apparent points would be.
+    """Return the points whose images lie in other frames than the apparent points do.
 
     The true points are the apparent ones plus `shift_m`, shape (m, 3).
     """
     survey, found = batch.survey, np.zeros(len(batch), np.bool_)
+    frames = (frames_of(narrower(survey.cameras, share)) for share in (0.0, -REACH, REACH))
     in_tiles(
         _find_near_borders, tiling.tiles_of(batch), tiling.spatial_order(batch.xyz), batch.chosen(),
-        rig_of(survey), frames_of(survey.cameras), frames_of(narrower(survey.cameras, -REACH)),
-        frames_of(narrower(survey.cameras, REACH)), shift_m, found, points=len(batch),
+        rig_of(survey), *frames, shift_m, found, points=len(batch),
     )  # fmt: skip
     return np.flatnonzero(found)
-
-
-def views_of_images(batch: Batch, shift_m: FloatArray) -> Views:
-    """Return the cameras whose frames hold the images of the true points, see `near_borders`."""
-    survey = batch.survey
-    wider = replace(survey, cameras=narrower(survey.cameras, -REACH))
-    views = chosen_views(replace(batch, survey=wider))
-    held = np.zeros(len(views.camera), np.bool_)
-    points = replace(batch, views=views).chosen()
-    in_tiles(_hold, len(batch), points, rig_of(survey), frames_of(survey.cameras), shift_m, held)
-    start = np.concatenate([[0], np.cumsum(held)])[views.start]
-    return Views(start, views.camera[held])
 
 
 def cameras_of_pairs(pairs: Views) -> Views:
@@ -192,29 +184,36 @@ def _make_room(
 
 @kernel(allocates=True)
 def _choose_all(
-    span: Span, given: tuple[IntArray, Chosen], rig: Rig, frames: Frames, rule: Rule,
-    tin: Tin | None, fields: Field | None,
+    span: Span, given: tuple[IntArray, Chosen], rig: Rig, frames: Frames, wide: Frames,
+    shift: FloatArray, rule: Rule, tin: Tin | None, fields: Field | None,
     found: tuple[IntArray, IntArray, IntArray, npt.NDArray[np.int32]],
 ) -> None:  # fmt: skip
     """Choose the cameras of each point, a tile at a time.
 
-    Fills in where the entries of point i begin, how many they are (at i + 1), and the entries. An
+    With shifts the frames hold the images of the true points, and the frames `wide` may hold them
+    where they hold the tile. Fills in where the entries of point i begin, how many they are (at i + 1), and the entries. An
     entry is the number of a camera or, with view lists, that of one of their entries.
     """
     (order, points), (first, begin, count, place) = given, found
     start, camera = points.start, points.camera
     low, high = tiling.corners_of(order[span[0] * TILE : span[1] * TILE], points.xyz)
     some = camera[:0] if start.size else np.arange(len(rig.centres))
-    around = tiling.near_cameras(some, frames, rig.centres, low, high)
+    around = tiling.near_cameras(some, wide, rig.centres, low, high)
     for t in range(*span):
         rows = order[t * TILE : (t + 1) * TILE]
-        tile = np.empty(7 * TILE)
+        tile, room = np.empty(7 * TILE), np.empty(6 * TILE)
         low, high = tiling.gather(tile, rows, points)
         # without lists `around` has the cameras; the frame test is vectorised over the points
-        near = tiling.near_cameras(around, frames, rig.centres, low, high)
+        near = tiling.near_cameras(around, wide, rig.centres, low, high)
         marks, seeing = np.empty((near.size, rows.size)), 0
+        if len(shift):
+            tiling.gather_three(room, rows, shift)
         for c in near:
-            if mark(marks[seeing], tile, TILE, frames, c, rig.centres[c]):
+            if len(shift):
+                some_seen = _mark_images(marks[seeing], tile, room, rig, frames, c, points.n)
+            else:
+                some_seen = mark(marks[seeing], tile, TILE, frames, c, rig.centres[c])
+            if some_seen:
                 near[seeing] = c
                 seeing += 1
         near = near[:seeing]
@@ -245,15 +244,18 @@ def _find_near_borders(
     around = tiling.near_cameras(np.arange(len(rig.centres)), wide, rig.centres, low, high)
     for t in range(*span):
         rows = order[t * TILE : (t + 1) * TILE]
-        low, high = tiling.corners_of(rows, points.xyz)
+        tile, room, marks = np.empty(7 * TILE), np.empty(6 * TILE), np.empty((2, rows.size))
+        low, high = tiling.gather(tile, rows, points)
+        tiling.gather_three(room, rows, shift)
         for c in tiling.near_cameras(around, wide, rig.centres, low, high):
             # most frames hold a tile with all its images: only their borders cost time
             if _encloses(inner, c, rig.centres[c], low, high):
                 continue
-            for i in rows:
-                e = minus(row_of(rig.centres, c), row_of(points.xyz, i))
-                if holds(frames, c, e) != _images(points, rig, frames, c, i, shift):
-                    found[i] = True
+            mark(marks[0], tile, TILE, frames, c, rig.centres[c])
+            _mark_images(marks[1], tile, room, rig, frames, c, points.n)
+            for j in range(rows.size):
+                if marks[0, j] != marks[1, j]:
+                    found[rows[j]] = True
 
 
 @device
@@ -271,25 +273,29 @@ def _encloses(
 
 
 @device
-def _images(points: Chosen, rig: Rig, frames: Frames, c: int, i: int, shift: FloatArray) -> bool:
-    """Whether camera c images a true point, whose light it sees in the direction w = k s - N."""
-    e, normal = minus(row_of(rig.centres, c), row_of(points.xyz, i)), normal_above(points, i)
-    # water that stood higher for this image: the point is lowered instead
-    h = normal[2] * (points.height[i] - (points.xyz[i, 2] - rig.offset[c]))
-    if not dot(normal, e) > h:
-        return holds(frames, c, e)
-    k, _, _, _, s = light_near(row_of(shift, i), e, normal, h, points.n)
-    return holds(frames, c, minus(normal, scaled(k, s)))
+def _mark_images(
+    marks: FloatArray, tile: FloatArray, room: FloatArray, rig: Rig, frames: Frames, c: int,
+    n: float,
+) -> bool:  # fmt: skip
+    """Do as `mark` for the images of the true points of a tile, whose shifts are in the room.
 
-
-@kernel
-def _hold(
-    span: Span, points: Chosen, rig: Rig, frames: Frames, shift: FloatArray, held: BoolArray
-) -> None:
-    """Set which cameras of the lists of some points image their true points."""
-    for i in range(*span):
-        for at in range(points.start[i], points.start[i + 1]):
-            held[at] = _images(points, rig, frames, points.camera[at], i, shift)
+    Camera c sees the light of a true point in the direction w = k s - N. So the point at C + w, of
+    which there is room for a tile after the shifts, has the same image.
+    """
+    centre, offset, seen = row_of(rig.centres, c), rig.offset[c], room[3 * TILE :]
+    for j in range(marks.size):
+        p, normal = three(tile, j), three(tile, 4 * TILE + j)
+        e = minus(centre, p)
+        # water that stood higher for this image: the point is lowered instead
+        h = normal[2] * (tile[3 * TILE + j] - (p[2] - offset))
+        k, _, _, _, s = light_near(three(room, j), e, normal, h, n)
+        w = minus(scaled(k, s), normal)
+        # a camera below the water sees the apparent point
+        refracts = dot(normal, e) > h
+        seen[j] = centre[0] + (w[0] if refracts else -e[0])
+        seen[TILE + j] = centre[1] + (w[1] if refracts else -e[1])
+        seen[2 * TILE + j] = centre[2] + (w[2] if refracts else -e[2])
+    return mark(marks, seen, TILE, frames, c, rig.centres[c])
 
 
 @device(allocates=True)
@@ -304,7 +310,7 @@ def _choose(
     """
     chosen, cosine2 = np.empty(candidates.size, np.int32), np.empty(candidates.size)
     is_limited = rule.least_cosine2 > 0.0 or rule.most < candidates.size
-    (x, y, z), upward = tiling.three(tile, j), tiling.three(tile, 4 * TILE + j)
+    (x, y, z), upward = three(tile, j), three(tile, 4 * TILE + j)
     k = 0
     for at in range(candidates.size):
         c = candidates[at]

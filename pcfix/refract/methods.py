@@ -20,7 +20,6 @@ from pcfix.refract.choice import (
     chosen_views,
     is_bent,
     near_borders,
-    views_of_images,
 )
 from pcfix.refract.tiling import spatial_order
 from pcfix.refract.uncertainty import with_uncertainty
@@ -70,9 +69,7 @@ def _without_limit(found: Intersection, batch: Batch) -> Intersection:
     free = replace(survey, settings=settings, learned=survey.learned._replace(limit_deg=None))
     part = replace(batch.take(few), survey=free)
     if survey.settings.limit_deg is None:
-        rest = np.setdiff1d(np.arange(len(batch)), few)
-        both = [found.take(rest), _corrected(part)]
-        return joined(both, np.concatenate([rest, few]), len(survey.cameras))
+        return found.with_rows(few, _corrected(part))
     if part.views is not None and part.views.kind == "pairs":
         part = replace(part, views=cameras_of_pairs(part.views))
     flat = few[with_rays(part).counts >= 2]
@@ -113,10 +110,8 @@ def _corrected(batch: Batch) -> Intersection:
     again = again[found.outcome[again] == Outcome.CORRECTED]
     if not len(again):
         return found
-    rest = np.setdiff1d(np.arange(len(batch)), again, assume_unique=True)
     part = with_rays(batch.take(again), found.shift_m[again])
-    both = [found.take(rest), solved(part)]
-    return joined(both, np.concatenate([rest, again]), len(survey.cameras))
+    return found.with_rows(again, solved(part))
 
 
 def _takes_all_in_frame(batch: Batch) -> bool:
@@ -189,16 +184,11 @@ def with_rays(batch: Batch, shift_m: FloatArray | None = None) -> Batch:
     matcher = survey.learned.matcher if batch.views is None else None
     seeds = None if survey.settings.method == "consistent" else matcher
     whole = survey
-    # the number is limited in the end
-    if seeds is not None or occluder is not None or shift_m is not None:
+    if seeds is not None or occluder is not None:  # the number is limited in the end
         whole = replace(survey, settings=replace(survey.settings, max_cameras=None))
     if matcher is not None:
         whole = replace(whole, cameras=without_border(survey.cameras))
-    if shift_m is None:
-        views = chosen_views(replace(batch, survey=whole))
-    else:
-        whole = replace(whole, cameras=survey.cameras)
-        views = views_of_images(replace(batch, survey=whole), shift_m)
+    views = chosen_views(replace(batch, survey=whole), shift_m)
     if occluder is not None:
         views = visible_cameras(batch.xyz, centres, views, occluder)
     if seeds is not None:

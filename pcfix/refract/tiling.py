@@ -68,6 +68,13 @@ def gather(tile: FloatArray, rows: IntArray, points: Chosen) -> tuple[FloatArray
     return corners_of(rows, points.xyz)
 
 
+@device
+def gather_three(runs: FloatArray, rows: IntArray, values: FloatArray) -> None:
+    """Fill three runs with the rows of an array of three columns."""
+    for j in range(rows.size):
+        put(runs, j, row_of(values, rows[j]))
+
+
 def slots(*widths: int) -> tuple[int, ...]:
     """Return the first run of each of several quantities of so many numbers, and how many in all.
 
