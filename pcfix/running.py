@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -47,12 +48,15 @@ class Run:
         Makes large arrays; `pcfix.io.files.scratch_arrays` makes them on disk.
     release : callable
         Removes what was read of arrays on disk from memory.
+    clouds : dict, optional
+        The points of small clouds by path, of a command that reads them more than once.
     """
 
     threads: int
     report: Callable[[float], None] = _nothing
     empty: Empty = np.empty
     release: Callable[[], None] = _nothing
+    clouds: dict[Path, list[Any]] | None = None
 
 
 _RUN = ContextVar("pcfix_run", default=Run(_available_cores()))  # noqa: B039 (frozen)

@@ -143,7 +143,7 @@ def run_command(
     tiles = tiles_of(input)
     if tiles is None:
         task = file_task(cast("File", input), output, options, reads=reads, progress=progress)
-        with threads(task.jobs), all_or_none():
+        with threads(task.jobs), running(clouds={}), all_or_none():
             planned = plan(task)
             result: Result = stream(work, planned, task, partial(finish, planned, task))
             write_summary(options, result)

@@ -29,6 +29,7 @@ from pcfix.io.crs import METRES, shortened
 from pcfix.io.files import check_input
 from pcfix.model import BoolArray, FloatArray
 from pcfix.options.declare import File
+from pcfix.running import current
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -68,6 +69,8 @@ CHUNK_POINTS = 400_000
 CHUNK_BYTES = 500_000_000
 """The same where records are so long that fewer points are as much."""
 
+SMALL_BYTES = 250_000_000
+"""Point records of a cloud that stay in memory until it is read again."""
 
 Box = tuple[float, float, float, float]
 
@@ -224,7 +227,7 @@ class LasSource:
         self, path: File, jobs: int | None = None, *, part: CloudPart | None = None
     ) -> None:
         """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable."""
-        self.path, self.part = check_input(path), part
+        self.path, self.part, self._clouds = check_input(path), part, current().clouds
         with las_errors(self.path):
             with self.path.open("rb") as stream:
                 if other := _OTHER_CLOUDS.get(stream.read(4)):
@@ -342,7 +345,12 @@ class LasSource:
                     yield points[inside]
 
     def _all_chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
-        read = 0
+        clouds = self._clouds
+        if clouds is not None and self.path in clouds:
+            yield from clouds[self.path]
+            return
+        is_small = self.points_of_file * self.header.point_format.size <= SMALL_BYTES
+        read, chunks = 0, list[laspy.ScaleAwarePointRecord]()
         most = max(1, min(CHUNK_POINTS, CHUNK_BYTES // self.header.point_format.size))
         while read < self.points_of_file:
             with las_errors(self.path):
@@ -352,7 +360,11 @@ class LasSource:
                 sentence = f"it ends after {held}. Copy it again."
                 raise bad_file(self.path, "cloud.count", sentence, stated=self.points_of_file)
             read += len(points)
+            if clouds is not None and is_small:
+                chunks.append(points)
             yield points
+        if clouds is not None and is_small:
+            clouds[self.path] = chunks
 
     def dimension(self, points: laspy.ScaleAwarePointRecord, name: str) -> FloatArray:
         """Return one dimension of a chunk, scaled, as float64.
