@@ -22,7 +22,7 @@ from pcfix.model import (
 )
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract import tiling
-from pcfix.refract.batch import Batch, Chosen, Survey, normal_above
+from pcfix.refract.batch import Batch, Chosen, Survey
 from pcfix.refract.rays import light_near, pierce
 from pcfix.refract.tiling import TILE, three
 from pcfix.water.surface import Field, SurfaceAbove, Tin, build_fields, build_tin
@@ -190,9 +190,10 @@ def _choose_all(
 ) -> None:  # fmt: skip
     """Choose the cameras of each point, a tile at a time.
 
-    With shifts the frames hold the images of the true points, and the frames `wide` may hold them
-    where they hold the tile. Fills in where the entries of point i begin, how many they are (at i + 1), and the entries. An
-    entry is the number of a camera or, with view lists, that of one of their entries.
+    With shifts the frames hold the images of the true points; the frames `wide` then decide which
+    cameras are near a tile. Fills in where the entries of point i begin, how many they are (at
+    i + 1), and the entries. An entry is the number of a camera or, with view lists, that of one of
+    their entries.
     """
     (order, points), (first, begin, count, place) = given, found
     start, camera = points.start, points.camera

@@ -15,12 +15,7 @@ import numpy as np
 
 from pcfix.model import FloatArray, IntArray, Outcome, Views, WaterPlane
 from pcfix.refract.batch import Batch, Intersection, Survey
-from pcfix.refract.choice import (
-    cameras_of_pairs,
-    chosen_views,
-    is_bent,
-    near_borders,
-)
+from pcfix.refract.choice import cameras_of_pairs, chosen_views, is_bent, near_borders
 from pcfix.refract.tiling import spatial_order
 from pcfix.refract.uncertainty import with_uncertainty
 from pcfix.water.surface import SurfaceAbove
