@@ -37,9 +37,10 @@ OUTLIER_GSD = 0.01
 """Density of points that are mismatches, per ground pixel."""
 MOST_A_POINT = 0.25
 """Largest difference of two log likelihoods, per point: one patch decides nothing."""
-MODEL_ERROR = 0.0125
+MODEL_ERROR, EXACT_MODEL_ERROR = 0.0125, 0.005
 """Standard error of the mean difference, per point, as no model is exact: of simulated and rendered
-clouds of every type."""
+clouds of every type. The second is of tracks and nearest maps, which name one place for each point;
+in the 18 clouds of these types the right one is better by 0.001 to 0.14."""
 
 
 class Candidates(NamedTuple):
@@ -83,13 +84,13 @@ def log_likelihood(
     return np.asarray(log_density(found.x).mean(axis=1))
 
 
-def standard_errors(of: FloatArray, other: FloatArray) -> float:
+def standard_errors(of: FloatArray, other: FloatArray, model_error: float) -> float:
     """Return by how many standard errors one type is more likely than another.
 
     From their log likelihoods of the same patches, per point.
     """
     gain = np.clip(of - other, -MOST_A_POINT, MOST_A_POINT)
-    return float(gain.mean() / np.hypot(gain.std() / np.sqrt(len(gain)), MODEL_ERROR))
+    return float(gain.mean() / np.hypot(gain.std() / np.sqrt(len(gain)), model_error))
 
 
 @kernel(allocates=True)

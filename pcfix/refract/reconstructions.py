@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,13 @@ from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, ViewKind
 from pcfix.options.correct import Dimensions, ScienceOptions
 from pcfix.refract import patches
 from pcfix.refract.batch import FLAT_DEG, Batch, ModelUncertainty
-from pcfix.refract.likelihood import Candidates, log_likelihood, standard_errors
+from pcfix.refract.likelihood import (
+    EXACT_MODEL_ERROR,
+    MODEL_ERROR,
+    Candidates,
+    log_likelihood,
+    standard_errors,
+)
 from pcfix.refract.methods import correct, with_rays
 from pcfix.refract.patches import SMOOTH_GSD, Patches, scatter_m, shares
 
@@ -34,9 +41,9 @@ MOST_CONFIDENCE = 0.99
 """Larger ones were not tested (`tests.benchmarks.detection`)."""
 LEAST_PATCHES = 100
 """With all their points corrected for each type; with fewer nothing is decided."""
-OPEN_ODDS = (20.0, 100.0)
-"""Odds against another type up to which its whole difference counts as uncertainty, and from which
-it counts no more."""
+OPEN = (1.0 / 101.0, 1.0 / 21.0)
+"""Probability of another type up to which its difference does not count as uncertainty, and from
+which all of it counts: odds of 100 : 1 and 20 : 1."""
 COVERED = 0.95
 """Least share of the points that must be corrected, of those that are for most types."""
 LEAST_DEPTH_M = 0.1
@@ -365,9 +372,10 @@ def _beds(
         # discontinuities do not. But neighbours in sparse clouds show little of their scatter.
         if place.shape[1] == patches.PATCH_POINTS[0]:
             likely = [_log_likelihood(part, place, one, z[i]) for i, one in enumerate(types)]
-            from_maps = np.array([one.words not in (_TRACKS, _PAIRS) for one in types])
-            for a, b in zip(*np.nonzero(from_maps[:, None] | from_maps), strict=True):
-                errors[a, b] = standard_errors(likely[a], likely[b])
+            for a, b in permutations(range(len(types)), 2):
+                exact = {types[a].words, types[b].words} == {_TRACKS, _NEAREST}
+                error = EXACT_MODEL_ERROR if exact else MODEL_ERROR
+                errors[a, b] = standard_errors(likely[a], likely[b], error)
     np.fill_diagonal(share, -np.inf)
     np.fill_diagonal(errors, np.inf)
     return _Beds(types, z, place, len(place), share, sigma, errors)
@@ -473,13 +481,8 @@ def _model_uncertainty(part: Batch, beds: _Beds, at: int, among: list[int]) -> M
 
 
 def _open_share(errors: float) -> float:
-    """Return how much of the difference to another type counts: all of it up to odds of 20 : 1.
-
-    Less beyond, and nothing from 100 : 1.
-    """
-    wrong = 0.5 * math.erfc(errors / math.sqrt(2.0))
-    odds = (1.0 - wrong) / max(wrong, 1e-12)
-    return float(np.interp(math.log(max(odds, 1e-12)), np.log(OPEN_ODDS), (1.0, 0.0)))
+    """Return how much of the difference to another type counts, by its probability."""
+    return float(np.interp(0.5 * math.erfc(errors / math.sqrt(2.0)), OPEN, (0.0, 1.0)))
 
 
 def _as(part: Batch, one: Reconstruction, dimensions: Dimensions = "none") -> Batch:
