@@ -37,10 +37,9 @@ OUTLIER_GSD = 0.01
 """Density of points that are mismatches, per ground pixel."""
 MOST_A_POINT = 0.25
 """Largest difference of two log likelihoods, per point: one patch decides nothing."""
-MODEL_ERROR, EXACT_MODEL_ERROR = 0.0125, 0.005
+MODEL_ERROR = 0.0125
 """Standard error of the mean difference, per point, as no model is exact: of simulated and rendered
-clouds of every type. The second is of tracks and nearest maps, which name one place for each point;
-in the 18 clouds of these types the right one is better by 0.001 to 0.14."""
+clouds of every type."""
 
 
 class Candidates(NamedTuple):
@@ -84,7 +83,7 @@ def log_likelihood(
     return np.asarray(log_density(found.x).mean(axis=1))
 
 
-def standard_errors(of: FloatArray, other: FloatArray, model_error: float) -> float:
+def standard_errors(of: FloatArray, other: FloatArray, model_error: float = MODEL_ERROR) -> float:
     """Return by how many standard errors one type is more likely than another.
 
     From their log likelihoods of the same patches, per point.

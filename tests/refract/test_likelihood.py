@@ -81,7 +81,7 @@ def test_mixture(is_mixed):
     of_several, of_mean = (
         log_likelihood(terms, apparent, level, one, GSD_M) for one in (several, mean)
     )
-    errors = standard_errors(of_several, of_mean, MODEL_ERROR)
+    errors = standard_errors(of_several, of_mean)
     assert (errors > 2.33) if is_mixed else (errors < -2.33)
 
 
@@ -106,8 +106,6 @@ def test_one_patch_decides_nothing():
     one = rng.normal(0.0, 0.01, 100)
     other = one.copy()
     other[0] += 1000.0
-    assert abs(standard_errors(one, other, MODEL_ERROR)) < MOST_A_POINT / MODEL_ERROR
-    assert standard_errors(one, other, MODEL_ERROR) == pytest.approx(
-        -standard_errors(other, one, MODEL_ERROR)
-    )
-    assert standard_errors(one + 0.2, one, MODEL_ERROR) == pytest.approx(0.2 / MODEL_ERROR)
+    assert abs(standard_errors(one, other)) < MOST_A_POINT / MODEL_ERROR
+    assert standard_errors(one, other) == pytest.approx(-standard_errors(other, one))
+    assert standard_errors(one + 0.2, one) == pytest.approx(0.2 / MODEL_ERROR)
