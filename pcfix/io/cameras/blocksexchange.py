@@ -40,7 +40,7 @@ import numpy as np
 
 from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import ZIP_MAGIC, Source, damaged, note, number, read_xml, text_of
+from pcfix.io.cameras.checks import Source, damaged, note, number, read_xml, text_of
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.crs import Topocentric
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
@@ -63,8 +63,6 @@ DIRECTIONS = {"Right": (1, 0, 0), "Left": (-1, 0, 0), "Down": (0, 1, 0), "Up": (
 
 def recognises(source: Source) -> bool:
     """Whether the root element is BlocksExchange, in a plain file or a zip archive."""
-    if source.head.startswith(ZIP_MAGIC):
-        return b"<BlocksExchange" in _read_bytes(source.path)[:4096]
     return "<BlocksExchange" in source.text
 
 
@@ -74,13 +72,8 @@ def read(source: Source) -> Cameras:
 
 
 def _read_bytes(path: Path) -> bytes:
-    """Return a file, or the XML document in a zip archive, without comments."""
-    data = path.read_bytes()
-    if data.startswith(ZIP_MAGIC):
-        with checks.open_archive(path) as archive:
-            found = [name for name in archive.namelist() if name.lower().endswith(".xml")]
-            data = checks.unpacked(archive, found[0] if found else "XML document")
-    return COMMENT.sub(b"", data)
+    """Return the document in a file or archive without comments."""
+    return COMMENT.sub(b"", checks.read_document(path))
 
 
 class Photogroup(NamedTuple):
@@ -127,7 +120,7 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
     measurements would take minutes.
     """
     data = _read_bytes(path)
-    root = read_xml(path, io.BytesIO(TIE_POINTS.sub(b"", data)))
+    root = read_xml(path, TIE_POINTS.sub(b"", data))
     main, outside = list[Photo](), list[Photo]()  # outside of the main component
     unposed, ignored = list[str](), list[str]()
     blocks = list(root.iter("Block"))

@@ -129,7 +129,7 @@ def _crs_of(files: Files) -> str | None:
 def named_crs(path: Path) -> str:
     """Return the CRS in the first line of a file: a PROJ string, EPSG:n or WGS84 UTM 16N."""
     text = path.read_bytes()[:4096].decode("utf-8-sig", errors="replace").strip()
-    return checks.crs(path, checks.utm_as_code(text.partition("\n")[0].strip()))
+    return checks.crs(path, text.partition("\n")[0])
 
 
 def _frame(files: Files, found: opensfm.Reconstruction) -> AffineFrame | None:

@@ -39,7 +39,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning, bad_file
+from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io import tables
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Angles, Source, note
@@ -159,8 +159,8 @@ def open_table(path: Path) -> Table:
         rows = [[*fields, *[""] * len(GEO)][: len(GEO)] for _, fields in split]
         place = {name: GEO.index(name) for name in ("label", "x", "y", "z")}
         place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
-        crs = checks.utm_as_code(lines[0].strip())
-        return Table(path, [*GEO], rows, [i for i, _ in split], place, [""] * len(GEO), crs=crs)
+        numbers, units = [i for i, _ in split], [""] * len(GEO)
+        return Table(path, [*GEO], rows, numbers, place, units, crs=lines[0].strip())
     kinds = [("label", *three) for three in (*AXES, ("x_est", "y_est", "z_est"), TRANSLATION)]
     table = tables.read_table(path, *kinds, spellings=SPELLINGS)
     for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
@@ -230,12 +230,11 @@ def crs(columns: Table) -> tuple[str | None, tuple[PcfixWarning, ...]]:
             return None, ()
         ellipsoidal = columns.name("z").startswith("ellipsoid")
         return WGS84_ELLIPSOIDAL if ellipsoidal else WGS84, ()
-    if said.startswith("LOCAL_CS"):
-        return "local", ()
-    if not checks.names_crs(said):
+    try:
+        return checks.crs(columns.path, said), ()
+    except InputError:
         sentence = f"PROJ does not know its CRS '{shortened(said)}'. The cloud's is assumed."
         return None, (note(columns.path, "cameras.crs_unknown", sentence, crs=said),)
-    return said, ()
 
 
 def is_geo(lines: list[str]) -> bool:
