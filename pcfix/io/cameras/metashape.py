@@ -46,7 +46,7 @@ from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, damaged, note, number, numbers, read_xml, text_of
 from pcfix.io.cameras.lenses import lens_by_name
-from pcfix.io.crs import LOCAL, METRES, crs_text, is_local, parse_crs, shortened, unbound
+from pcfix.io.crs import LOCAL, crs_text, is_local, parse_crs, shortened, unbound
 from pcfix.io.ply import parse_header
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
 
@@ -79,7 +79,7 @@ def read(source: Source) -> Cameras:
     """Read the aligned images of a chunk: geocentric, or in a ``local`` frame."""
     chunk = open_chunk(source.path)
     images, unposed, notes = aligned_images(chunk)
-    crs, project_crs, of_world = _world(chunk)
+    crs, project_crs = _world(chunk)
     gnss, of_gnss = _gnss_positions(chunk, images)
     in_world = np.array([image.place @ image.pose for image in images])
     scales = np.cbrt(np.linalg.det(in_world[:, :3, :3]))[:, None, None]
@@ -97,7 +97,7 @@ def read(source: Source) -> Cameras:
         project_crs=project_crs,
         gnss=gnss,
         unposed=unposed,
-        notes=(*chunk.notes, *of_world, *notes, *of_gnss),
+        notes=(*chunk.notes, *notes, *of_gnss),
         source=chunk.software,
     )
 
@@ -131,11 +131,8 @@ class Document(NamedTuple):
 
     def properties(self, name: str) -> dict[str, str]:
         """Return the names and values of the properties in an element of a chunk."""
-        return _properties(self.root, f"{name}/property")
-
-
-def _properties(element: Element, path: str = "property") -> dict[str, str]:
-    return {one.get("name") or "": one.get("value") or "" for one in element.iterfind(path)}
+        found = self.root.iterfind(f"{name}/property")
+        return {one.get("name") or "": one.get("value") or "" for one in found}
 
 
 def open_chunk(path: Path) -> Document:
@@ -298,24 +295,21 @@ def _similarity(path: Path, element: Element | None) -> FloatArray | None:
     return matrix
 
 
-def _world(chunk: Document) -> tuple[str, str | None, list[PcfixWarning]]:
-    """Return the frame that a chunk's transforms lead to, its CRS if another, and notes on them."""
-    text = text_of(chunk.root, "reference")
+def _world(chunk: Document) -> tuple[str, str | None]:
+    """Return the frame that a chunk's transforms lead to, and its CRS if that is another."""
+    text, name = text_of(chunk.root, "reference"), str(chunk.path)
     if not text or text.upper() == "LOCAL" or not _places(chunk.path, chunk.root)[1]:
-        return LOCAL, None, []
-    crs = parse_crs(text, str(chunk.path))
+        return LOCAL, None
+    crs = parse_crs(text, name)
     if is_local(crs):
-        unit = crs.axis_info[0].unit_name
-        sentence = f"the local coordinates of the chunk are in {unit}, its transform in metres."
-        foreign = note(chunk.path, "cameras.local_unit", sentence, unit=unit)
-        return LOCAL, None, [] if unit in METRES else [foreign]
+        return LOCAL, None
     if crs.geodetic_crs is None:
         raise damaged(chunk.path, f"the CRS {shortened(text)} has no datum")
     # the geocentric CRS on the same datum; of WGS 84 it has the code 4978
     axes = {"coordinate_system": type(crs)("EPSG:4978").to_json_dict()["coordinate_system"]}
     given = unbound(crs.geodetic_crs).to_json_dict() | axes | {"type": "GeodeticCRS", "id": None}
     frame = crs_text(type(crs).from_json_dict({k: v for k, v in given.items() if v}))
-    return frame, frame if crs.is_geocentric else text, []
+    return frame, frame if crs.is_geocentric else text
 
 
 # ---- lenses ----
@@ -354,26 +348,16 @@ def _kind(sensor: Element) -> str:
 
 
 def _lens(path: Path, sensor: Element, image: str) -> tuple[Lens, list[PcfixWarning]]:
-    """Return the adjusted calibration, else the initial one, else the data sheet; and notes."""
-    label, found, stated = name_of(sensor), _calibration(sensor), _properties(sensor)
+    """Return the adjusted calibration, else the initial one; and a note on what is ignored."""
+    label, found = name_of(sensor), _calibration(sensor)
     sizes = [one.find("resolution") for one in (found, sensor) if one is not None]
     resolution = next((one for one in sizes if one is not None), None)
-    pixel_mm, focal_mm = (
-        number(path, f"sensor {label}, {name}", stated.get(name, "0"))
-        for name in ("pixel_width", "focal_length")
-    )
-    if resolution is None or (found is None and not min(pixel_mm, focal_mm) > 0.0):
+    if resolution is None or found is None:
         sentence = f"sensor {label} of {image} has no calibration or no size. Align the images."
         raise bad_file(path, "cameras.no_calibration", sentence, sensor=label)
     sides = (resolution.get(side) for side in ("width", "height"))
     size = [number(path, f"sensor {label}, resolution", side) for side in sides]
-    kind = _kind(sensor)
-    if found is None:  # what Metashape itself starts from
-        given, projection = {"f": focal_mm / pixel_mm}, PROJECTIONS[kind]
-        sentence = f"sensor {label} has no calibration; the lens of its data sheet is used."
-        of_lens = note(path, "cameras.data_sheet_lens", sentence, sensor=label)
-        return lens_by_name(given, *size, projection=projection, sensor=label), [of_lens]
-    lens = _calibrated(path, label, kind, found, size)
+    lens = _calibrated(path, label, _kind(sensor), found, size)
     coefficients = found.findtext("corrections/coeffs")
     if not coefficients:
         return lens, []
