@@ -30,9 +30,9 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning, bad_file
+from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import AffineFrame, Source, load_json, note, triple
+from pcfix.io.cameras.checks import AffineFrame, Source, load_json, triple
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.cameras.pix4d import fisheye
 from pcfix.io.crs import crs_text, parse_crs, plan_unit
@@ -59,7 +59,7 @@ def read(source: Source) -> Cameras:
     project = _open_project(source.path)
     path, calibrated = project.part("calibration", "calibrated-cameras")
     _, given = project.part("input_cameras", "input-cameras", needed=False)
-    (frame, notes), names = _frame_of(project), dict[int, str]()
+    frame, names = _frame_of(project), dict[int, str]()
     for listed in project.files("camera_list", FORMAT.format("camera-list")):
         for camera in load_json(listed)["cameras"] if listed.is_file() else []:
             name = camera["uri"].replace("\\", "/").rpartition("/")[2]
@@ -74,17 +74,17 @@ def read(source: Source) -> Cameras:
         for sensor in calibrated["sensors"]
         if "image_size_px" in sensors.get(sensor["id"], {})
     }
-    lenses = [known.get(shot["sensor_id"]) for shot in shots.values()]
+    lenses = [known[shot["sensor_id"]] for shot in shots.values() if shot["sensor_id"] in known]
     captures = given.get("captures", [])
     captured = [shot["id"] for capture in captures for shot in capture.get("cameras", [])]
     return Cameras(
         labels=labels,
         centres=frame.points(xyz),
         rotations=from_omega_phi_kappa(*angles.T) if len(shots) else None,
-        lenses=tuple(one for one in lenses if one) if lenses and all(lenses) else None,
+        lenses=tuple(lenses) if shots and len(lenses) == len(shots) else None,
         crs=frame.crs,
         project_crs=frame.project_crs,
-        notes=(*notes, *checks.repeated(path, labels)),
+        notes=checks.repeated(path, labels),
         gnss=_gnss(path, captures, list(shots)),
         unposed=tuple(names.get(i, f"camera {i}") for i in captured if i not in shots),
         source=project.generator,
@@ -120,27 +120,24 @@ class Project(NamedTuple):
 
 def _open_project(path: Path) -> Project:
     """Read the project at a path, in a folder, or that a part belongs to."""
-    if path.is_dir():
-        found = sorted(path.glob("*.opf"))
-    else:
-        content = load_json(path)
-        if content.get("format") == PROJECT:
-            generator = content.get("generator", {})
-            words = ("OPF", generator.get("name", ""), generator.get("version", ""))
-            return Project(path, content["items"], " ".join(map(str, words)).strip())
-        above = path.resolve().parent
-        found = [*sorted(above.glob("*.opf")), *sorted(above.parent.glob("*.opf"))]
-    if len(found) != 1 or found[0] == path:
-        sentence = f"belongs to one of {len(found)} OPF projects. Give the project file (.opf)."
-        raise bad_file(path, "cameras.several_projects", sentence, projects=len(found))
-    return _open_project(found[0])
+    content = {} if path.is_dir() else load_json(path)
+    if content.get("format") != PROJECT:
+        folders = [path] if path.is_dir() else [*path.resolve().parents][:2]
+        found = [one for folder in folders for one in sorted(folder.glob("*.opf"))]
+        if len(found) != 1:
+            sentence = f"belongs to one of {len(found)} OPF projects. Give the project file (.opf)."
+            raise bad_file(path, "cameras.several_projects", sentence, projects=len(found))
+        path, content = found[0], load_json(found[0])
+    generator = content.get("generator", {})
+    words = ("OPF", generator.get("name", ""), generator.get("version", ""))
+    return Project(path, content["items"], " ".join(map(str, words)).strip())
 
 
-def _frame_of(project: Project) -> tuple[AffineFrame, tuple[PcfixWarning, ...]]:
-    """Return the frame of the processing, east, north, up, and notes on it."""
+def _frame_of(project: Project) -> AffineFrame:
+    """Return the frame of the processing, east, north, up."""
     path, scene = project.part("scene_reference_frame", "scene-reference-frame", needed=False)
     if not scene:  # the frame of the processing is arbitrary
-        return AffineFrame(np.eye(3), np.zeros(3), "local"), ()
+        return AffineFrame(np.eye(3), np.zeros(3), "local")
     way = scene["base_to_canonical"]
     shift, scale = triple(way["shift"]), triple(way["scale"])
     if not (scale > 0.0).all():
@@ -149,12 +146,8 @@ def _frame_of(project: Project) -> tuple[AffineFrame, tuple[PcfixWarning, ...]]:
         scale = scale[[1, 0, 2]]  # positions are east, north already, scales in the CRS's order
     said = checks.crs(path, scene["crs"]["definition"])
     crs, unit = (said, 1.0) if said == "local" else _with_heights(said, str(path))
-    geoid_m = float(scene["crs"].get("geoid_height") or 0.0)
-    sentence = f"its heights refer to a constant geoid height of {geoid_m:g} m."
-    geoid = note(path, "cameras.constant_geoid", sentence, geoid_m=geoid_m)
     size = [1.0, 1.0, unit] / scale
-    frame = AffineFrame(np.diag(size), -shift * size, crs, None if crs == said else said)
-    return frame, (geoid,) if geoid_m else ()
+    return AffineFrame(np.diag(size), -shift * size, crs, None if crs == said else said)
 
 
 def _with_heights(text: str, name: str) -> tuple[str, float]:
@@ -221,7 +214,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     found = [node for model in models for node in _nodes(model, row_of)]
     if not found:
         raise checks.no_tie_points(project.path, "its calibration has no tracks")
-    frame, _ = _frame_of(project)
+    frame = _frame_of(project)
     return checks.tie_points(*(node._replace(xyz=frame.points(node.xyz)) for node in found))
 
 
