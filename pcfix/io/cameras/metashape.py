@@ -6,23 +6,21 @@ projects with a folder (.psx, whose documents lie in zips in ``<name>.files``).
 Convention. ``camera/transform`` is a 4x4 matrix from the camera (x right, y down, z forward) to the
 chunk, whose origin, axes and scale mean nothing. The ``transform`` of the camera's component, or of
 the chunk, leads on to the world as s R X + t. With a CRS in ``reference`` the world is geocentric,
-on the datum of that CRS, whatever its kind; heights there are ellipsoidal, and only the export to
-that CRS brings a geoid in. With ``LOCAL_CS``, or no transform, the world is local. The image of a
-slave camera (``master_id``) has the pose T_master [R, t], with the rotation and location of its
-sensor in the master's frame, t in the unit of the chunk. EXIF orientations turn only what is
-displayed: matrices and pixels are those of the image as stored.
+on the datum of that CRS, whatever its kind, with ellipsoidal heights. With ``LOCAL_CS``, or no
+transform, it is local. The image of a slave camera (``master_id``) has the pose T_master [R, t],
+with the rotation and location of its sensor in the master's frame, t in the unit of the chunk. EXIF
+orientations turn only what is displayed: matrices and pixels are those of the image as stored.
 
 The tie points of a frame are PLY files in one archive: ``points`` has x, y, z in the frame of the
-component and the id of the track, ``projections`` of each camera have x and y in pixels from the
-corner of the image and the id of the track. A project of one file has them beside its document.
-Markers stand in the document of the frame, as ``location`` with x and y; only the pinned ones were
-measured, the others Metashape computed from the poses. Where the GNSS put the cameras is their
-``reference``, in the CRS of the cameras or of the chunk.
+component and the id of the track, ``projections`` of each camera x and y in pixels from the corner
+of the image and the id of the track. The document of the frame has the markers, with a ``location``
+x, y in each image; only the pinned ones were measured, Metashape computed the others. The GNSS
+positions are the ``reference`` of each camera, in the CRS of the cameras or of the chunk.
 
 Calibration. The formula is that of `pcfix.model.Lens`, with cx and cy from the centre of the image.
 A fisheye is equidistant, and since version 2.3 can be equisolid. Files of PhotoScan up to 1.2 can
-have fx and fy instead of f; there cx and cy count from the corner, and p1 and p2 change places.
-The element decides this, as the version of the document does not.
+have fx and fy instead of f (the version of the document does not show it): there cx and cy count
+from the corner, and p1 and p2 change places.
 
 References: "Agisoft Metashape User Manual, Professional Edition", appendix "Camera models";
 "Metashape Python Reference", Chunk.transform, Sensor.location, CoordinateSystem.geoccs;

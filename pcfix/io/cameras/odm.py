@@ -4,16 +4,14 @@ ODM reconstructs with OpenSfM and delivers its cloud in a projected CRS, named i
 the first line of coords.txt. Its reconstruction has been in three frames:
 
 - up to 2020 topocentric as OpenSfM writes it, with geocoords_transformation.txt, an affine map
-  (turn by the meridian convergence, scale, shift) that makes projected coordinates of it, and so
-  of the cloud;
+  from it to projected coordinates, and so to the cloud;
 - then with the axes of the projected CRS, less its coordinates of the reference; the reference is
   at whole metres, which distinguishes this frame from a topocentric one;
 - topocentric again in versions that project the finished cloud point by point, and in
   reconstruction.topocentric.json, which the second kind keeps.
 
-Where the reference is at whole metres, shots.geojson decides between the last two, or the GNSS
-positions (always topocentric). Poses come out in the projected CRS in the first two frames,
-topocentric in the third.
+Where the reference is at whole metres, shots.geojson or the GNSS positions (always topocentric)
+decide between the last two. Poses come out in the projected CRS, in the third frame topocentric.
 
 shots.geojson has per image `translation`, the projection centre in the projected CRS, `rotation`,
 axis times angle from the axes of that CRS to the camera (x right, y down, z forward), and size and
