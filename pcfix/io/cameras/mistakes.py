@@ -28,7 +28,7 @@ _SAMPLE = 200
 def likely_mistake(
     centres: FloatArray, low: FloatArray, high: FloatArray, cloud_crs: str | CRS | None
 ) -> str | None:
-    """Return what is likely wrong where a block does not fit its cloud.
+    """Return what is likely wrong where a block does not fit its cloud; None where it does.
 
     Parameters
     ----------
@@ -37,11 +37,6 @@ def likely_mistake(
     low, high : array, shape (3,)
         Corners of the cloud, metres.
     cloud_crs : str, CRS or None
-
-    Returns
-    -------
-    str or None
-        One sentence; None where the block is over the cloud.
     """
     centres = np.asarray(centres, np.float64)[:: max(1, len(centres) // _SAMPLE)]
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
@@ -78,18 +73,17 @@ def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str,
     plan = None if crs is None else parts(parse_crs(crs, "the cloud"))[0]
     if plan is None or not plan.is_projected:
         return
-    say = "; set it with --cameras-crs"
+    say, zone = "set it with --cameras-crs", int((plan.utm_zone or "0N")[:-1])
     others = [
-        (f"longitude and latitude in degrees{say} EPSG:4326", 4326, centres),
+        (f"longitude and latitude in degrees; {say} EPSG:4326", 4326, centres),
         ("degrees, latitude before longitude; exchange the columns", 4326, swapped),
-        (f"web Mercator{say} EPSG:3857", 3857, centres),
+        (f"web Mercator; {say} EPSG:3857", 3857, centres),
     ]
-    if plan.utm_zone is not None:  # the zones within two of the cloud's, and the other hemisphere
-        zone = int(plan.utm_zone[:-1])
-        for near in ((zone + step - 1) % 60 + 1 for step in (0, -1, 1, -2, 2)):
-            for side, first in (("N", 32600), ("S", 32700)):
-                words = f"UTM zone {near}{side} (the cloud is in {plan.utm_zone}){say}"
-                others.append((words, first + near, centres))
+    # the zones within two of the cloud's, and the other hemisphere
+    for near in [(zone + step - 1) % 60 + 1 for step in (0, -1, 1, -2, 2)] if zone else []:
+        for side, first in (("N", 32600), ("S", 32700)):
+            words = f"UTM zone {near}{side} (the cloud is in {plan.utm_zone}); {say}"
+            others.append((words, first + near, centres))
     for words, code, numbers in others:
         with suppress(ProjError):  # of a CRS that is no single map, as all zones of UTM in one
             to_cloud = Transformer.from_crs(code, plan, always_xy=True)
@@ -100,10 +94,11 @@ def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str,
 def _wrong_height(middle: float, low: FloatArray, high: FloatArray) -> str | None:
     """Return what is likely wrong where cameras lie over the cloud, but not above it."""
     below, above = float(low[2]) - middle, middle - float(high[2])
-    limit = ABSURD_HEIGHTS * max(float((high - low)[:2].max()), MARGIN_M)
+    width = max(float((high - low)[:2].max()), MARGIN_M)
+    limit = ABSURD_HEIGHTS * width
     if below <= 0.0 and above <= limit:
         return None
-    what = f"{above:.0f} m above the cloud, which is {limit / ABSURD_HEIGHTS:.0f} m wide"
+    what = f"{above:.0f} m above the cloud, which is {width:.0f} m wide"
     if below > 0.0:
         what = f"{below:.0f} m below the lowest point of the cloud"
     why = "their heights have another origin; see --cameras-offset"

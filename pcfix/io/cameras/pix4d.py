@@ -143,12 +143,10 @@ def _find(source: Source) -> dict[str, Path]:
     The project's name precedes that of the files; its file is beside or in its folder.
     """
     path, columns = source.path, _columns(source)
-    is_project = b"<pix4uav" in source.head
+    is_project, found = b"<pix4uav" in source.head, TABLE.fullmatch(path.name)
+    tables = [(path.parent, found[1] if found else "")]
     if is_project or path.is_dir():
         tables = _tables_in(path.with_suffix("") if is_project else path)
-    else:
-        found = TABLE.fullmatch(path.name)
-        tables = [(path.parent, found[1] if found else "")]
     if not tables:
         return {}
     folder, prefix = tables[0]
@@ -346,7 +344,10 @@ def fisheye(given: dict[str, float], shape: Sequence[float], *frame: float) -> L
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
-    """Read ``tp_bingo.txt``, or ``tp_pix4d.txt`` where there is no other."""
+    """Read ``tp_bingo.txt``, or ``tp_pix4d.txt`` where there is no other.
+
+    Lines are an image (and the size of its sensor, as in H_23.52_15.68), its points, and -99.
+    """
     files = _find(source)
     path = files.get("bingo") or files.get("ties")
     if path is None:
@@ -354,48 +355,38 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     if cameras.lenses is None:
         raise checks.no_tie_points(path, "it needs lenses, and the cameras have none")
     labels = list(enumerate(cameras.labels))[::-1]  # of equal names the first counts
-    rows = {PurePath(label).stem: i for i, label in labels} | {label: i for i, label in labels}
+    row_of = {PurePath(label).stem: i for i, label in labels} | {label: i for i, label in labels}
+    names, rows, measured = list[str](), list[int](), list[list[str]]()
     with checks.reading(path):
-        points, measured = _measured(path, rows)
-        camera, xy, sensor = measured[:, 0].astype(np.int64), measured[:, 1:3], measured[:, 3:]
-        posed = camera >= 0
-        if not posed.any():
+        image: int | None = None
+        for line in read_lines(path):
+            words = line.split()
+            if not words or words[0] == "-99":
+                image = None
+            elif image is None:
+                text, size = line.strip(), words[-1].split("_")
+                image = row_of.get(text, row_of.get(text.rpartition(" ")[0].strip(), -1))
+                sides = size[-2:] if len(size) >= 3 else ["nan", "nan"]
+            elif len(words) not in (3, 4):
+                raise damaged(path, f"'{line.strip()[:60]}' is not a point and its x and y")
+            elif image >= 0:
+                names.append(words[0])
+                rows.append(image)
+                measured.append([*words[1:3], *sides])
+        if not rows:
             raise checks.no_tie_points(path, "it measures nothing in the images that are posed")
+        xy, sensor = np.split(np.array(measured, np.float64), 2, axis=1)
         if path == files.get("bingo"):
-            if not (sensor[posed] > 0.0).all():
+            if not (sensor > 0.0).all():
                 raise damaged(path, "the line of an image lacks its sensor size H_width_height")
-            frame = np.array([(lens.width, lens.height) for lens in cameras.lenses])[camera]
+            frame = np.array([(lens.width, lens.height) for lens in cameras.lenses])[rows]
             # from mm from the image centre, y up, to the unit of the lens from the upper left
             xy = frame / 2.0 + xy * np.array([1.0, -1.0]) * frame / sensor
-        names, point = np.unique(points[posed], return_inverse=True)
+        points, point = np.unique(names, return_inverse=True)
         known = {}  # where the adjustment placed the control points
         if "gcps" in files:
             lines = [line.split(",") for line in read_lines(files["gcps"])[1:]]
             known = {row[0].strip(): checks.triple(row[4:7]) for row in lines if len(row) > 1}
         unknown = np.full(3, np.nan)
-        xyz = np.array([known.get(name.partition("_")[2], unknown) for name in names.tolist()])
-        return checks.tie_points(checks.Seen(xyz, point, camera[posed], xy[posed]))
-
-
-def _measured(path: Path, rows: dict[str, int]) -> tuple[np.ndarray, FloatArray]:
-    """Read the lines: an image (and the size of its sensor), its points, and -99.
-
-    Out come the names of the points, and for each the camera (-1: not posed), x and y, and width
-    and height of the sensor, as in H_23.52_15.68 after the name of the image.
-    """
-    names, numbers_of = list[str](), list[list[float]]()
-    image: tuple[int, list[str]] | None = None
-    for line in read_lines(path):
-        words = line.split()
-        if not words or words[0] == "-99":
-            image = None
-        elif image is None:
-            text, size = line.strip(), words[-1].split("_")
-            row = rows.get(text, rows.get(text.rpartition(" ")[0].strip(), -1))
-            image = row, size[-2:] if len(size) >= 3 else ["nan", "nan"]
-        elif len(words) in (3, 4):
-            names.append(words[0])
-            numbers_of.append([image[0], *map(float, [*words[1:3], *image[1]])])
-        else:
-            raise damaged(path, f"'{line.strip()[:60]}' is not a point and its x and y")
-    return np.array(names), np.array(numbers_of).reshape(-1, 5)
+        xyz = np.array([known.get(name.partition("_")[2], unknown) for name in points.tolist()])
+        return checks.tie_points(checks.Seen(xyz, point, np.array(rows), xy))
