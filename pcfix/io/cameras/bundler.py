@@ -85,7 +85,7 @@ def recognises(source: Source) -> bool:
 
 def read(source: Source) -> Cameras:
     """Read the poses of the largest model, and its lenses where sizes are known."""
-    cameras, parameters, least_px, _ = _read(source)
+    cameras, parameters, least_px, _ = _model(source)
     frames, notes = _frame_sizes(source.path, cameras.labels, least_px)
     lenses = []
     for given, (w, h) in zip(parameters, frames.tolist(), strict=False):
@@ -97,7 +97,7 @@ def read(source: Source) -> Cameras:
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points of the largest model and where the images saw them."""
-    model = _read(source)
+    model = _model(source)
     if model.cameras.source == "MVE":
         raise checks.no_tie_points(source.path, "MVE writes no image coordinates")
     middles = [(one.principal_x, one.principal_y) for one in cameras.lenses or ()]
@@ -105,13 +105,11 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     return checks.tie_points(model.points._replace(uv=uv))
 
 
-def _read(source: Source) -> Model:
-    is_nvm = _NVM.match(source.text.lstrip()) is not None
-    return (_read_nvm if is_nvm else _read_bundler)(source.path)
-
-
-def _read_bundler(path: Path) -> Model:
-    """Read a file of Bundler or MVE."""
+def _model(source: Source) -> Model:
+    """Read a file of Bundler or MVE, or the largest model of VisualSFM."""
+    path = source.path
+    if _NVM.match(source.text.lstrip()):
+        return _read_nvm(path)
     head, *body = read_lines(path)
     version = _BUNDLER.match(head)
     if version and version[1] != _VERSION:

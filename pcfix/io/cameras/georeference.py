@@ -236,7 +236,19 @@ def _into(
         vertical = systems.parts(frame.crs if project is None else project)[1]
         target = cloud if vertical is None else systems.with_heights(cloud, vertical)
     crs = systems.crs_text(target)
-    assumed = _assumed_heights(frame, target, project, trusted)
+    own, there = systems.heights_of(frame.crs), systems.heights_of(target)
+    unit, size = systems.plan_unit(frame.crs)
+    axes = [e.semi_major_metre for e in (frame.crs.ellipsoid, target.ellipsoid) if e is not None]
+    other_datum = bool(axes) and max(axes) - min(axes) > 1.0
+    is_guess = other_datum or (project is None and not frame.topocentric)
+    assumed = ""
+    if own == "unstated" and frame.crs.is_projected and size != 1.0:
+        assumed = f"heights are assumed to be in {unit}, like x and y"
+    elif own == "unstated" != there and not trusted:
+        assumed = f"names no vertical datum; that of the cloud is assumed ({target.name})"
+    elif own == "ellipsoidal" and there == "unstated" and is_guess and not trusted:
+        words = "names no vertical datum; ellipsoidal is assumed"
+        assumed = f"the cloud's CRS ({target.name}) {words}"
     notes = (note(name, "cameras.heights_assumed", f"{assumed}."),) if assumed else ()
     by_user = trusted and not frame.direct
     heights = not (by_user or systems.heights_agree(frame.crs, target))
@@ -261,22 +273,6 @@ def _into(
             differ = note(name, "cameras.heights_differ", sentence, metres=off)
             return replace(found, notes=(*found.notes, differ))
     return found
-
-
-def _assumed_heights(frame: Frame, target: CRS, project: CRS | None, trusted: bool) -> str:
-    """Return what is assumed about heights, in words; nothing if both sides state theirs."""
-    own, cloud = systems.heights_of(frame.crs), systems.heights_of(target)
-    unit, size = systems.plan_unit(frame.crs)
-    axes = [e.semi_major_metre for e in (frame.crs.ellipsoid, target.ellipsoid) if e is not None]
-    other_datum = bool(axes) and max(axes) - min(axes) > 1.0
-    is_guess = other_datum or (project is None and not frame.topocentric)
-    if own == "unstated" and frame.crs.is_projected and size != 1.0:
-        return f"heights are assumed to be in {unit}, like x and y"
-    if own == "unstated" != cloud and not trusted:
-        return f"names no vertical datum; that of the cloud is assumed ({target.name})"
-    if own == "ellipsoidal" and cloud == "unstated" and is_guess and not trusted:
-        return f"the cloud's CRS ({target.name}) names no vertical datum; ellipsoidal is assumed"
-    return ""
 
 
 def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatArray, str]:

@@ -89,7 +89,15 @@ def read_reconstruction(path: Path) -> Reconstruction:
             position, dop = shot.get("gps_position"), shot.get("gps_dop")
             if position is not None and dop != NO_GNSS:
                 places[label] = position, [np.nan if dop is None else dop] * 3
-        reference = _reference(path, chosen)
+        origin, beside = chosen.get("reference_lla"), path.with_name("reference_lla.json")
+        if origin is None and beside.is_file() and beside.read_bytes()[:100].lstrip()[:1] == b"{":
+            origin = checks.load_json(beside)
+        reference = None
+        if origin is not None:
+            lat, lon, alt = (float(origin[key]) for key in ("latitude", "longitude", "altitude"))
+            if not (abs(lat) <= 90.0 and abs(lon) <= 360.0 and abs(alt) < np.inf):
+                raise checks.damaged(path, f"reference_lla {lat:g}, {lon:g} is no place on earth")
+            reference = None if lat == lon == 0.0 else (lat, lon, alt)
         crs = "local" if reference is None else "ENU:" + ",".join(map(repr, reference))
         listed = path.with_name("image_list.txt")  # the images that the project was given
         lines = read_lines(listed) if listed.is_file() else []
@@ -115,21 +123,6 @@ def _pose(*parts: Any) -> tuple[FloatArray, FloatArray]:
         turn = from_rotation_vectors(checks.triple(part["rotation"]))
         rotation, shift = turn @ rotation, turn @ shift + checks.triple(part["translation"])
     return rotation, shift
-
-
-def _reference(path: Path, chosen: Any) -> tuple[float, float, float] | None:
-    """Return latitude, longitude, height of the origin, from the file or the one beside it."""
-    beside = path.with_name("reference_lla.json")
-    entry = chosen.get("reference_lla")
-    if entry is None and beside.is_file() and beside.read_bytes()[:100].lstrip()[:1] == b"{":
-        path, entry = beside, checks.load_json(beside)
-    if entry is None:
-        return None
-    with checks.reading(path):
-        lat, lon, alt = (float(entry[key]) for key in ("latitude", "longitude", "altitude"))
-        if not (abs(lat) <= 90.0 and abs(lon) <= 360.0 and abs(alt) < np.inf):
-            raise checks.damaged(path, f"reference_lla {lat:g}, {lon:g} is no place on earth")
-    return None if lat == lon == 0.0 else (lat, lon, alt)
 
 
 HEADER = b"OPENSFM_TRACKS_VERSION"

@@ -109,8 +109,12 @@ def read(source: Source) -> Cameras:
             centres, rotations = (each[rows][posed] for each in (centres, rotations))
         else:
             centres, rotations = np.array([image.fields["centre"] for image in images]), turns
-            if "offset" in files:
-                centres += _offset(files["offset"])
+            if beside := files.get("offset"):  # one line, or the same for each group of images
+                lines = [line.replace(",", " ").split() for line in read_lines(beside)]
+                offsets = {" ".join(words[-3:]) for words in lines if words}
+                if len(offsets) != 1:
+                    raise damaged(beside, "it should have one offset x y z")
+                centres += numbers(beside, "the offset", offsets.pop(), 3)
             else:
                 sentence = "there is no offset.xyz next to it. Give the offset by --cameras-offset."
                 notes = (note(path, "cameras.no_offset", sentence),)
@@ -195,15 +199,6 @@ def _rows(
             nearest = int(np.argmin(apart))
         found.append(rows.pop(nearest) if rows else -1)
     return found
-
-
-def _offset(path: Path) -> FloatArray:
-    """Read the offset: one line, or the same one for each group of images."""
-    lines = [line.replace(",", " ").split()[-3:] for line in read_lines(path) if line.strip()]
-    offsets = np.array([numbers(path, "the offset", " ".join(line), 3) for line in lines])
-    if not len(offsets) or (offsets != offsets[0]).any():
-        raise damaged(path, "it should have one offset x y z")
-    return offsets[0]
 
 
 def _priors(path: Path, labels: list[str]) -> tuple[GnssPositions | None, list[str]]:

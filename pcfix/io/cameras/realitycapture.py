@@ -63,9 +63,14 @@ def read(source: Source) -> Cameras:
     path = source.path
     folder = path if path.is_dir() else path.parent
     beside = {p.stem: p.name for p in folder.iterdir() if p.suffix.lower() in IMAGES}
-    images = {  # a file _common speaks of no image
-        file: _fields(file) for file in _files(path) if file.stem != "_common"
-    }
+    images: dict[Path, dict[str, str]] = {}
+    for file in _files(path):
+        if file.stem != "_common":  # which speaks of no image
+            images[file] = {}
+            for one in read_xml(file).iter(DESCRIPTION):
+                fields = one.attrib | {str(child.tag): child.text or "" for child in one}
+                own = {k: v.strip() for k, v in fields.items() if k.startswith("{" + NAMESPACE)}
+                images[file] |= {name.partition("}")[2]: text for name, text in own.items()}
     names = {file: beside.get(file.stem, file.stem) for file in images}
     posed = {f: of for f, of in images.items() if {"Rotation", "Position"} <= of.keys()}
     if not posed:
@@ -95,17 +100,6 @@ def _files(path: Path) -> list[Path]:
         return [path]
     listed = sorted(p for p in path.iterdir() if p.suffix.lower() == ".xmp" and p.is_file())
     return [file for file in listed if NAMESPACE.encode() in file.read_bytes()]
-
-
-def _fields(path: Path) -> dict[str, str]:
-    """Return the fields of all descriptions, from attributes and child elements."""
-    fields: dict[str, str] = {}
-    for description in read_xml(path).iter(DESCRIPTION):
-        pairs = [*description.attrib.items(), *((str(e.tag), e.text) for e in description)]
-        for name, text in pairs:
-            if name.startswith("{" + NAMESPACE):
-                fields[name.partition("}")[2]] = (text or "").strip()
-    return fields
 
 
 def _lens(path: Path, fields: dict[str, str], width: float, height: float) -> Lens:
