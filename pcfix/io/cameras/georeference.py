@@ -121,9 +121,8 @@ class Georeference:
             raise bad_file(self.name, "cameras.not_transformed", sentence, image=cameras.labels[i])
         if rotations is not None and self.frame is not None:
             rotations = rotations @ self.turns(cameras.centres).transpose(0, 2, 1)
-        notes = cameras.notes + self.notes
-        changes = {"crs": self.crs, "project_crs": None, "notes": notes}
-        return replace(cameras, centres=centres, rotations=rotations, **changes)
+        found = replace(cameras, centres=centres, rotations=rotations, crs=self.crs)
+        return replace(found, project_crs=None, notes=cameras.notes + self.notes)
 
     def points(self, xyz: FloatArray) -> FloatArray:
         """Return points (n, 3) there; NaN where one is not finite or has no place there."""
@@ -318,9 +317,9 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatA
     measured = forward(measured)
     unit = systems.plan_unit(own.crs)[1]
     off = (adjusted - measured) * [unit, unit, abs(systems.metres_up(own.crs))]
-    if own.crs.is_geographic and own.crs.ellipsoid is not None:  # radians
-        places = (unit * measured[:, 0], unit * measured[:, 1], unit * adjusted[:, 0])
-        azimuth, _, metres = own.crs.get_geod().inv(*places, unit * adjusted[:, 1], radians=True)
+    if own.crs.is_geographic and (geod := own.crs.get_geod()) is not None:
+        radians = unit * np.hstack([measured[:, :2], adjusted[:, :2]])
+        azimuth, _, metres = geod.inv(*radians.T, radians=True)
         off[:, :2] = np.column_stack([metres * np.sin(azimuth), metres * np.cos(azimuth)])
     found[rows] = off * [1.0, 1.0, np.nan] if reason else off
     return found, reason

@@ -22,7 +22,6 @@ Reference: Pix4D, "Open Photogrammetry Format Specification" 1.0, https://pix4d.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -206,44 +205,44 @@ OFFSET_BITS = 40
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
-    """Read the tracks of the calibration."""
+    """Read the tracks of the calibration: the points and matches of the nodes of its models."""
     project = _open_project(source.path)
     _, calibrated = project.part("calibration", "calibrated-cameras")
     row_of = {shot["id"]: i for i, shot in enumerate(calibrated["cameras"])}
-    models = project.files("calibration", "model/gltf+json")
-    found = [node for model in models for node in _nodes(model, row_of)]
+    frame, found = _frame_of(project), list[checks.Seen]()
+    for path in project.files("calibration", "model/gltf+json"):
+        with checks.reading(path):
+            model = load_json(path)
+            for node in model.get("nodes", []):
+                matrix = np.array(node.get("matrix", np.eye(4).ravel()), float).reshape(4, 4).T
+                for primitive in model["meshes"][node["mesh"]]["primitives"]:
+                    matches = primitive.get("extensions", {}).get(MATCHES, {})
+                    if "pixelCoordinates" in matches.get("imagePoints", {}):
+                        seen = _matches(path, model, primitive, row_of)
+                        x, y, z = (seen.xyz @ matrix[:3, :3].T + matrix[:3, 3]).T
+                        xyz = frame.points(np.column_stack([x, -z, y]))  # the model has y up
+                        found.append(seen._replace(xyz=xyz))
     if not found:
         raise checks.no_tie_points(project.path, "its calibration has no tracks")
-    frame = _frame_of(project)
-    return checks.tie_points(*(node._replace(xyz=frame.points(node.xyz)) for node in found))
+    return checks.tie_points(*found)
 
 
-def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[checks.Seen]:
-    """Yield the points and matches of the nodes of a model."""
-    with checks.reading(path):
-        model = load_json(path)
-        for node in model.get("nodes", []):
-            for primitive in model["meshes"][node["mesh"]]["primitives"]:
-                matches = primitive.get("extensions", {}).get(MATCHES, {})
-                images = matches.get("imagePoints", {})
-                if "pixelCoordinates" in images:
-                    xyz = _accessor(path, model, primitive["attributes"]["POSITION"], 3)
-                    uv = _accessor(path, model, images["pixelCoordinates"], 2)
-                    ranges = _accessor(path, model, matches["pointIndexRanges"], 2)
-                    packed = ranges.astype("<u4").view("<u8")[:, 0]
-                    first = (packed & np.uint64(2**OFFSET_BITS - 1)).astype(np.int64)
-                    count = (packed >> np.uint64(OFFSET_BITS)).astype(np.int64)
-                    index = _accessor(path, model, matches["cameraIds"], 1)[:, 0].astype(np.int64)
-                    rows = np.array([row_of.get(i, -1) for i in matches["cameraUids"]], np.int64)
-                    if (first + count > len(index)).any() or len(count) > len(xyz):
-                        raise checks.damaged(path, "its points have more matches than there are")
-                    point = np.repeat(np.arange(len(count)), count)
-                    before = np.repeat(first - (np.cumsum(count) - count), count)
-                    at = np.arange(len(point)) + before
-                    matrix = np.array(node.get("matrix", np.eye(4).ravel()), float).reshape(4, 4).T
-                    x, y, z = (xyz.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).T
-                    z_up = np.column_stack([x, -z, y])  # the model itself has y up
-                    yield checks.Seen(z_up, point, rows[index[at]], uv[at].astype(np.float64))
+def _matches(path: Path, model: Part, primitive: Part, row_of: dict[int, int]) -> checks.Seen:
+    """Return the points of a primitive, in the axes of its node, and where images saw them."""
+    matches = primitive["extensions"][MATCHES]
+    xyz = _accessor(path, model, primitive["attributes"]["POSITION"], 3).astype(np.float64)
+    uv = _accessor(path, model, matches["imagePoints"]["pixelCoordinates"], 2).astype(np.float64)
+    ranges = _accessor(path, model, matches["pointIndexRanges"], 2)
+    packed = ranges.astype("<u4").view("<u8")[:, 0]
+    first = (packed & np.uint64(2**OFFSET_BITS - 1)).astype(np.int64)
+    count = (packed >> np.uint64(OFFSET_BITS)).astype(np.int64)
+    index = _accessor(path, model, matches["cameraIds"], 1)[:, 0].astype(np.int64)
+    rows = np.array([row_of.get(i, -1) for i in matches["cameraUids"]], np.int64)
+    if (first + count > len(index)).any() or len(count) > len(xyz):
+        raise checks.damaged(path, "its points have more matches than there are")
+    point = np.repeat(np.arange(len(count)), count)
+    at = np.arange(len(point)) + np.repeat(first - (np.cumsum(count) - count), count)
+    return checks.Seen(xyz, point, rows[index[at]], uv[at])
 
 
 def _accessor(path: Path, model: Part, index: int, width: int) -> Any:
