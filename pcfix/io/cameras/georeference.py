@@ -318,8 +318,8 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatA
     unit = systems.plan_unit(own.crs)[1]
     off = (adjusted - measured) * [unit, unit, abs(systems.metres_up(own.crs))]
     if own.crs.is_geographic and (geod := own.crs.get_geod()) is not None:
-        radians = unit * np.hstack([measured[:, :2], adjusted[:, :2]])
-        azimuth, _, metres = geod.inv(*radians.T, radians=True)
+        x, y, other_x, other_y = unit * np.hstack([measured[:, :2], adjusted[:, :2]]).T
+        azimuth, _, metres = geod.inv(x, y, other_x, other_y, radians=True)
         off[:, :2] = np.column_stack([metres * np.sin(azimuth), metres * np.cos(azimuth)])
     found[rows] = off * [1.0, 1.0, np.nan] if reason else off
     return found, reason
