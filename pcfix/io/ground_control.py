@@ -37,7 +37,7 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io.cameras import metashape
-from pcfix.io.cameras.checks import Source
+from pcfix.io.cameras.checks import Source, recognises
 from pcfix.io.cameras.checks import number as xml_number
 from pcfix.io.cameras.odm import named_crs
 from pcfix.io.cameras.table import AXES, centres, has_header
@@ -268,7 +268,7 @@ def _to_cameras(
 
 def read_marks(path: Path) -> tuple[list[Mark], str | None]:
     """Read the marks of a file, and the CRS that it states."""
-    if metashape.recognises(Source(path)):
+    if recognises(metashape, Source(path)):
         return _from_metashape(path)
     lines = read_lines(path)
     numbered = [(i, line.split()) for i, line in enumerate(lines, start=1) if line.strip()]

@@ -1,7 +1,8 @@
 """Read camera poses of any software: one module per format behind one `read_cameras`.
 
-A format module has ``recognises(source)``, which is cheap, ``read(source)`` and, where the format
-has tie points, ``tie_points(source, cameras)``. `read_cameras` turns what damaged contents raise
+A format module has patterns by which `checks.recognises` knows its files, or ``recognises(source)``
+of its own, then ``read(source)`` and, where the format has tie points, ``tie_points(source,
+cameras)``. `read_cameras` turns what damaged contents raise
 into an `InputError`, and checks rotations and lenses; a module raises an `InputError` itself where
 it can say more than "damaged". To add a format, write its module, an entry of `FORMATS` and a line
 in README.md of this folder. A module is loaded when its turn comes.
@@ -198,6 +199,6 @@ def _format_of(source: Source) -> str | None:
     is_part = reader_of(UNSUPPORTED).is_part(source)
     for form in [UNSUPPORTED] if is_part else FORMATS:
         with suppress(Exception), np.errstate(all="ignore"):
-            if reader_of(form).recognises(source):
+            if checks.recognises(reader_of(form), source):
                 return form
     return None

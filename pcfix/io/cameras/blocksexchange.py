@@ -46,6 +46,7 @@ from pcfix.io.crs import Topocentric
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
 from pcfix.model import Cameras, FloatArray, Lens, TiePoints
 
+CONTENT = "<BlocksExchange"
 COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
 TIE_POINTS = re.compile(rb"<TiePoints>(.*?)</TiePoints>", re.DOTALL)
 EXTERNAL = re.compile(rb"<Path>\s*([^<]*?)\s*</Path>")
@@ -59,11 +60,6 @@ EXIF = "EPSG:4326"
 FIRST_PIXEL = 0.5
 """The centre of the first pixel, seen from its corner."""
 DIRECTIONS = {"Right": (1, 0, 0), "Left": (-1, 0, 0), "Down": (0, 1, 0), "Up": (0, -1, 0)}
-
-
-def recognises(source: Source) -> bool:
-    """Whether the root element is BlocksExchange, in a plain file or a zip archive."""
-    return "<BlocksExchange" in source.text
 
 
 def read(source: Source) -> Cameras:

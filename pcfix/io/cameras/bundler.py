@@ -49,7 +49,8 @@ from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_photogrammetric
 from pcfix.model import Cameras, FloatArray, TiePoints
 
-_BUNDLER, _MVE = re.compile(r"#\s*Bundle file v(\d+\.\d+)"), re.compile(r"drews 1\.0")
+CONTENT = re.compile(r"\A\s*(#\s*Bundle file v\d|drews 1\.0|NVM_V3)")
+_BUNDLER = re.compile(r"#\s*Bundle file v(\d+\.\d+)")
 _VERSION = "0.3"
 _CAMERA_NUMBERS = 15
 _FOCAL_OF_LIST = re.compile(r"\s+0\s+[\d.]+$")
@@ -75,12 +76,6 @@ class Model(NamedTuple):
     lenses: list[dict[str, float]]  # parameters; f is of the longer side in files of MVE
     least_px: FloatArray
     points: Seen
-
-
-def recognises(source: Source) -> bool:
-    """Whether the first line is that of Bundler, of any version, of MVE or VisualSFM."""
-    text = source.text.lstrip()
-    return any(form.match(text) for form in (_BUNDLER, _MVE, _NVM))
 
 
 def read(source: Source) -> Cameras:

@@ -72,6 +72,18 @@ class Source:
         return frozenset(p.name for p in self.path.iterdir()) if self.path.is_dir() else frozenset()
 
 
+def recognises(form: Any, source: Source) -> bool:
+    """Whether a format knows a file or folder: by a rule of its own, or by patterns.
+
+    These are ``CONTENT`` of the first bytes of a file, and ``INSIDE`` of a name in a folder.
+    """
+    if hasattr(form, "recognises"):
+        return bool(form.recognises(source))
+    if source.path.is_dir():
+        return any(re.fullmatch(getattr(form, "INSIDE", ""), name) for name in source.names)
+    return re.search(form.CONTENT, source.text) is not None
+
+
 def damaged(path: object, why: object) -> InputError:
     """Return the error for contents that no software writes."""
     return bad_file(path, "cameras.damaged", f"is damaged or cut off ({why}). Export it again.")

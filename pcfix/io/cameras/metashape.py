@@ -61,16 +61,12 @@ PROJECTIONS: dict[str, Projection] = {
 """Kinds of sensors that a lens can describe: not spherical, cylindrical or RPC."""
 SPREADS = {"sxyz": [0, 1, 2], "sxy": [0, 1], "sx": [0], "sy": [1], "sz": [2]}
 """Names of stated standard deviations and the axes that they are of."""
-ROOT = re.compile(  # a project, chunks or a chunk, after the declaration and comments
-    r"\s*(<\?.*?\?>\s*|<!--.*?-->\s*)*"
+INSIDE = r"project\.zip"
+CONTENT = re.compile(  # a project, chunks or a chunk, after the declaration and comments
+    r"\A\s*(<\?.*?\?>\s*|<!--.*?-->\s*)*"
     r"(<(document|collection)\b.*?(<chunks?\b|\bpath=)|<chunk\b.*?<sensors\b)",
     re.DOTALL,
 )
-
-
-def recognises(source: Source) -> bool:
-    """Whether the content is a project, a chunk, or an archive of one."""
-    return "project.zip" in source.names or bool(ROOT.match(source.text))
 
 
 def read(source: Source) -> Cameras:

@@ -41,6 +41,7 @@ from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.model import Cameras, FloatArray, Lens
 
 PREFIX, PREFIX_2, SUFFIX = "Orientation-", "Ori-PerspCentral-", ".xml"
+CONTENT, INSIDE = "<OrientationConique|<NameInternalCalib>", rf"({PREFIX}|{PREFIX_2}).*\{SUFFIX}"
 UNIFIED = ("eModele_DRad_PPaEqPPs", "eModele_Fraser_PPaEqPPs")
 """Of `ModUnif`: radial and Fraser's about the principal point; five k, P1, P2, b1, b2."""
 NO_DISTORTION = ("ModNoDist", "eModelePolyDeg0")
@@ -49,14 +50,6 @@ AFFINITY_PX = 0.1
 
 NAMES = (*(f"k{i}" for i in range(1, 10)), "p1", "p2", "b1", "b2")
 _IS_INVERSE = {"": False, "eConvApero_DistM2C": False, "eConvApero_DistC2M": True}
-
-
-def recognises(source: Source) -> bool:
-    """Whether a folder has orientations by their names, or a file is one."""
-    if source.path.is_dir():
-        begins = (PREFIX, PREFIX_2)
-        return any(name.startswith(begins) and name.endswith(SUFFIX) for name in source.names)
-    return "<OrientationConique" in source.text or "<NameInternalCalib>" in source.text
 
 
 def read(source: Source) -> Cameras:

@@ -40,17 +40,10 @@ from pcfix.model import Cameras, GnssPositions, Lens, TiePoints
 
 FORMAT = "application/opf-{}+json"
 PROJECT = FORMAT.format("project")
+CONTENT = '"application/opf-|"orientation_deg"'
+INSIDE = r".*\.opf"
 Part = dict[str, Any]
 """An object of a JSON file."""
-
-
-def recognises(source: Source) -> bool:
-    """Whether a file is a project or calibrated cameras, or a folder holds a project."""
-    if source.path.is_dir():
-        return any(name.endswith(".opf") for name in source.names)
-    return '"application/opf-' in source.text or (
-        '"orientation_deg"' in source.text and '"sensor_id"' in source.text
-    )
 
 
 def read(source: Source) -> Cameras:
