@@ -16,7 +16,7 @@ length. Places in mm (xmm, ymm) are in the camera axes, from the centre of the s
 principal point and from the principal point for measurements.
 
 Software ignores poses where ManualPose is false, and lenses where ManualOpticalParams is. The cloud
-was not made with these, so they are not read.
+was not computed from these, so they are not read.
 
 GNSS positions are in Pose/Metadata, or in the GPS of ExifData. Tie points can be in another file,
 and either file in a zip archive (.xmlz).

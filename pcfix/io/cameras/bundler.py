@@ -6,7 +6,7 @@ After the numbers of cameras and points come, for each camera, f k1 k2, a matrix
 and then the points with their views (image, feature, x, y). ``X_cam = R X + t`` is in axes x right,
 y up, z backward, so the rows of y and z change sign for OpenCV's axes. The image is
 ``f (1 + k1 r^2 + k2 r^4) (-X_cam / Z_cam)``, x right and y up from the middle of the frame. f = 0
-says that an image has no pose. Names are in ``list.txt``, a line for each camera.
+marks an image without a pose. Names are in ``list.txt``, a line for each camera.
 
 *MVE* ("drews 1.0", https://github.com/simonfuhrmann/mve/wiki/MVE-File-Format) has OpenCV's axes, f
 in units of the longer side of the frame, and views (image, feature, nothing).
@@ -20,15 +20,15 @@ that have no pose. In names, ``"`` stands for a space. The quaternion is world t
 axes; ``NVM_V3_R9T`` has the matrix and the translation of ``x_cam = R x + t`` instead
 (``pba/src/pba/util.h`` of Multicore Bundle Adjustment). k is of the measured place:
 ``(1 + k r^2) m / f`` is the undistorted one, with ``r = |m| / f``. Measured places m are counted
-from the principal point, which is the middle of the frame unless FixedK says otherwise.
+from the principal point, which is the middle of the frame unless FixedK states another.
 
 OpenSfM and ODM write .nvm files with places from the upper left corner, and scale the shorter side
 of the frame by its own length instead of the longer one's. Such a file is recognised by places none
 of which is negative and which are far from where the points project. The middle of its frame, and
 whether the shorter side is squeezed, then follow from the points themselves.
 
-None has the sizes of the images: they are those of the images beside the file, or else the smallest
-that hold all tie points. The files name no CRS.
+None has the sizes of the images: they are those of the images next to the file, or else the
+smallest that hold all tie points. The files name no CRS.
 """
 
 from __future__ import annotations

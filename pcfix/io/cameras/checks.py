@@ -42,10 +42,10 @@ _HEAD_BYTES = 4096
 
 @dataclass(frozen=True)
 class Source:
-    """A file or folder that may hold cameras, and what the user said about it.
+    """A file or folder that may hold cameras, and what the user states about it.
 
     `sensor` is the ``--sensor`` file, `angles` the kind of angles of a table whose header does not
-    say it.
+    name it.
     """
 
     path: Path
@@ -279,7 +279,7 @@ def measured(
 
 
 def crs(path: Path, definition: str) -> str:
-    """Return what a file says of its CRS: ``local``, or a definition that PROJ understands."""
+    """Return the CRS that a file states: ``local``, or a definition that PROJ understands."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
@@ -349,7 +349,7 @@ def rows_of(wanted: IntArray, identifiers: IntArray) -> IntArray:
 def tie_points(*parts: Seen) -> TiePoints:
     """Join points and gather their observations by point, without those of a camera -1.
 
-    An observation that is not finite is left out, and such a position is unknown.
+    An observation that is not finite is skipped, and such a position is unknown.
     """
     before = np.cumsum([0, *(len(part.xyz) for part in parts)])
     xyz = np.concatenate([part.xyz for part in parts])
@@ -358,10 +358,10 @@ def tie_points(*parts: Seen) -> TiePoints:
     is_there = np.concatenate([(part.camera >= 0) & (part.point >= 0) for part in parts])
     camera = np.concatenate([part.camera for part in parts])
     uv = np.concatenate([part.uv for part in parts])
-    kept = np.flatnonzero(is_there & np.isfinite(uv).all(axis=1))
-    kept = kept[np.argsort(point[kept], kind="stable")]
-    start = np.concatenate([[0], np.cumsum(np.bincount(point[kept], minlength=len(xyz)))])
-    return TiePoints(xyz, Views(start, camera[kept]), uv[kept])
+    used = np.flatnonzero(is_there & np.isfinite(uv).all(axis=1))
+    used = used[np.argsort(point[used], kind="stable")]
+    start = np.concatenate([[0], np.cumsum(np.bincount(point[used], minlength=len(xyz)))])
+    return TiePoints(xyz, Views(start, camera[used]), uv[used])
 
 
 def image_size(folder: Path, name: str) -> tuple[int, int] | None:
@@ -395,7 +395,7 @@ def block_to_write(path: Path, cameras: Cameras) -> tuple[FloatArray, tuple[Lens
 
 
 def write_new(folder: Path, contents: Mapping[str, bytes]) -> None:
-    """Write files into a folder, made if need be; none where one of them exists."""
+    """Write files into a folder, which need not exist; none where one of them exists."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in contents:
         check_output(folder / name, overwrite=False)

@@ -6,8 +6,8 @@ image in rigs also. Definition: https://colmap.github.io/format.html.
 
 A pose is a unit quaternion, scalar first, and a translation, both world to camera, in OpenCV
 axes: ``x_cam = R x + t``, so the projection centre is ``-R' t``. Pixels start at the upper left
-corner of the upper left pixel. The files name no CRS, unless ``georeference.json`` of pcfix is
-beside them (``crs``, text or null, ``offset_m``, three numbers, ``written_by``): its offset is then
+corner of the upper left pixel. The files name no CRS, unless ``georeference.json`` of pcfix is next
+to them (``crs``, text or null, ``offset_m``, three numbers, ``written_by``): its offset is then
 added to centres and tie points, and its CRS is theirs.
 
 Binary files are little-endian, with counts before lists and names that end with a zero byte; text
@@ -113,7 +113,7 @@ def _models_at(path: Path) -> list[Path]:
 
 
 def _is_model(listed: Path) -> bool:
-    """Whether there is a list of cameras, and one of images beside it."""
+    """Whether there is a list of cameras, and one of images next to it."""
     if not (listed.is_file() and listed.with_stem("images").is_file()):
         return False
     with listed.open(encoding="utf-8-sig", errors="replace") as stream:
@@ -121,7 +121,7 @@ def _is_model(listed: Path) -> bool:
 
 
 def read_place(folder: Path) -> tuple[FloatArray, str | None]:
-    """Return the offset of a model's positions and their CRS, from pcfix's file beside it."""
+    """Return the offset of a model's positions and their CRS, from pcfix's file next to it."""
     path = folder / FILE
     with checks.reading(path):
         found = checks.load_json(path) if path.is_file() else None
@@ -332,7 +332,7 @@ def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = 
     cameras : Cameras
         With rotations and lenses in pixels.
     tie_points : TiePoints, optional
-        In the frame of the cameras; those without a position or without a view are left out.
+        In the frame of the cameras; those without a position or without a view are skipped.
     """
     from scipy.spatial.transform import Rotation
 

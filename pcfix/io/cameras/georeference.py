@@ -4,11 +4,11 @@ Centres go through PROJ, point by point. A rotation is taken over at its own cen
 one metre along the source's axes become three vectors in the target, and the rotation next to them
 turns the camera. That is the meridian convergence between maps, and all of the rotation from
 geocentric or topocentric axes. What it cannot hold is the scale of the map against that of the
-heights, 0.9996 on the central meridian of UTM: points 100 m below lie up to that part of their
+heights, 0.9996 on the central meridian of UTM: points 100 m below are up to that part of their
 distance from the principal point elsewhere in the image, 0.8 px at the edge of 4000 px. A cloud
 in map coordinates has the same flaw.
 
-Heights are shifted only where both sides say what theirs are. Where one does not, they stay:
+Heights are shifted only where both sides state what theirs are. Otherwise they do not change:
 ellipsoidal ones remain ellipsoidal, whatever the cloud's datum is.
 """
 
@@ -165,8 +165,8 @@ def georeference(
         Projected, in metres. None where the cloud names none: then they are brought to where
         the software delivers clouds, mostly where the cameras are.
     cameras_crs : str, optional
-        Overrides what the file says. ``local``: the numbers are taken as they are. A CRS without
-        heights says that these agree with the cloud's, and so does ``ENU:lat,lon,height``. For a
+        Overrides the CRS in the file. ``local``: the numbers are used as they are. A CRS without
+        heights states that these agree with the cloud's, and so does ``ENU:lat,lon,height``. For a
         file with geocentric positions it is the CRS in which its software delivers clouds, unless
         it is geocentric itself.
     offset_m : tuple of 3 float, optional
@@ -279,7 +279,7 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatA
 
     That is metres along the axes of the cameras' map, or east, north, up where they are in none,
     shape (k, 3); NaN where a camera has no position, and where the two cannot be compared, which is
-    often so of heights. The text says why they cannot.
+    often so of heights. The text is the reason why they cannot.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Agisoft Metashape and PhotoScan: exported cameras or markers, and whole projects.
 
 Read are the XML of *Export Cameras* and *Export Markers*, projects of one file (.psz, a zip) and
-projects with a folder (.psx, whose documents lie in zips in ``<name>.files``).
+projects with a folder (.psx, whose documents are zips in ``<name>.files``).
 
 Convention. ``camera/transform`` is a 4x4 matrix from the camera (x right, y down, z forward) to the
 chunk, whose origin, axes and scale mean nothing. The ``transform`` of the camera's component, or of
@@ -133,7 +133,7 @@ def open_chunk(path: Path) -> Document:
     """Return the active chunk, or the first that has aligned images where that one has none."""
     named = path / "project.zip" if path.is_dir() else path
     top = Document(read_xml(named), named)
-    if top.root.tag == "document" and (inside := top.root.get("path")):  # .psx: beside it
+    if top.root.tag == "document" and (inside := top.root.get("path")):  # .psx: in its folder
         named = path.parent / inside.replace("{projectname}", path.stem)
         top = Document(read_xml(named), named)
     chosen = top
@@ -389,7 +389,7 @@ def _gnss_positions(
 ) -> tuple[GnssPositions | None, list[PcfixWarning]]:
     """Return the reference positions of images, and notes on them.
 
-    Positions that the user unticked are no measurement and left out, unless all are, as is usual
+    Positions that the user unticked are no measurement and skipped, unless all are, as is usual
     when only control points determine the block.
     """
     path, given = chunk.path, [image.element.find("reference") for image in images]
@@ -447,7 +447,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the tie points of a project, then the markers, with what was measured of them.
 
     A marker has no position (NaN), as the file has only its surveyed coordinates. Projections
-    that Metashape itself computed are left out.
+    that Metashape itself computed are skipped.
     """
     chunk = open_chunk(source.path)
     images, frame, seen = aligned_images(chunk)[0], chunk.frame, list[checks.Seen]()
@@ -467,7 +467,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
 
 
 def _tie_points(frame: Document, images: list[Image]) -> Iterator[checks.Seen]:
-    """Yield the points of every component that has a place; their archive may be left out."""
+    """Yield the points of every component that has a place; their archive may be missing."""
     clouds = (*frame.root.iterfind("point_cloud"), *frame.root.iterfind("tie_points"))
     there = [one for one in clouds if (path := frame.path_to(one)) is None or path.is_file()]
     for document in map(frame.follow, there):

@@ -3,7 +3,7 @@
 `Externe` has the projection centre (`Centre`) and the matrix camera to world as rows L1, L2, L3
 (`CodageMatr`); the camera is x right, y down, z forward. The interior orientation is `Interne` in
 the same file, or in the file that `FileInterne` names from the folder in which MicMac ran; it is
-looked for beside the orientation first. `OrIntImaM2C` is an affine map from the camera's pixels to
+looked for next to the orientation first. `OrIntImaM2C` is an affine map from the camera's pixels to
 those of a scaled image. The formats do not say whether pixels begin at the corner or the centre of
 the first; they are taken as they are. The files name no CRS.
 
@@ -15,13 +15,13 @@ affinity b1 x + b2 y of Fraser's is of the ideal place, that of a lens of the di
 read where that makes no difference, up to `AFFINITY_PX`. mm3d ConvertCalib converts the others.
 
 MMVII has the centre (`Center`) and the camera's axes in the world (`AxeI`, `AxeJ`, `AxeK`), the
-same matrix by columns, and the calibration in a file beside it: ideal places (X, Y) / Z to observed
-ones with K1, K2, ... radial, p1, p2, b1 and b2 as above; anything beyond is refused.
+same matrix by columns, and the calibration in a file next to it: ideal places (X, Y) / Z to
+observed ones with K1, K2, ... radial, p1, p2, b1 and b2 as above; anything beyond is refused.
 
 References: M. Pierrot-Deseilligny and others, "MicMac, Apero, Pastis and other beverages in a
 nutshell", https://github.com/micmacIGN/Documentation, "Distortion models" and ConvertCalib;
 include/XML_GEN/ParamChantierPhotogram.xml of https://github.com/micmacIGN/micmac for the elements;
-MMVII's files write the formula of each coefficient beside it.
+MMVII's files write the formula of each coefficient next to it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is likely wrong where cameras do not lie over their cloud."""
+"""What is likely wrong where cameras are not over their cloud."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 FOOT_M = 0.3048
 MARGIN_M = 100.0
-"""With half the cloud's sides: how far outside the cloud a block may stand."""
+"""With half the cloud's sides: how far outside the cloud a block may be."""
 UNDULATION_M = (15.0, 110.0)
 """Of the geoid, where it is worth a word."""
 ABSURD_HEIGHTS = 3.0
@@ -43,7 +43,7 @@ def likely_mistake(
     size, margin = high - low, 0.5 * (high - low)[:2] + MARGIN_M
 
     def is_over(moved: FloatArray) -> bool:
-        """Whether the middle of a block is over the cloud, or not far beside it."""
+        """Whether the middle of a block is over the cloud, or not far from it."""
         middle = np.median(moved[:, :2], axis=0)
         return bool(np.all((middle >= low[:2] - margin) & (middle <= high[:2] + margin)))
 
@@ -53,11 +53,11 @@ def likely_mistake(
         if is_over(moved):
             return f"The cameras would lie over the cloud {words}."
     x, y = (low + high)[:2] / 2.0 - np.median(centres[:, :2], axis=0)
-    span, apart = np.ptp(centres[:, :2], axis=0).max(), float(np.hypot(x, y))
+    span, away = np.ptp(centres[:, :2], axis=0).max(), float(np.hypot(x, y))
     advice = "check the CRS of both."
     if 0.2 < span / max(size[:2].max(), 1e-9) < 5.0:
         advice = f"perhaps by an offset of {x:.0f}, {y:.0f} m; see --cameras-offset."
-    far = f"{apart / 1000.0:,.1f} km" if apart >= 1e4 else f"{apart:.0f} m"
+    far = f"{away / 1000.0:,.1f} km" if away >= 1e4 else f"{away:.0f} m"
     return f"The cameras are {far} from the cloud in plan; {advice}"
 
 
@@ -73,16 +73,16 @@ def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str,
     plan = None if crs is None else parts(parse_crs(crs, "the cloud"))[0]
     if plan is None or not plan.is_projected:
         return
-    say, zone = "set it with --cameras-crs", int((plan.utm_zone or "0N")[:-1])
+    remedy, zone = "set it with --cameras-crs", int((plan.utm_zone or "0N")[:-1])
     others = [
-        (f"longitude and latitude in degrees; {say} EPSG:4326", 4326, centres),
+        (f"longitude and latitude in degrees; {remedy} EPSG:4326", 4326, centres),
         ("degrees, latitude before longitude; exchange the columns", 4326, swapped),
-        (f"web Mercator; {say} EPSG:3857", 3857, centres),
+        (f"web Mercator; {remedy} EPSG:3857", 3857, centres),
     ]
     # the zones within two of the cloud's, and the other hemisphere
     for near in [(zone + step - 1) % 60 + 1 for step in (0, -1, 1, -2, 2)] if zone else []:
         for side, first in (("N", 32600), ("S", 32700)):
-            words = f"UTM zone {near}{side} (the cloud is in {plan.utm_zone}); {say}"
+            words = f"UTM zone {near}{side} (the cloud is in {plan.utm_zone}); {remedy}"
             others.append((words, first + near, centres))
     for words, code, numbers in others:
         with suppress(ProjError):  # of a CRS that is no single map, as all zones of UTM in one
@@ -92,7 +92,7 @@ def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str,
 
 
 def _wrong_height(middle: float, low: FloatArray, high: FloatArray) -> str | None:
-    """Return what is likely wrong where cameras lie over the cloud, but not above it."""
+    """Return what is likely wrong where cameras are over the cloud in plan, but not above it."""
     below, above = float(low[2]) - middle, middle - float(high[2])
     width = max(float((high - low)[:2].max()), MARGIN_M)
     limit = ABSURD_HEIGHTS * width

@@ -106,7 +106,7 @@ def _files_of(path: Path) -> Files:
     """Return the files of the project that a file or folder belongs to.
 
     A file is taken as it is; of a folder its reconstruction, or else its shots.geojson. Other files
-    are beside it, or in the project's own folders.
+    are next to it, or in the project's own folders.
     """
     folder = path if path.is_dir() else path.parent
     root = folder.parent if folder.name == "undistorted" else folder

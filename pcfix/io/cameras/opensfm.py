@@ -1,4 +1,4 @@
-"""OpenSfM: reconstruction.json, and tracks.csv beside it.
+"""OpenSfM: reconstruction.json, and tracks.csv next to it.
 
 The file is a list of reconstructions, each with `cameras`, `shots` and `points`. A shot's
 `rotation` (axis times angle, radians) and `translation` take world to camera, x right, y down, z

@@ -1,7 +1,7 @@
 """OPF, the Open Photogrammetry Format of PIX4Dmatic and PIX4Dcatch: a project and its parts.
 
 The project (``.opf``, JSON) names files by item and format. Of the item `calibration` come the
-calibrated cameras and the tracks; `input_cameras` has frames, pixel sizes and what the GNSS said;
+calibrated cameras and the tracks; `input_cameras` has frames, pixel sizes and the GNSS positions;
 `camera_list` the names of the images; `scene_reference_frame` the CRS.
 
 Poses are in the processing CRS, which is right-handed and isometric: coordinates of the project's
@@ -13,9 +13,9 @@ image axes x right, y up, z back to the processing CRS.
 Pixels start at the corner of the image; T1 and T2 are in OpenCV's order. A fisheye has an affine
 matrix [c d; e f] and a polynomial of 2 theta / pi, as in `pcfix.io.cameras.pix4d`.
 
-Tracks are a glTF model with its buffers beside it: positions in the axes of each node, whose matrix
-leads to y up (so processing x, y, z are its x, -z, y), and for each point 40 bits that say where
-its matches begin and 24 how many they are.
+Tracks are a glTF model with its buffers next to it: positions in the axes of each node, whose
+matrix leads to y up (so processing x, y, z are its x, -z, y), and of each point the first of its
+matches in 40 bits and their count in 24.
 
 Reference: Pix4D, "Open Photogrammetry Format Specification" 1.0, https://pix4d.github.io/opf-spec.
 """
@@ -136,10 +136,10 @@ def _frame_of(project: Project) -> AffineFrame:
         raise checks.damaged(path, f"the scale {scale.tolist()} is not positive")
     if way.get("swap_xy"):
         scale = scale[[1, 0, 2]]  # positions are east, north already, scales in the CRS's order
-    said = checks.crs(path, scene["crs"]["definition"])
-    crs, unit = (said, 1.0) if said == "local" else _with_heights(said, str(path))
+    stated = checks.crs(path, scene["crs"]["definition"])
+    crs, unit = (stated, 1.0) if stated == "local" else _with_heights(stated, str(path))
     size = [1.0, 1.0, unit] / scale
-    return AffineFrame(np.diag(size), -shift * size, crs, None if crs == said else said)
+    return AffineFrame(np.diag(size), -shift * size, crs, None if crs == stated else stated)
 
 
 def _with_heights(text: str, name: str) -> tuple[str, float]:
@@ -180,8 +180,8 @@ def _gnss(path: Path, captures: list[Part], ids: list[int]) -> GnssPositions | N
     text = next((place["crs"]["definition"] for place in found.values()), "local")
     if checks.crs(path, text) == "local":
         return None
-    said, up_m = _with_heights(text, str(path))
-    crs = parse_crs(said, str(path))
+    stated, up_m = _with_heights(text, str(path))
+    crs = parse_crs(stated, str(path))
     order = [1, 0, 2] if crs.axis_info[0].direction.lower() == "north" else [0, 1, 2]
     unit_m = 1.0 if crs.is_geographic else plan_unit(crs)[1]
     places = {
@@ -189,7 +189,7 @@ def _gnss(path: Path, captures: list[Part], ids: list[int]) -> GnssPositions | N
         for i, p in found.items()
         if p["crs"]["definition"] == text
     }
-    return checks.measured(ids, places, said)
+    return checks.measured(ids, places, stated)
 
 
 COMPONENTS = {"5121": "u1", "5123": "<u2", "5125": "<u4", "5126": "<f4"}

@@ -13,8 +13,8 @@ similar rotations belong together.
 ``pix4d_calibrated_internal_camera_parameters.cam`` has the interior orientation in millimetres,
 ``wkt.prj`` the CRS, and the project file (.p4d) the GNSS positions.
 Image measurements are in ``tp_bingo.txt`` (mm from the image centre, y up, the size of the sensor
-beside each name) and ``tp_pix4d.txt`` (pixels). ``calibrated_images_position.txt`` and
-``pmatrix.txt`` repeat what the tables say.
+after each name) and ``tp_pix4d.txt`` (pixels). ``calibrated_images_position.txt`` and
+``pmatrix.txt`` repeat the tables.
 
 References: Pix4D, "What does the Output Params Folder contain?" (support.pix4d.com, article
 202977149), "How are the Internal and External Camera Parameters defined?" (article 202559089).
@@ -68,7 +68,7 @@ FIELDS = {
     "position": "centre",
     "rotation": "rotation",
 }
-"""What the header of the camera parameters says, and the names of the numbers in `lenses`."""
+"""What the header of the camera parameters names, and the names of the numbers in `lenses`."""
 SHAPE = re.compile(r"^(.*?)\s*\[\s*(\d{1,2})\s*x\s*(\d{1,2})\s*\]\s*$")
 SENSOR = re.compile(r"sensor width of\s*([-+.\deE]+)\s*x\s*([-+.\deE]+)")
 CALIBRATION = re.compile(r"(?im)^pix4d camera calibration file.*$")
@@ -144,7 +144,7 @@ def _columns(source: Source) -> list[str]:
 def _find(source: Source) -> dict[str, Path]:
     """Return the files of the project that are there, by the names in `NAMES`, and ``project``.
 
-    The project's name precedes that of the files; its file is beside or in its folder.
+    The project's name precedes that of the files; its file is next to its folder or in it.
     """
     path, columns = source.path, _columns(source)
     is_project, found = b"<pix4uav" in source.head, TABLE.fullmatch(path.name)
@@ -195,8 +195,8 @@ def _rows(
     for i, label in enumerate(labels):
         rows, nearest = left[label], 0
         if turns and len(rows) > 1:
-            apart = np.linalg.norm(turns[1][rows] - turns[0][i], axis=(1, 2))
-            nearest = int(np.argmin(apart))
+            differences = turns[1][rows] - turns[0][i]
+            nearest = int(np.argmin(np.linalg.norm(differences, axis=(1, 2))))
         found.append(rows.pop(nearest) if rows else -1)
     return found
 
@@ -304,7 +304,7 @@ def _lens(
 ) -> Lens | None:  # fmt: skip
     """Return the lens of an image, in pixels, or else that of the calibration of all images.
 
-    The latter is in mm where the size of the image is not known. None where neither says enough: a
+    The latter is in mm where the size of the image is not known. None where neither suffices: a
     fisheye needs the size, as its matrix is in pixels and its principal point in mm.
     """
     given: dict[str, float] = {}

@@ -1,4 +1,4 @@
-"""RealityCapture and RealityScan: .xmp files beside the images, one each.
+"""RealityCapture and RealityScan: .xmp files next to the images, one each.
 
 The fields of the namespace ``xcr`` are attributes or child elements. `Rotation` is world to
 camera by rows (x right, y down, z forward) and `Position` the projection centre. Lengths in the
@@ -14,7 +14,7 @@ x' = ... + t1 (r^2 + 2 x^2) + 2 t2 x y; models named brown3 leave k4 out, those 
 last two. The division model undoes the distortion after the calibration matrix, about the centre
 of the image: m = m' / (1 + k1 |m'|^2), m and m' places in shares of the larger side.
 
-The size of an image is not in the file: it is that of the image beside it, or from the proportions
+The size of an image is not in the file: it is that of the image next to it, or from the proportions
 of ``--sensor``. Positions called relative or rigid are in a local frame; absolute ones are in the
 CRS of the export, which the file does not name; its `latitude` and `longitude` are others.
 

@@ -1,6 +1,6 @@
-"""The lens of the images of a table, and a block written as a table with its sensor beside it.
+"""The lens of the images of a table, and a block written as a table with its sensor next to it.
 
-The lens is that of a table beside it, a calibration, or the table's own columns. Written are
+The lens is that of a table next to it, a calibration, or the table's own columns. Written are
 ``cameras.csv``, with label, x, y, z, qw, qx, qy, qz: projection centre and rotation from the world
 to the camera (x right, y down, z forward), after a comment with the CRS where there is one; and
 ``sensor.csv``, with the one lens of all images, in pixels with OpenCV's names or, of an undistorted

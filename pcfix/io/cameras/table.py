@@ -3,7 +3,7 @@
 Fields are separated by comma, semicolon, tab or spaces; the header may be a comment (#), and units
 may stand in it (x[m], omega[gon]). What its columns may be called is in `SPELLINGS`: the image, its
 projection centre (longitude and latitude in degrees of WGS 84 are EPSG:4326, or EPSG:4979 if the
-header says that the heights are ellipsoidal), and how it is turned, or nothing:
+header calls the heights ellipsoidal), and how it is turned, or nothing:
 
 - omega, phi, kappa: photogrammetric camera axes (x right, y up, z back) go to the world by
   Rx(omega) Ry(phi) Rz(kappa); a matrix next to them is ignored.
@@ -12,12 +12,12 @@ header says that the heights are ellipsoidal), and how it is turned, or nothing:
   pitch, roll of RealityCapture.
 - yaw, pitch, roll of a gimbal, -90 for a view straight down (``angles="aircraft"``, or
   exiftool's GimbalPitchDegree): Rz(-yaw) Rx(90 + pitch) Rz(-roll). Angles that fit this better
-  than the former are refused until the user says which they are.
+  than the former are refused until the user names their kind.
 - qw, qx, qy, qz: world to camera with axes x right, y down, z forward, as in COLMAP.
 - only r11 ... r33: world to camera, to either of the two axes; the cameras look down.
 
 Axes of the world are those of the CRS of the positions: its grid north, or for degrees the east,
-north and up of the place. Values called ``_est`` are adjusted ones; the others beside them are then
+north and up of the place. Values called ``_est`` are adjusted ones; the others are then
 positions by GNSS, with the stated accuracies (Metashape's reference table).
 
 RealityCapture's ``f, px, py, k1 ... k4, t1, t2``: f in mm for a film of 36 mm along the larger side
@@ -219,22 +219,22 @@ def crs(columns: Table) -> tuple[str | None, tuple[PcfixWarning, ...]]:
     """Return the CRS that a table states or implies, and notes on it.
 
     Longitude and latitude without more are those of WGS 84. Heights then are ellipsoidal only
-    if the header calls them so; else the CRS has no heights. A ``.prj`` of the table's name beside
-    it counts where the table itself says nothing.
+    if the header calls them so; else the CRS has no heights. A ``.prj`` of the table's name next
+    to it counts where the table itself states none.
     """
-    said, beside = columns.crs, columns.path.with_suffix(".prj")
-    if not said and beside != columns.path and beside.is_file():
-        said = " ".join(tables.read_lines(beside)).strip() or None
-    if said is None:
+    stated, beside = columns.crs, columns.path.with_suffix(".prj")
+    if not stated and beside != columns.path and beside.is_file():
+        stated = " ".join(tables.read_lines(beside)).strip() or None
+    if stated is None:
         if axes(columns.place) != ("longitude", "latitude", "z"):
             return None, ()
         ellipsoidal = columns.name("z").startswith("ellipsoid")
         return WGS84_ELLIPSOIDAL if ellipsoidal else WGS84, ()
     try:
-        return checks.crs(columns.path, said), ()
+        return checks.crs(columns.path, stated), ()
     except InputError:
-        sentence = f"PROJ does not know its CRS '{shortened(said)}'. The cloud's is assumed."
-        return None, (note(columns.path, "cameras.crs_unknown", sentence, crs=said),)
+        sentence = f"PROJ does not know its CRS '{shortened(stated)}'. The cloud's is assumed."
+        return None, (note(columns.path, "cameras.crs_unknown", sentence, crs=stated),)
 
 
 def is_geo(lines: list[str]) -> bool:
@@ -260,7 +260,7 @@ LOOKS_DOWN_DEG = 80.0
 def _rotations(columns: Table, angles: Angles | None) -> FloatArray | None:
     """Return world to camera rotations, or None where the table has nothing that turns.
 
-    `angles` is what the user says that they are. What the header cannot say, the view must: the
+    `angles` is their kind as the user names it. Where the header cannot, the view must decide: the
     cameras look down at the ground.
     """
     path, wanted = columns.path, CONVERSIONS[angles][0] if angles else ()
