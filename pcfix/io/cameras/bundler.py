@@ -49,7 +49,7 @@ from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_photogrammetric
 from pcfix.model import Cameras, FloatArray, TiePoints
 
-CONTENT = re.compile(r"\A\s*(#\s*Bundle file v\d|drews 1\.0|NVM_V3)")
+CONTENT = re.compile(r"\A\s*(#\s*Bundle file v\d+\.\d+|drews 1\.0|NVM_V3)")
 _BUNDLER = re.compile(r"#\s*Bundle file v(\d+\.\d+)")
 _VERSION = "0.3"
 _CAMERA_NUMBERS = 15

@@ -157,7 +157,9 @@ def unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
 def read_document(path: Path) -> bytes:
     """Return a file, or of an archive its ``doc.xml`` or else the first XML document."""
     with reading(path):
-        if not zipfile.is_zipfile(path):
+        with path.open("rb") as stream:
+            is_archive = stream.read(len(ZIP_MAGIC)) == ZIP_MAGIC
+        if not is_archive:
             return path.read_bytes()
         with zipfile.ZipFile(path) as archive:
             listed = [name for name in archive.namelist() if name.lower().endswith(".xml")]
