@@ -78,12 +78,12 @@ def check_cameras(
     if view is not None:
         sample = sample_of(view, SAMPLE_POINTS, surface)
         xyz, heights = sample.xyz, sample.heights
-        cameras = inputs.block(view.crs, read)[0]
-    else:
-        try:
-            cameras = inputs.block(None, read)[0]
-        except InputError as error:
-            cameras, problem = read, str(error)
+    try:
+        cameras = inputs.block(None if view is None else view.crs, read)[0]
+    except InputError as error:
+        if view is not None:
+            raise
+        cameras, problem = read, str(error)
     if given.gnss is not None:
         cameras = read_gnss(given.gnss, cameras)
     diagnosis, remedy = None, ("", "")
@@ -152,23 +152,23 @@ def sensors_of(cameras: Cameras, above_m: FloatArray | None) -> list[Plain]:
     ``lenses`` counts the lenses that differ, and ``folded`` is the share of the frame beyond the
     fold of the distortion.
     """
-    groups: dict[Any, list[int]] = {}
-    is_shared = 2 * len(set(cameras.lenses or ())) <= len(cameras)
-    for row, lens in enumerate(cameras.lenses or ()):
+    all_lenses, groups = cameras.lenses or (), dict[Any, list[int]]()
+    is_shared = 2 * len(set(all_lenses)) <= len(cameras)
+    for row, lens in enumerate(all_lenses):
         kind = lens.sensor, lens.width, lens.height, lens.unit, lens.projection
         groups.setdefault(lens if is_shared else kind, []).append(row)
     sensors = []
     for rows in groups.values():
-        lenses = list(dict.fromkeys((cameras.lenses or ())[row] for row in rows))
-        lens = lenses[0]
+        lenses = list(dict.fromkeys(all_lenses[row] for row in rows))
+        lens, focal = lenses[0], [one.focal for one in lenses]
         height_m = 0.0 if above_m is None else float(np.mean(above_m[rows]))
         sensors.append({
             "name": lens.sensor,
             "images": len(rows),
             "width": lens.width,
             "height": lens.height,
-            "focal": min(one.focal for one in lenses),
-            "focal_most": max(one.focal for one in lenses),
+            "focal": min(focal),
+            "focal_most": max(focal),
             "unit": lens.unit,
             "projection": lens.projection,
             "distorted": _is_distorted(lens),
@@ -244,12 +244,11 @@ def _fit(
 def cameras_text(report: CamerasReport) -> str:
     """Return the summary of a camera file."""
     r, cameras, z = report.figures, report.cameras, report.cameras.centres[:, 2]
-    missing, fit, gnss, found = cameras.unposed, r["fit"], r["gnss"], report.diagnosis
+    missing, sensors, fit, gnss = cameras.unposed, r["sensors"], r["fit"], r["gnss"]
     images = f"{len(cameras):,} with a pose"
     if missing:
         more = ", ..." if len(missing) > SHOWN_NAMES else ""
         images += f", {len(missing):,} without: {', '.join(missing[:SHOWN_NAMES])}{more}"
-    sensors = r["sensors"]
     rows = [("Images", images), *(row for s in sensors[:MOST_SENSORS] for row in _sensor_rows(s))]
     if len(sensors) > MOST_SENSORS:
         rows.append(("", f"and {len(sensors) - MOST_SENSORS} more"))
@@ -268,17 +267,16 @@ def cameras_text(report: CamerasReport) -> str:
     if r["tilt_deg"] is not None:
         median, largest = r["tilt_deg"]
         rows.append(("Tilt", f"median {median:.1f} deg, largest {largest:.1f} deg"))
-    if gnss is not None:
+    if gnss is not None and gnss["images"]:
         mean, sd = (
             ", ".join("-" if one is None else f"{one:{form}}" for one in gnss[name])
             for name, form in (("mean_m", "+.3f"), ("sd_m", ".3f"))
         )
-        if gnss["images"]:
-            rows.append(("GNSS", f"{gnss['images']:,} images; adjusted minus GNSS east, north, up:"
-                         f" mean {mean} m, sd {sd} m; largest {gnss['largest_m']:.3f} m"
-                         f" ({gnss['largest_image']})"))  # fmt: skip
-        if gnss["reason"]:
-            rows.append(("" if gnss["images"] else "GNSS", gnss["reason"]))
+        rows.append(("GNSS", f"{gnss['images']:,} images; adjusted minus GNSS east, north, up:"
+                     f" mean {mean} m, sd {sd} m; largest {gnss['largest_m']:.3f} m"
+                     f" ({gnss['largest_image']})"))  # fmt: skip
+    if gnss is not None and gnss["reason"]:
+        rows.append(("GNSS", gnss["reason"]))
     if fit is not None:
         seen = (f"{name}: {100.0 * part:.1f} %" for name, part in fit["seen_by"].items())
         rows += [
@@ -286,7 +284,7 @@ def cameras_text(report: CamerasReport) -> str:
             ("Visible", f"share of points by number of cameras: {', '.join(seen)}"),
             ("Check", fit["verdict"] or fit["tested"]),
         ]
-    if found is not None:
+    if (found := report.diagnosis) is not None:
         says = {True: "absorbed", False: "not absorbed", None: "open"}
         verdict = f"not known; give control points (--gcps), or {EXPORT}"
         if found.absorbed:
@@ -301,20 +299,15 @@ def cameras_text(report: CamerasReport) -> str:
 def _sensor_rows(s: Plain) -> Rows:
     """Return frame, focal length and pixel size of a sensor, and what is wrong with its lens."""
     low, high = f"{s['focal']:.6g}", f"{s['focal_most']:.6g}"
-    words = [
-        f"{s['name'] or 'unnamed'}: {s['images']:,} images",
-        f" with {s['lenses']:,} different lenses" if s["lenses"] > 1 else "",
-        f", {s['width']:g} x {s['height']:g} {s['unit']}",
-        f", focal length {low if low == high else f'{low} to {high}'} {s['unit']}",
-    ]
-    words.append(f", {s['projection']}{', distorted' * s['distorted']}")
-    if s["gsd_m"] is not None:
-        words.append(f", GSD {100.0 * s['gsd_m']:.2f} cm at the water")
-    rows = [("Sensor", "".join(words))]
-    if s["folded"]:
-        rows.append(("", f"the distortion folds within the frame: {100.0 * s['folded']:.2g} % of it"
-                     " is not used; check the radial coefficients"))  # fmt: skip
-    return rows
+    words = f"{s['name'] or 'unnamed'}: {s['images']:,} images"
+    words += f" with {s['lenses']:,} different lenses" if s["lenses"] > 1 else ""
+    words += f", {s['width']:g} x {s['height']:g} {s['unit']}, focal length"
+    words += f" {low if low == high else f'{low} to {high}'} {s['unit']}, {s['projection']}"
+    words += ", distorted" if s["distorted"] else ""
+    words += f", GSD {100.0 * s['gsd_m']:.2f} cm at the water" if s["gsd_m"] is not None else ""
+    folded = f"the distortion folds within the frame: {100.0 * s['folded']:.2g} % of it is not used"
+    fold: Rows = [("", f"{folded}; check the radial coefficients")] if s["folded"] else []
+    return [("Sensor", words), *fold]
 
 
 def _short(crs: str | None) -> str:
@@ -337,25 +330,20 @@ def draw_footprints(plan: Axes, cameras: Cameras, level_m: float, **look: Any) -
 
 def block_figure(report: CamerasReport) -> Figure:
     """Draw the block in plan, with the footprints of its frames, and from the south."""
-    cameras, xyz = report.cameras, report.sample_xyz
+    cameras, xyz, level = report.cameras, report.sample_xyz, report.level_m
     figure, (plan, side) = new_figure(8.0, 8.5, nrows=2, height_ratios=[5, 2])
-    level = report.level_m  # of the footprints: the water, or else the middle of the cloud
-    if level is None:
-        level = float(np.median(xyz[:, 2])) if len(xyz) else np.nan
-    shown = draw_cloud(figure, plan, xyz, report.level_m, label="cloud")
-    if len(shown):
-        side.plot(shown[:, 0], shown[:, 2], ".", color="0.6", markersize=1, label="cloud")
-    has_footprints = draw_footprints(plan, cameras, level, linewidth=0.6, alpha=0.6)
-    plan.plot(*cameras.centres[:, :2].T, "^", color=AFTER, markersize=4, label="cameras")
-    if has_footprints:
+    shown = draw_cloud(figure, plan, xyz, level, label="cloud")
+    side.plot(shown[:, 0], shown[:, 2], ".", color="0.6", markersize=1)
+    if level is not None:
+        side.axhline(level, color=WATER)
+    elif len(xyz):
+        level = float(np.median(xyz[:, 2]))  # of the footprints: the middle of the cloud
+    if level is not None and draw_footprints(plan, cameras, level, linewidth=0.6, alpha=0.6):
         plan.plot([], [], color=WATER, label=f"footprints at {level:.1f} m")
-    side.plot(cameras.centres[:, 0], cameras.centres[:, 2], "^", color=AFTER, markersize=4)
-    if report.level_m is not None:
-        side.axhline(report.level_m, color=WATER, label="water")
+    for axes, heights in ((plan, cameras.centres[:, 1]), (side, cameras.centres[:, 2])):
+        axes.plot(cameras.centres[:, 0], heights, "^", color=AFTER, markersize=4, label="cameras")
     label_plan(plan, 20.0)
     label_side(side)
     side.tick_params(axis="x", labelrotation=20)
     legend_below(plan)
-    if side.get_legend_handles_labels()[0]:
-        side.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     return figure

@@ -37,7 +37,7 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io.cameras import metashape
-from pcfix.io.cameras.checks import Source
+from pcfix.io.cameras.checks import Source, recognises
 from pcfix.io.cameras.checks import number as xml_number
 from pcfix.io.cameras.odm import named_crs
 from pcfix.io.cameras.table import AXES, centres, has_header
@@ -268,7 +268,7 @@ def _to_cameras(
 
 def read_marks(path: Path) -> tuple[list[Mark], str | None]:
     """Read the marks of a file, and the CRS that it states."""
-    if metashape.recognises(Source(path)):
+    if recognises(metashape, Source(path)):
         return _from_metashape(path)
     lines = read_lines(path)
     numbered = [(i, line.split()) for i, line in enumerate(lines, start=1) if line.strip()]
@@ -358,20 +358,20 @@ def _odm_table(path: Path, rows: list[tuple[int, list[str]]]) -> Table:
 def _from_metashape(path: Path) -> tuple[list[Mark], str | None]:
     """Read the markers that have surveyed coordinates, where they were measured in the images."""
     chunk = metashape.open_chunk(path)
-    frame = chunk.frame
-    names = {c.get("id"): metashape.name_of(c) for c in chunk.element.iterfind("cameras//camera")}
+    frame, settings = chunk.frame, chunk.properties("settings")
+    names = {c.get("id"): metashape.name_of(c) for c in chunk.root.iterfind("cameras//camera")}
     default, pixels = (
-        xml_number(path, f"setting {name}", chunk.settings.get(name, "0"))
+        xml_number(path, f"setting {name}", settings.get(name, "0"))
         for name in ("accuracy_markers", "accuracy_projections")
     )
     surveyed: dict[str, Mark] = {}
-    for marker in chunk.element.iterfind("markers//marker"):
+    for marker in chunk.root.iterfind("markers//marker"):
         found, label = marker.find("reference"), metashape.name_of(marker)
         stated = (marker if found is None else found).attrib
         if all(stated.get(axis) for axis in "xyz"):
             where = f"marker {label}, reference"
             xyz = np.array([xml_number(path, where, stated[axis]) for axis in "xyz"])
-            sigma = metashape.spreads(path, where, stated, metashape.SPREADS, np.full(3, default))
+            sigma = metashape.spreads(path, where, stated, np.full(3, default))
             surveyed[marker.get("id") or ""] = Mark(
                 f"marker {label}", label, "", np.full(2, np.nan), xyz,
                 np.where(sigma > 0.0, sigma, np.nan), pixels if pixels > 0.0 else np.nan,
@@ -385,8 +385,8 @@ def _from_metashape(path: Path) -> tuple[list[Mark], str | None]:
     if not marks:
         sentence = "has no marker with surveyed coordinates and a mark in an image. Export them."
         raise bad_file(path, "gcps.none", sentence)
-    own = (chunk.element.findtext("marker_reference") or "").strip()
-    crs = own or (chunk.element.findtext("reference") or "").strip() or LOCAL
+    own = (chunk.root.findtext("marker_reference") or "").strip()
+    crs = own or (chunk.root.findtext("reference") or "").strip() or LOCAL
     if crs.lower() == LOCAL or is_local(parse_crs(crs, str(chunk.path))):
         crs = LOCAL
     return marks, crs

@@ -1,10 +1,11 @@
 """Read camera poses of any software: one module per format behind one `read_cameras`.
 
-A format module has ``recognises(source)``, which is cheap, ``read(source)`` and, where the format
-has tie points, ``tie_points(source, cameras)``. `read_cameras` turns what damaged contents raise
-into an `InputError`, and checks rotations and lenses; a module raises an `InputError` itself where
-it can say more than "damaged". To add a format, write its module, an entry of `FORMATS` and a line
-in README.md of this folder. A module is loaded when its turn comes.
+A format module has patterns by which `checks.recognises` knows its files, or ``recognises(source)``
+of its own, then ``read(source)`` and, where the format has tie points, ``tie_points(source,
+cameras)``. `read_cameras` turns what damaged contents raise into an `InputError`, and checks
+rotations and lenses; a module raises an `InputError` itself where its sentence is clearer. To add a
+format, write its module, an entry of `FORMATS` and a line in README.md of this folder. A module is
+loaded when its turn comes.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ FORMATS = {
     UNSUPPORTED: "a format that pcfix does not read",
 }
 """The modules of this folder and their software, in the order in which they are asked: a plain
-table says least of all."""
+table has the fewest marks."""
 TAKE_SENSOR = ("table", "realitycapture")
 """Modules that look for the sensor themselves."""
 
@@ -61,7 +62,7 @@ def read_cameras(
     ----------
     path : path
         A file or folder that photogrammetry software wrote; its content decides which. Each
-        module of this folder says what it takes and in which convention. Or a table with a
+        module of this folder states its files and their convention. Or a table with a
         header line; columns, in any order, upper or lower case:
 
         ``label, x, y, z``
@@ -74,9 +75,9 @@ def read_cameras(
     sensor : path, optional
         For tables, and files of poses without lenses: a CSV table of one row for all images,
         ``focal, sensor_x, sensor_y`` in millimetres or ``focal_px, width_px, height_px, ...``, or a
-        calibration of Metashape. Default: a ``sensor.csv`` beside the cameras.
+        calibration of Metashape. Default: a ``sensor.csv`` next to the cameras.
     angles : {"omega-phi-kappa", "yaw-pitch-roll", "aircraft"}, optional
-        The kind of angles in a table whose header does not say it. For the angles of an aircraft
+        The kind of angles in a table whose header does not name it. For the angles of an aircraft
         or a gimbal, pitch -90 looks straight down.
 
     Returns
@@ -88,12 +89,12 @@ def read_cameras(
     Warns
     -----
     PcfixWarning
-        When labels repeat: different positions are kept, exact copies dropped.
+        When labels repeat: different positions are used, exact copies skipped.
 
     Raises
     ------
     InputError
-        If a file is missing or damaged, is not a camera file, or has its own lenses beside a
+        If a file is missing or damaged, is not a camera file, or has its own lenses and a
         `sensor`.
 
     Examples
@@ -198,6 +199,6 @@ def _format_of(source: Source) -> str | None:
     is_part = reader_of(UNSUPPORTED).is_part(source)
     for form in [UNSUPPORTED] if is_part else FORMATS:
         with suppress(Exception), np.errstate(all="ignore"):
-            if reader_of(form).recognises(source):
+            if checks.recognises(reader_of(form), source):
                 return form
     return None

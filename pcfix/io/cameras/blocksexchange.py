@@ -16,7 +16,7 @@ length. Places in mm (xmm, ymm) are in the camera axes, from the centre of the s
 principal point and from the principal point for measurements.
 
 Software ignores poses where ManualPose is false, and lenses where ManualOpticalParams is. The cloud
-was not made with these, so they are not read.
+was not computed from these, so they are not read.
 
 GNSS positions are in Pose/Metadata, or in the GPS of ExifData. Tie points can be in another file,
 and either file in a zip archive (.xmlz).
@@ -40,19 +40,20 @@ import numpy as np
 
 from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import ZIP_MAGIC, Source, damaged, note, number, read_xml, text_of
+from pcfix.io.cameras.checks import Source, damaged, note, number, read_xml, text_of
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.crs import Topocentric
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
 from pcfix.model import Cameras, FloatArray, Lens, TiePoints
 
+CONTENT = "<BlocksExchange"
 COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
 TIE_POINTS = re.compile(rb"<TiePoints>(.*?)</TiePoints>", re.DOTALL)
 EXTERNAL = re.compile(rb"<Path>\s*([^<]*?)\s*</Path>")
 DECLARATION = re.compile(rb"<\?xml.*?\?>")
 SRS_OF_ALL = re.compile(rb"<SRSId>\s*([^<]*?)\s*</SRSId>")
 MAIN_COMPONENT = "1"
-CENTRE = [f"Pose/Center/{axis}" for axis in "xyz"]
+CENTRE = [f"Center/{axis}" for axis in "xyz"]
 DEGREES = ["Longitude", "Latitude", "Altitude"]
 EXIF = "EPSG:4326"
 """The CRS of positions in ExifData."""
@@ -61,26 +62,14 @@ FIRST_PIXEL = 0.5
 DIRECTIONS = {"Right": (1, 0, 0), "Left": (-1, 0, 0), "Down": (0, 1, 0), "Up": (0, -1, 0)}
 
 
-def recognises(source: Source) -> bool:
-    """Whether the root element is BlocksExchange, in a plain file or a zip archive."""
-    if source.head.startswith(ZIP_MAGIC):
-        return b"<BlocksExchange" in _read_bytes(source.path)[:4096]
-    return "<BlocksExchange" in source.text
-
-
 def read(source: Source) -> Cameras:
     """Read poses and lenses, in the CRS of the block."""
     return _read_block(source.path)[0]
 
 
 def _read_bytes(path: Path) -> bytes:
-    """Return a file, or the XML document in a zip archive, without comments."""
-    data = path.read_bytes()
-    if data.startswith(ZIP_MAGIC):
-        with checks.open_archive(path) as archive:
-            found = [name for name in archive.namelist() if name.lower().endswith(".xml")]
-            data = checks.unpacked(archive, found[0] if found else "XML document")
-    return COMMENT.sub(b"", data)
+    """Return the document in a file or archive without comments."""
+    return COMMENT.sub(b"", checks.read_document(path))
 
 
 class Photogroup(NamedTuple):
@@ -127,7 +116,7 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
     measurements would take minutes.
     """
     data = _read_bytes(path)
-    root = read_xml(path, io.BytesIO(TIE_POINTS.sub(b"", data)))
+    root = read_xml(path, TIE_POINTS.sub(b"", data))
     main, outside = list[Photo](), list[Photo]()  # outside of the main component
     unposed, ignored = list[str](), list[str]()
     blocks = list(root.iter("Block"))
@@ -137,21 +126,20 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
             ignored += [] if group.has_poses else [group.name]
             srs = text_of(element, "SRSId") or text_of(block, "SRSId")
             for photo in element.iterfind("Photo"):
-                label, key = _label(photo), (i, text_of(photo, "Id"))
-                if not group.has_poses or photo.find("Pose/Center") is None:
+                label, pose = _label(photo), photo.find("Pose")
+                if not group.has_poses or pose is None or pose.find("Center") is None:
                     unposed.append(label)
                     continue
-                centre = _numbers(path, f"image {label}", photo, CENTRE)
-                turn = _rotation(path, label, photo.find("Pose/Rotation"), group.axes)
-                metadata, gps, prior = photo.find("Pose/Metadata"), photo.find("ExifData/GPS"), None
+                centre = _numbers(path, f"image {label}", pose, CENTRE)
+                turn = _rotation(path, label, pose.find("Rotation"), group.axes)
+                metadata, gps, prior = pose.find("Metadata"), photo.find("ExifData/GPS"), None
                 if metadata is not None and metadata.find("Center") is not None:
-                    axes = [f"Center/{axis}" for axis in "xyz"]
-                    place = _numbers(path, f"image {label}, Metadata", metadata, axes)
+                    place = _numbers(path, f"image {label}, Metadata", metadata, CENTRE)
                     prior = text_of(metadata, "SRSId") or srs, place
                 elif gps is not None and all(gps.findtext(name) for name in DEGREES):
                     prior = EXIF, _numbers(path, f"image {label}, GPS", gps, DEGREES)
+                one = Photo((i, text_of(photo, "Id")), label, group, centre, turn, srs, prior)
                 is_main = text_of(photo, "Component") in ("", MAIN_COMPONENT)
-                one = Photo(key, label, group, centre, turn, srs, prior)
                 (main if is_main else outside).append(one)
         unposed += [_label(element) for element in block.iterfind("BulkPhotos/Photo")]
     turned = [photo for photo in main or outside if photo.rotation is not None]
@@ -170,8 +158,7 @@ def _read_block(path: Path) -> tuple[Cameras, list[Photo], list[tuple[int, str, 
     if priors:  # positions in the CRS that the first of them has
         of = next(iter(priors.values()))[0]
         places = {k: (xyz, np.full(3, np.nan)) for k, (srs, xyz) in priors.items() if srs == of}
-        crs = EXIF if of == EXIF else _crs_of(path, root, of)
-        gnss = checks.measured([photo.key for photo in photos], places, crs)
+        gnss = checks.measured([photo.key for photo in photos], places, _crs_of(path, root, of))
     lenses = [photo.group.lens for photo in photos if photo.group.lens is not None]
     has_lenses, notes = bool(turned) and len(lenses) == len(photos), []
     if ignored:
@@ -218,8 +205,8 @@ def _rotation(
 
 def _crs_of(path: Path, root: Element, srs_id: str) -> str:
     """Return the CRS of an id as `Cameras` has it; without an id the frame is local."""
-    if not srs_id:
-        return "local"
+    if srs_id in ("", EXIF):
+        return srs_id or "local"
     definitions = {text_of(srs, "Id"): srs.findtext("Definition") or "" for srs in root.iter("SRS")}
     if srs_id not in definitions:
         raise damaged(path, f"there is no spatial reference system with the id {srs_id}")
@@ -273,26 +260,23 @@ def _photogroup(path: Path, element: Element) -> Photogroup:
     for tag in (str(child.tag) for child in element) if is_used else ():
         if "Distortion" in tag and tag not in ("Distortion", "FisheyeDistortion"):
             raise refused(f"distortion {tag}")
-    focal, is_fisheye = value("FocalLengthPixels", math.nan), kind == "Fisheye"
+    focal, more = value("FocalLengthPixels", math.nan), dict[str, Any]()
     if math.isnan(focal) and pixel_mm > 0.0:
         focal = value("FocalLength", math.nan) / pixel_mm
-    given = {"fx": focal, "fy": focal * value("AspectRatio", 1.0), "skew": value("Skew")}
-    if is_fisheye:
-        given = {"f": math.pi / 2.0 * focal}
+    if kind == "Fisheye":
+        given = {"fx": math.pi / 2.0 * focal, "fy": math.pi / 2.0 * focal}
         if element.find("FisheyeFocalMatrix") is not None:
             names = {"fx": "M_00", "skew": "M_01", "b3": "M_10", "fy": "M_11"}
             given = {key: value(f"FisheyeFocalMatrix/{one}") for key, one in names.items()}
-    else:
-        given |= {k.lower(): value(f"Distortion/{k}") for k in ("K1", "K2", "K3", "P1", "P2")}
-    given |= {"cx": middle[0], "cy": middle[1]}
-    more: dict[str, Any] = {"sensor": name}
-    if is_fisheye:
-        shape = [value(f"FisheyeDistortion/P{i}") for i in range(5)]
         has_shape = element.find("FisheyeDistortion") is not None
-        more |= {"projection": "polynomial", "shape": tuple(shape) if has_shape else (0.0, 1.0)}
-    lens = None
-    if is_used and min(width, height) > 0.0 and not math.isnan(given.get("f", given.get("fx", 0))):
-        lens = lens_by_name(given, width, height, **more)
+        shape = [value(f"FisheyeDistortion/P{i}") for i in range(5)] if has_shape else [0.0, 1.0]
+        more = {"projection": "polynomial", "shape": tuple(shape)}
+    else:
+        given = {"fx": focal, "fy": focal * value("AspectRatio", 1.0), "skew": value("Skew")}
+        given |= {k.lower(): value(f"Distortion/{k}") for k in ("K1", "K2", "K3", "P1", "P2")}
+    lens, (cx, cy) = None, middle.tolist()
+    if is_used and min(width, height) > 0.0 and not math.isnan(given["fx"]):
+        lens = lens_by_name(given | {"cx": cx, "cy": cy}, width, height, sensor=name, **more)
     has_poses = text_of(element, "ManualPose").lower() != "false"
     return Photogroup(name, has_poses, axes, middle, pixel_mm, lens)
 

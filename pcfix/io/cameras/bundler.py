@@ -1,41 +1,41 @@
 """Bundler's ``bundle.out``, MVE's ``synth_0.out`` and VisualSFM's ``.nvm``: cameras and points.
 
-*Bundler*: N. Snavely, "Bundler v0.4 User's Manual", section "Output format", which describes files
-that begin with ``# Bundle file v0.3``
-(https://www.cs.cornell.edu/~snavely/bundler/bundler-v0.4-manual.html). After the numbers of
-cameras and points come, for each camera, f k1 k2, a matrix R and a vector t, and then the points
-with their views (image, feature, x, y). ``X_cam = R X + t`` is in axes x right, y up, z backward,
-thus the camera looks along -z; the rows of y and z change sign for OpenCV's axes. The image is
+*Bundler*: N. Snavely, "Bundler v0.4 User's Manual", section "Output format", of files that begin
+with ``# Bundle file v0.3`` (https://www.cs.cornell.edu/~snavely/bundler/bundler-v0.4-manual.html).
+After the numbers of cameras and points come, for each camera, f k1 k2, a matrix R and a vector t,
+and then the points with their views (image, feature, x, y). ``X_cam = R X + t`` is in axes x right,
+y up, z backward, so the rows of y and z change sign for OpenCV's axes. The image is
 ``f (1 + k1 r^2 + k2 r^4) (-X_cam / Z_cam)``, x right and y up from the middle of the frame. f = 0
-says that an image has no pose. Names are in ``list.txt``, a line for each camera.
+marks an image without a pose. Names are in ``list.txt``, a line for each camera.
 
 *MVE* ("drews 1.0", https://github.com/simonfuhrmann/mve/wiki/MVE-File-Format) has OpenCV's axes, f
 in units of the longer side of the frame, and views (image, feature, nothing).
 
 *VisualSFM*: C. Wu, "VisualSFM: documentation", section "The output format: N-View Match"
 (http://ccwu.me/vsfm/doc.html#nvm). The first line may go on with the calibration that was held,
-``FixedK fx cx fy cy``. Then come models: a number of cameras, a line for each (name, f, quaternion
-with the scalar first, projection centre, k, 0), a number of points, a line for each (x y z, colour,
-n, then n times image, feature, x, y). A model without points holds the images that have no pose.
-A 0 or the end of the file ends the models. In names, ``"`` stands for a space. The quaternion is
-world to camera in OpenCV's axes; ``NVM_V3_R9T`` has the matrix and the translation of
-``x_cam = R x + t`` instead (``pba/src/pba/util.h`` of Multicore Bundle Adjustment). k is of the
-measured place: ``(1 + k r^2) m / f`` is the undistorted one, with ``r = |m| / f``. Measured places
-m are counted from the principal point, which is the middle of the frame unless FixedK says
-otherwise, x right, y down.
+``FixedK fx cx fy cy``. Then come models, up to a 0 or the end: a number of cameras, a line for each
+(name, f, quaternion with the scalar first, projection centre, k, 0), a number of points, a line for
+each (x y z, colour, n, then n times image, feature, x, y). A model without points holds the images
+that have no pose. In names, ``"`` stands for a space. The quaternion is world to camera in OpenCV's
+axes; ``NVM_V3_R9T`` has the matrix and the translation of ``x_cam = R x + t`` instead
+(``pba/src/pba/util.h`` of Multicore Bundle Adjustment). k is of the measured place:
+``(1 + k r^2) m / f`` is the undistorted one, with ``r = |m| / f``. Measured places m are counted
+from the principal point, which is the middle of the frame unless FixedK states another.
 
 OpenSfM and ODM write .nvm files with places from the upper left corner, and scale the shorter side
 of the frame by its own length instead of the longer one's. Such a file is recognised by places none
 of which is negative and which are far from where the points project. The middle of its frame, and
 whether the shorter side is squeezed, then follow from the points themselves.
 
-None has the sizes of the images: they are those of the images beside the file, or else the smallest
-that hold all tie points. The files name no CRS.
+None has the sizes of the images: they are those of the images next to the file, or else the
+smallest that hold all tie points. The files name no CRS.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,9 +47,10 @@ from pcfix.io.cameras.checks import Seen, Source, damaged, note
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_photogrammetric
-from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, TiePoints
+from pcfix.model import Cameras, FloatArray, TiePoints
 
-_BUNDLER, _MVE = re.compile(r"#\s*Bundle file v(\d+\.\d+)"), re.compile(r"drews 1\.0")
+CONTENT = re.compile(r"\A\s*(#\s*Bundle file v\d+\.\d+|drews 1\.0|NVM_V3)")
+_BUNDLER = re.compile(r"#\s*Bundle file v(\d+\.\d+)")
 _VERSION = "0.3"
 _CAMERA_NUMBERS = 15
 _FOCAL_OF_LIST = re.compile(r"\s+0\s+[\d.]+$")
@@ -65,75 +66,45 @@ _LEAST_VIEWS = 10
 
 
 class Model(NamedTuple):
-    """A model of a file.
+    """What a file holds: posed cameras without lenses, and points.
 
-    `names` are those of all images, `posed` the rows of those with a pose, which the other arrays
-    are of: `lenses` has f, k1, k2, where f is of the longer side of the frame in files of MVE, and
-    `least_px` the width and height that hold the tie points, 0 where there are none. The views of
-    the `points` have rows of all images for cameras, and u, v from the principal point, v down.
+    `least_px` is the width and height that hold the tie points of each image, 0 where there are
+    none. The views of the `points` have u, v from the principal point, v down.
     """
 
-    software: str
-    names: list[str]
-    posed: IntArray
-    rotations: FloatArray
-    centres: FloatArray
-    lenses: FloatArray
+    cameras: Cameras
+    lenses: list[dict[str, float]]  # parameters; f is of the longer side in files of MVE
     least_px: FloatArray
     points: Seen
-    held: dict[str, float]  # FixedK
-    elsewhere: tuple[str, ...] = ()  # images of other models
-    notes: tuple[PcfixWarning, ...] = ()
-
-
-def recognises(source: Source) -> bool:
-    """Whether the first line is that of Bundler, of any version, of MVE or VisualSFM."""
-    text = source.text.lstrip()
-    return any(form.match(text) for form in (_BUNDLER, _MVE, _NVM))
 
 
 def read(source: Source) -> Cameras:
     """Read the poses of the largest model, and its lenses where sizes are known."""
-    path, model = source.path, _read(source)
-    labels = tuple(model.names[i] for i in model.posed)
-    frames, notes = _frame_sizes(path, labels, model.least_px)
+    cameras, parameters, least_px, _ = _model(source)
+    frames, notes = _frame_sizes(source.path, cameras.labels, least_px)
     lenses = []
-    for (f, k1, k2), (w, h) in zip(model.lenses.tolist(), frames.tolist(), strict=False):
-        given = {"f": f * max(w, h) if model.software == "MVE" else f, "k1": k1, "k2": k2}
-        is_inverse = model.software == "VisualSFM"
-        lenses.append(lens_by_name(given | model.held, w, h, inverse=is_inverse))
-    everything = dict.fromkeys((*model.elsewhere, *model.names))
-    return Cameras(
-        labels=labels,
-        centres=model.centres,
-        rotations=model.rotations,
-        lenses=tuple(lenses) or None,
-        notes=(*model.notes, *notes),
-        unposed=tuple(name for name in everything if name not in set(labels)),
-        source=model.software,
-    )
+    for given, (w, h) in zip(parameters, frames.tolist(), strict=False):
+        if cameras.source == "MVE":
+            given["f"] *= max(w, h)
+        lenses.append(lens_by_name(given, w, h, inverse=cameras.source == "VisualSFM"))
+    return replace(cameras, lenses=tuple(lenses) or None, notes=(*cameras.notes, *notes))
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points of the largest model and where the images saw them."""
-    model = _read(source)
-    if model.software == "MVE":
+    model = _model(source)
+    if model.cameras.source == "MVE":
         raise checks.no_tie_points(source.path, "MVE writes no image coordinates")
-    row = np.full(len(model.names), -1)
-    row[model.posed] = np.arange(len(cameras))
-    camera = row[model.points.camera]
     middles = [(one.principal_x, one.principal_y) for one in cameras.lenses or ()]
-    uv = np.array(middles).reshape(-1, 2)[camera] + model.points.uv
-    return checks.tie_points(model.points._replace(camera=camera, uv=uv))
+    uv = np.array(middles).reshape(-1, 2)[model.points.camera] + model.points.uv
+    return checks.tie_points(model.points._replace(uv=uv))
 
 
-def _read(source: Source) -> Model:
-    is_nvm = _NVM.match(source.text.lstrip()) is not None
-    return (_read_nvm if is_nvm else _read_bundler)(source.path)
-
-
-def _read_bundler(path: Path) -> Model:
-    """Read a file of Bundler or MVE."""
+def _model(source: Source) -> Model:
+    """Read a file of Bundler or MVE, or the largest model of VisualSFM."""
+    path = source.path
+    if _NVM.match(source.text.lstrip()):
+        return _read_nvm(path)
     head, *body = read_lines(path)
     version = _BUNDLER.match(head)
     if version and version[1] != _VERSION:
@@ -141,28 +112,45 @@ def _read_bundler(path: Path) -> Model:
         raise checks.unsupported(path, what, f"Export v{_VERSION}", version=version[1])
     values = np.array(" ".join(body).split(), np.float64)
     count, end = int(values[0]), 2 + _CAMERA_NUMBERS * int(values[0])
-    points = _points(path, values[end:], int(values[1]), count, 4 if version else 3)
-    names = _listed_names(path, count)
-    if not names:
-        names = [f"{'camera' if version else 'view'} {i}" for i in range(count)]
     rows = values[2:end].reshape(count, _CAMERA_NUMBERS)
-    posed = _posed(path, rows[:, 0] != 0.0)
-    rows = rows[posed]
-    rotations = checks.rotations(path, [names[i] for i in posed], rows[:, 3:12])
-    centres, least = checks.centres(rotations, rows[:, 12:]), np.zeros((count, 2))
+    points = _points(path, values[end:], int(values[1]), count, 4 if version else 3)
+    rows, points, posed = _posed(path, rows, points, rows[:, 0] != 0.0)
+    kind = "camera" if version else "view"
+    names = _listed_names(path, count) or [f"{kind} {i}" for i in range(count)]
+    labels = tuple(names[i] for i in posed)
+    rotations = checks.rotations(path, labels, rows[:, 3:12])
+    centres, least = checks.centres(rotations, rows[:, 12:]), np.zeros((len(rows), 2))
     if version:
         rotations = from_photogrammetric(rotations)
         points = points._replace(uv=points.uv * (1.0, -1.0))
-        np.maximum.at(least, points.camera, 2.0 * np.abs(points.uv))
-    software = f"Bundler v{_VERSION}" if version else "MVE"
-    return Model(software, names, posed, rotations, centres, rows[:, :3], least[posed], points, {})
+        least = _holding(points, len(rows))
+    given = [dict(zip(("f", "k1", "k2"), row, strict=True)) for row in rows[:, :3].tolist()]
+    software, unposed = f"Bundler v{_VERSION}" if version else "MVE", _others(names, labels)
+    cameras = Cameras(labels, centres, rotations, unposed=unposed, source=software)
+    return Model(cameras, given, least, points)
 
 
-def _posed(path: Path, has_focal: BoolArray) -> IntArray:
-    """Return the rows of images with a pose."""
-    if not has_focal.any():
+def _posed(
+    path: Path, rows: FloatArray, points: Seen, has_pose: np.ndarray
+) -> tuple[FloatArray, Seen, list[int]]:
+    """Return the rows of images with a pose, the views with their new numbers, and the old ones."""
+    if not has_pose.any():
         raise checks.no_pose(path, "no image has a pose (all focal lengths are 0)")
-    return np.flatnonzero(has_focal)
+    number = np.where(has_pose, np.cumsum(has_pose) - 1, -1)
+    points = points._replace(camera=number[points.camera])
+    return rows[has_pose], points, np.flatnonzero(has_pose).tolist()
+
+
+def _holding(points: Seen, count: int) -> FloatArray:
+    """Return the smallest frames about the principal points that hold the views of each image."""
+    least, is_posed = np.zeros((count, 2)), points.camera >= 0
+    np.maximum.at(least, points.camera[is_posed], 2.0 * np.abs(points.uv[is_posed]))
+    return least
+
+
+def _others(names: Iterable[str], labels: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of images without a pose, each once."""
+    return tuple(name for name in dict.fromkeys(names) if name not in set(labels))
 
 
 def _listed_names(path: Path, count: int) -> list[str]:
@@ -170,10 +158,9 @@ def _listed_names(path: Path, count: int) -> list[str]:
     stem = path.name.removesuffix(".out")
     own = (f"{one}.list.txt" for one in (stem, path.name, stem.removesuffix(".bundle")))
     for place in (*map(path.with_name, (*own, "list.txt")), path.parent.parent / "list.txt"):
-        if place.is_file():
-            lines = [line.strip() for line in read_lines(place) if line.strip()]
-            if len(lines) == count:
-                return [_FOCAL_OF_LIST.sub("", line) for line in lines]
+        lines = [line.strip() for line in read_lines(place)] if place.is_file() else []
+        if len(listed := [line for line in lines if line]) == count:
+            return [_FOCAL_OF_LIST.sub("", line) for line in listed]
     return []
 
 
@@ -187,9 +174,9 @@ def _read_nvm(path: Path) -> Model:
     models: list[tuple[list[str], FloatArray, Seen]] = []
     at = 0
     while at < len(lines) and (count := int(lines[at])) > 0:
-        cameras = [line.rsplit(None, width) for line in lines[at + 1 : at + 1 + count]]
-        names = [row[0].strip().strip('"').replace('"', " ") for row in cameras]
-        numbers = np.array([row[1:] for row in cameras], np.float64).reshape(count, width)
+        listed = [line.rsplit(None, width) for line in lines[at + 1 : at + 1 + count]]
+        names = [row[0].strip().strip('"').replace('"', " ") for row in listed]
+        numbers = np.array([row[1:] for row in listed], np.float64).reshape(count, width)
         at += 1 + count
         views = int(lines[at])
         values = np.array(" ".join(lines[at + 1 : at + 1 + views]).split(), np.float64)
@@ -199,30 +186,26 @@ def _read_nvm(path: Path) -> Model:
         raise checks.no_pose(path, "has no model")
     among = [model for model in models if len(model[2].xyz)] or models
     names, rows, points = max(among, key=lambda model: (model[1][:, 0] > 0.0).sum())
-    posed = _posed(path, rows[:, 0] > 0.0)
-    labels, own = [names[i] for i in posed], rows[posed]
+    rows, points, posed = _posed(path, rows, points, rows[:, 0] > 0.0)
+    labels = tuple(names[i] for i in posed)
     if matrix:
-        rotations = checks.rotations(path, labels, own[:, 1:10])
-        centres = checks.centres(rotations, own[:, 10:13])
+        rotations = checks.rotations(path, labels, rows[:, 1:10])
+        centres = checks.centres(rotations, rows[:, 10:13])
     else:
-        rotations, centres = checks.quaternions(path, labels, own[:, 1:5]), own[:, 5:8]
-    least = np.zeros((len(rows), 2))
+        rotations, centres = checks.quaternions(path, labels, rows[:, 1:5]), rows[:, 5:8]
     if fixed:
-        least[:] = 2.0 * fixed["cx"], 2.0 * fixed["cy"]
+        least = np.tile([2.0 * fixed["cx"], 2.0 * fixed["cy"]], (len(rows), 1))
     else:
-        row = np.full(len(rows), -1)
-        row[posed] = np.arange(len(posed))
-        row = row[points.camera]
-        x, y, z = np.einsum("nij,nj->in", rotations[row], points.xyz[points.point] - centres[row])
-        z = np.where((row >= 0) & (z > 0.0), z, np.nan)
+        rays = points.xyz[points.point] - centres[points.camera]
+        x, y, z = np.einsum("nij,nj->in", rotations[points.camera], rays)
+        z = np.where((points.camera >= 0) & (z > 0.0), z, np.nan)
         expected = rows[points.camera, :1] * np.column_stack([x / z, y / z])
         points, least = _from_the_middle(points, expected, rows[:, 0])
-    lenses = np.column_stack([own[:, 0], own[:, -2], np.zeros(len(own))])
-    return Model(
-        *("VisualSFM", names, posed, rotations, centres, lenses, least[posed], points, fixed),
-        elsewhere=tuple(name for model in models for name in model[0]),
-        notes=(checks.several(path, len(among), len(labels)),) if len(among) > 1 else (),
-    )
+    given = [{"f": f, "k1": k1} | fixed for f, k1 in rows[:, [0, -2]].tolist()]
+    unposed = _others((name for model in models for name in model[0]), labels)
+    notes = (checks.several(path, len(among), len(labels)),) if len(among) > 1 else ()
+    cameras = Cameras(labels, centres, rotations, unposed=unposed, source="VisualSFM", notes=notes)
+    return Model(cameras, given, least, points)
 
 
 def _points(path: Path, body: FloatArray, count: int, images: int, width: int) -> Seen:
@@ -256,13 +239,13 @@ def _from_the_middle(
 
     `expected` are the places without distortion, `focal` is that of each image.
     """
-    image, seen, least = points.camera, points.uv.copy(), np.zeros((len(focal), 2))
+    image, seen = points.camera, points.uv.copy()
     expected = np.where(np.abs(expected) < _LARGEST_PX, expected, np.nan)
     known = np.isfinite(expected).all(axis=1)
     is_from_corner = ((seen >= 0.0) & (seen < _LARGEST_PX)).all() and known.any()
     if not (is_from_corner and np.median(np.abs(seen - expected)[known]) > _FAR_PX):
-        np.maximum.at(least, image, 2.0 * np.abs(seen))
-        return points, least
+        return points, _holding(points, len(focal))
+    least = np.zeros((len(focal), 2))
     for f in np.unique(focal[image[known]]):  # OpenSfM's, from the corner
         rows = focal[image] == f
         if (rows & known).sum() >= _LEAST_VIEWS:
@@ -273,22 +256,17 @@ def _from_the_middle(
 
 
 def _squeeze_and_frame(expected: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Fit seen = squeeze x expected + frame / 2 on each axis, the second time without outliers.
+    """Return by how much each axis is squeezed, and the frame in whole pixels.
 
-    The frame is whole pixels, and the squeeze is 1 or its sides in units of the longer one,
-    whichever is nearer.
+    The squeeze is 1, seen = expected + frame / 2, or the side in units of the longer one,
+    seen = squeeze (expected + longer / 2), whichever is nearer. Medians bear outliers.
     """
-    slopes, offsets = np.empty((2, 2))
-    for axis, (e, s) in enumerate(zip(expected.T, seen.T, strict=True)):
-        good = np.full(len(e), True)
-        for _ in range(2):
-            offsets[axis], slopes[axis] = np.polynomial.polynomial.polyfit(e[good], s[good], 1)
-            apart = np.abs(s - slopes[axis] * e - offsets[axis])
-            good = apart <= 3.0 * np.median(apart)
-    frame = np.round(2.0 * offsets)
-    squeeze = frame / frame.max()
-    nearer = np.abs(slopes - squeeze) < np.abs(slopes - 1.0)
-    return np.where(nearer, squeeze, 1.0), frame
+    half = np.median(seen - expected, axis=0)
+    squeeze = np.median(seen / (expected + half.max()), axis=0)
+    plain = np.median(np.abs(seen - expected - half), axis=0)
+    squeezed = np.median(np.abs(seen - squeeze * (expected + half.max())), axis=0)
+    frame = np.round(2.0 * np.where(squeezed < plain, squeeze * half.max(), half))
+    return np.where(squeezed < plain, frame / frame.max(), 1.0), frame
 
 
 def _frame_sizes(

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from pathlib import Path, PureWindowsPath
-from typing import IO, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -42,10 +42,10 @@ _HEAD_BYTES = 4096
 
 @dataclass(frozen=True)
 class Source:
-    """A file or folder that may hold cameras, and what the user said about it.
+    """A file or folder that may hold cameras, and what the user states about it.
 
     `sensor` is the ``--sensor`` file, `angles` the kind of angles of a table whose header does not
-    say it.
+    name it.
     """
 
     path: Path
@@ -62,13 +62,26 @@ class Source:
 
     @cached_property
     def text(self) -> str:
-        """The first bytes as text, without a byte order mark."""
-        return tables.decoded(self.head)
+        """The first bytes as text, without a byte order mark; of an archive those of its XML."""
+        is_archive = self.head.startswith(ZIP_MAGIC)
+        return tables.decoded(read_document(self.path)[:_HEAD_BYTES] if is_archive else self.head)
 
     @cached_property
     def names(self) -> frozenset[str]:
         """Names of the contents of a folder; none for a file."""
         return frozenset(p.name for p in self.path.iterdir()) if self.path.is_dir() else frozenset()
+
+
+def recognises(form: Any, source: Source) -> bool:
+    """Whether a format knows a file or folder: by a rule of its own, or by patterns.
+
+    These are ``CONTENT`` of the first bytes of a file, and ``INSIDE`` of a name in a folder.
+    """
+    if hasattr(form, "recognises"):
+        return bool(form.recognises(source))
+    if source.path.is_dir():
+        return any(re.fullmatch(getattr(form, "INSIDE", ""), name) for name in source.names)
+    return re.search(form.CONTENT, source.text) is not None
 
 
 def damaged(path: object, why: object) -> InputError:
@@ -132,12 +145,6 @@ def reading(path: object) -> Iterator[None]:
         raise damaged(path, error or type(error).__name__) from error
 
 
-def open_archive(path: Path) -> zipfile.ZipFile:
-    """Open an archive."""
-    with reading(path):
-        return zipfile.ZipFile(path)
-
-
 def unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
     """Return the content of an entry."""
     with reading(archive.filename):
@@ -147,12 +154,25 @@ def unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
         return archive.read(entry)
 
 
-def read_xml(path: Path, stream: IO[bytes] | None = None) -> Element:
-    """Return the root of a document, from `stream` if it is in an archive."""
-    from defusedxml.ElementTree import parse
+def read_document(path: Path) -> bytes:
+    """Return a file, or of an archive its ``doc.xml`` or else the first XML document."""
+    with reading(path):
+        with path.open("rb") as stream:
+            is_archive = stream.read(len(ZIP_MAGIC)) == ZIP_MAGIC
+        if not is_archive:
+            return path.read_bytes()
+        with zipfile.ZipFile(path) as archive:
+            listed = [name for name in archive.namelist() if name.lower().endswith(".xml")]
+            return unpacked(archive, "doc.xml" if "doc.xml" in listed else [*listed, "XML"][0])
+
+
+def read_xml(path: Path, data: bytes | None = None) -> Element:
+    """Return the root of a document, which may be in an archive, or already read."""
+    from defusedxml.ElementTree import fromstring
 
     with reading(path):
-        root: Element = parse(stream if stream is not None else path, forbid_dtd=False).getroot()
+        data = read_document(path) if data is None else data
+        root: Element = fromstring(data, forbid_dtd=False)
     return root
 
 
@@ -224,26 +244,24 @@ def centres(rotations: FloatArray, translations: FloatArray) -> FloatArray:
 
 def lens(path: Path, name: str, given: Lens) -> Lens:
     """Return the lens when its numbers can be those of a camera."""
-    numbers = np.hstack([v for v in astuple(given) if isinstance(v, float | tuple)])
-    frame = f"{given.width:g} x {given.height:g}"
     positive = min(given.focal, given.focal + given.b1, given.width, given.height) > 0.0
-    if not (positive and np.isfinite(numbers).all()):
-        sentence = f"the lens {name} is damaged (focal length {given.focal:g}, frame {frame})."
-        raise bad_file(path, "cameras.lens", sentence, lens=name)
+    every = np.hstack([v for v in astuple(given) if isinstance(v, float | tuple)])
+    if not (positive and np.isfinite(every).all()):
+        frame = f"focal length {given.focal:g}, frame {given.width:g} x {given.height:g}"
+        raise bad_file(path, "cameras.lens", f"the lens {name} is damaged ({frame}).", lens=name)
     return given
 
 
 def checked(path: Path, cameras: Cameras) -> Cameras:
     """Return cameras with proper rotations and with one object for each different lens."""
-    same: dict[Lens, Lens] = {}
-    for given, label in zip(cameras.lenses or (), cameras.labels, strict=False):
-        if given not in same:
-            same[given] = lens(path, given.sensor or f"of {label}", given)
     if cameras.rotations is not None:
         turns = rotations(path, cameras.labels, cameras.rotations)
         cameras = replace(cameras, rotations=turns)
-    lenses = cameras.lenses and tuple(same[given] for given in cameras.lenses)
-    return replace(cameras, lenses=lenses)
+    if cameras.lenses is None:
+        return cameras
+    of = dict(zip(cameras.lenses, cameras.labels, strict=True))
+    same = {one: lens(path, one.sensor or f"of {label}", one) for one, label in of.items()}
+    return replace(cameras, lenses=tuple(same[one] for one in cameras.lenses))
 
 
 def measured(
@@ -254,41 +272,30 @@ def measured(
     Numbers that are not finite are unknown; a position may lack its height only. None where no
     image has a position.
     """
-    nothing = np.full(3, np.nan)
-    rows = [places.get(key, (nothing, nothing)) for key in keys]
-    xyz, sigma = (np.array([row[i] for row in rows], np.float64).reshape(-1, 3) for i in (0, 1))
+    unknown = np.full((2, 3), np.nan)
+    rows = [places.get(key, unknown) for key in keys]
+    xyz, sigma = np.array(rows, np.float64).reshape(-1, 2, 3).transpose(1, 0, 2)
     xyz[~np.isfinite(xyz)] = np.nan
     xyz[np.isnan(xyz[:, :2]).any(axis=1)] = np.nan
     return None if np.isnan(xyz).all() else GnssPositions(xyz, sigma, crs)
 
 
 def crs(path: Path, definition: str) -> str:
-    """Return what a file says of its CRS: ``local``, or a definition that PROJ understands."""
-    text = definition.strip()
-    if text.lower() == "local" or text.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")):
-        return "local"
-    if not names_crs(text):
-        sentence = f"PROJ does not know the CRS '{text[:80]}'. Export in a CRS with an EPSG code."
-        raise bad_file(path, "cameras.crs", sentence, crs=text)
-    return text
-
-
-def names_crs(text: str) -> bool:
-    """Whether PROJ understands a text as a CRS."""
+    """Return the CRS that a file states: ``local``, or a definition that PROJ understands."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
+    text = definition.strip()
+    if text.lower() == "local" or text.upper().startswith(("LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")):
+        return "local"
+    if utm := re.match(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS])", text, re.IGNORECASE):  # ODM's
+        text = f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}"
     try:
         CRS.from_user_input(text)
-    except CRSError:
-        return False
-    return True
-
-
-def utm_as_code(text: str) -> str:
-    """Return ODM's "WGS84 UTM 16N" as an EPSG code, any other text as it is."""
-    utm = re.match(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS])", text, re.IGNORECASE)
-    return f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}" if utm else text
+    except CRSError as error:
+        sentence = f"PROJ does not know the CRS '{text[:80]}'. Export in a CRS with an EPSG code."
+        raise bad_file(path, "cameras.crs", sentence, crs=text) from error
+    return text
 
 
 class AffineFrame(NamedTuple):
@@ -344,7 +351,7 @@ def rows_of(wanted: IntArray, identifiers: IntArray) -> IntArray:
 def tie_points(*parts: Seen) -> TiePoints:
     """Join points and gather their observations by point, without those of a camera -1.
 
-    An observation that is not finite is left out, and such a position is unknown.
+    An observation that is not finite is skipped, and such a position is unknown.
     """
     before = np.cumsum([0, *(len(part.xyz) for part in parts)])
     xyz = np.concatenate([part.xyz for part in parts])
@@ -353,10 +360,10 @@ def tie_points(*parts: Seen) -> TiePoints:
     is_there = np.concatenate([(part.camera >= 0) & (part.point >= 0) for part in parts])
     camera = np.concatenate([part.camera for part in parts])
     uv = np.concatenate([part.uv for part in parts])
-    kept = np.flatnonzero(is_there & np.isfinite(uv).all(axis=1))
-    kept = kept[np.argsort(point[kept], kind="stable")]
-    start = np.concatenate([[0], np.cumsum(np.bincount(point[kept], minlength=len(xyz)))])
-    return TiePoints(xyz, Views(start, camera[kept]), uv[kept])
+    used = np.flatnonzero(is_there & np.isfinite(uv).all(axis=1))
+    used = used[np.argsort(point[used], kind="stable")]
+    start = np.concatenate([[0], np.cumsum(np.bincount(point[used], minlength=len(xyz)))])
+    return TiePoints(xyz, Views(start, camera[used]), uv[used])
 
 
 def image_size(folder: Path, name: str) -> tuple[int, int] | None:
@@ -390,7 +397,7 @@ def block_to_write(path: Path, cameras: Cameras) -> tuple[FloatArray, tuple[Lens
 
 
 def write_new(folder: Path, contents: Mapping[str, bytes]) -> None:
-    """Write files into a folder, made if need be; none where one of them exists."""
+    """Write files into a folder, which need not exist; none where one of them exists."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in contents:
         check_output(folder / name, overwrite=False)

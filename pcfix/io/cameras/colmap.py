@@ -1,22 +1,21 @@
 """COLMAP's sparse models, as text or binary.
 
-A model is a folder with ``cameras``, ``images`` and ``points3D``, all ``.bin`` or all ``.txt``;
-from COLMAP 3.12 on with ``rigs`` and ``frames`` too, which are not needed, as ``images`` has the
-pose of every image in rigs also. Definition: https://colmap.github.io/format.html.
+A model is a folder with ``cameras``, ``images`` and ``points3D``, all ``.bin`` or all ``.txt``.
+``rigs`` and ``frames`` (COLMAP 3.12 and later) are not needed, as ``images`` has the pose of every
+image in rigs also. Definition: https://colmap.github.io/format.html.
 
 A pose is a unit quaternion, scalar first, and a translation, both world to camera, in OpenCV
 axes: ``x_cam = R x + t``, so the projection centre is ``-R' t``. Pixels start at the upper left
-corner of the upper left pixel. The world is that of the alignment, if there was one, often minus an
-offset; the files name no CRS, so it is None, unless ``georeference.json`` of pcfix is beside
-them (``crs``, text or null, ``offset_m``, three numbers, ``written_by``): its offset is then added
-to centres and tie points, and its CRS is theirs.
+corner of the upper left pixel. The files name no CRS, unless ``georeference.json`` of pcfix is next
+to them (``crs``, text or null, ``offset_m``, three numbers, ``written_by``): its offset is then
+added to centres and tie points, and its CRS is theirs.
 
 Binary files are little-endian, with counts before lists and names that end with a zero byte; text
 files have a line per camera and point, two per image, and ``#`` before comments. The parameters of
 a camera are those of COLMAP's own list, in its order (https://colmap.github.io/cameras.html and,
-for models that are not there yet, ``src/colmap/sensor/models`` of COLMAP 4). p1 and p2 are in
-OpenCV's order, except in the model of Project Aria's cameras (RAD_TAN_THIN_PRISM_FISHEYE), where
-they are in Brown's, and where the tangential and prism terms are of the radially distorted place.
+for newer models, ``src/colmap/sensor/models`` of COLMAP 4). p1 and p2 are in OpenCV's order, except
+in the model of Project Aria's cameras (RAD_TAN_THIN_PRISM_FISHEYE), where they are in Brown's and
+the tangential and prism terms are of the radially distorted place.
 
 Images keep the order of the file. An image point belongs to the point in space whose identifier it
 has, -1 for none; ``points3D`` lists the same as tracks.
@@ -114,7 +113,7 @@ def _models_at(path: Path) -> list[Path]:
 
 
 def _is_model(listed: Path) -> bool:
-    """Whether there is a list of cameras, and one of images beside it."""
+    """Whether there is a list of cameras, and one of images next to it."""
     if not (listed.is_file() and listed.with_stem("images").is_file()):
         return False
     with listed.open(encoding="utf-8-sig", errors="replace") as stream:
@@ -122,7 +121,7 @@ def _is_model(listed: Path) -> bool:
 
 
 def read_place(folder: Path) -> tuple[FloatArray, str | None]:
-    """Return the offset of a model's positions and their CRS, from pcfix's file beside it."""
+    """Return the offset of a model's positions and their CRS, from pcfix's file next to it."""
     path = folder / FILE
     with checks.reading(path):
         found = checks.load_json(path) if path.is_file() else None
@@ -333,7 +332,7 @@ def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = 
     cameras : Cameras
         With rotations and lenses in pixels.
     tie_points : TiePoints, optional
-        In the frame of the cameras; those without a position or without a view are left out.
+        In the frame of the cameras; those without a position or without a view are skipped.
     """
     from scipy.spatial.transform import Rotation
 

@@ -4,11 +4,11 @@ Centres go through PROJ, point by point. A rotation is taken over at its own cen
 one metre along the source's axes become three vectors in the target, and the rotation next to them
 turns the camera. That is the meridian convergence between maps, and all of the rotation from
 geocentric or topocentric axes. What it cannot hold is the scale of the map against that of the
-heights, 0.9996 on the central meridian of UTM: points 100 m below lie up to that part of their
+heights, 0.9996 on the central meridian of UTM: points 100 m below are up to that part of their
 distance from the principal point elsewhere in the image, 0.8 px at the edge of 4000 px. A cloud
 in map coordinates has the same flaw.
 
-Heights are shifted only where both sides say what theirs are. Where one does not, they stay:
+Heights are shifted only where both sides state what theirs are. Otherwise they do not change:
 ellipsoidal ones remain ellipsoidal, whatever the cloud's datum is.
 """
 
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 CENTRE_DISTANCE_M = (6.2e6, 7.0e6)
 """Cameras are at no other distance from the centre of the earth."""
-STEP_M = 10.0
-"""Half the distance over which directions are compared."""
+STEP_M, EARTH_RADIUS_M = 10.0, 6.4e6
+"""About half the distance over which directions are compared."""
 
 
 class Frame(NamedTuple):
@@ -82,24 +82,7 @@ def frame_of(text: str, name: str) -> Frame:
     if not (crs.is_projected or crs.is_geographic):
         sentence = f"{crs.name} is not a CRS for cameras. Give another with --cameras-crs."
         raise bad_file(name, "cameras.crs", sentence, crs=crs.name)
-    return Frame(crs, _same, direct=True)
-
-
-def _same(xyz: FloatArray) -> FloatArray:
-    return xyz
-
-
-def _metres(crs: CRS, xyz: FloatArray) -> FloatArray:
-    """Return how many metres one unit of each number is, at points (n, 3) of a CRS."""
-    unit, up = systems.plan_unit(crs)[1], np.full(len(xyz), abs(systems.metres_up(crs)))
-    if crs.is_projected or crs.ellipsoid is None:
-        return np.column_stack([np.full((len(xyz), 2), unit), up])
-    # radii of curvature of the ellipsoid across and along the meridian
-    a, b = crs.ellipsoid.semi_major_metre, crs.ellipsoid.semi_minor_metre
-    latitude = unit * xyz[:, 1]
-    across = a**2 / np.hypot(a * np.cos(latitude), b * np.sin(latitude))
-    parallel = across * np.maximum(np.cos(latitude), 1e-9)
-    return np.column_stack([unit * parallel, unit * across**3 * (b / a**2) ** 2, up])
+    return Frame(crs, lambda xyz: xyz, direct=True)
 
 
 def is_tied(crs: str | None, name: str) -> bool:
@@ -117,18 +100,14 @@ def _on_earth(crs: str | None, name: str) -> CRS | None:
 
 @dataclass(frozen=True, eq=False)
 class Georeference:
-    """The transformation from the frame of a camera file into another CRS.
+    """The transformation from the frame of a camera file into another CRS."""
 
-    `forward` takes points of the file, to which `offset`, shape (3,), is added first. `frame` is
-    that of the file; None where the axes are the same. `crs` is the result's, as in `Cameras.crs`.
-    """
-
-    forward: systems.Points
-    frame: Frame | None
-    offset: FloatArray
-    crs: str | None
-    notes: tuple[PcfixWarning, ...]
-    name: str
+    name: str  # of the file, for messages
+    offset: FloatArray  # (3,), added to points of the file first
+    crs: str | None  # of the result, as in `Cameras.crs`
+    notes: tuple[PcfixWarning, ...] = ()
+    frame: Frame | None = None  # of the file; None where the numbers are used as they are
+    forward: systems.Points = lambda xyz: xyz
 
     def cameras(self, cameras: Cameras) -> Cameras:
         """Return the cameras with centres and rotations there; `gnss` stays in its own CRS."""
@@ -142,14 +121,8 @@ class Georeference:
             raise bad_file(self.name, "cameras.not_transformed", sentence, image=cameras.labels[i])
         if rotations is not None and self.frame is not None:
             rotations = rotations @ self.turns(cameras.centres).transpose(0, 2, 1)
-        return replace(
-            cameras,
-            centres=centres,
-            rotations=rotations,
-            crs=self.crs,
-            project_crs=None,
-            notes=cameras.notes + self.notes,
-        )
+        found = replace(cameras, centres=centres, rotations=rotations, crs=self.crs)
+        return replace(found, project_crs=None, notes=cameras.notes + self.notes)
 
     def points(self, xyz: FloatArray) -> FloatArray:
         """Return points (n, 3) there; NaN where one is not finite or has no place there."""
@@ -159,17 +132,18 @@ class Georeference:
         """Return the rotations from the source's axes to the target's at points (n, 3)."""
         if self.frame is None:
             return np.broadcast_to(np.eye(3), (len(xyz), 3, 3))
-        at = xyz + self.offset
-        metres = _metres(self.frame.crs, at) if self.frame.direct else np.ones_like(at)
-        steps = STEP_M * np.eye(3) / metres[:, None, :]
+        crs, at, steps = self.frame.crs, xyz + self.offset, STEP_M * np.eye(3)
+        if self.frame.direct:  # about that many metres in the units of the axes
+            unit = systems.plan_unit(crs)[1] * (EARTH_RADIUS_M if crs.is_geographic else 1.0)
+            steps /= [unit, unit, abs(systems.metres_up(crs))]
         ahead, behind = (self.forward((at[:, None] + s).reshape(-1, 3)) for s in (steps, -steps))
         if not (np.isfinite(ahead).all() and np.isfinite(behind).all()):
             return np.full((len(xyz), 3, 3), np.nan)
         vectors = (ahead - behind).reshape(-1, 3, 3).transpose(0, 2, 1)
         if (np.linalg.det(vectors) < 0.0).any():
-            sentence = f"the axes of {self.frame.crs.name} are left-handed. Use another CRS."
-            raise bad_file(self.name, "cameras.left_handed", sentence, crs=self.frame.crs.name)
-        u, _, v = np.linalg.svd(vectors)
+            sentence = f"the axes of {crs.name} are left-handed. Use another CRS."
+            raise bad_file(self.name, "cameras.left_handed", sentence, crs=crs.name)
+        u, _, v = np.linalg.svd(vectors)  # the nearest rotation, whatever the lengths of the axes
         return np.asarray(u @ v)
 
 
@@ -191,8 +165,8 @@ def georeference(
         Projected, in metres. None where the cloud names none: then they are brought to where
         the software delivers clouds, mostly where the cameras are.
     cameras_crs : str, optional
-        Overrides what the file says. ``local``: the numbers are taken as they are. A CRS without
-        heights says that these agree with the cloud's, and so does ``ENU:lat,lon,height``. For a
+        Overrides the CRS in the file. ``local``: the numbers are used as they are. A CRS without
+        heights states that these agree with the cloud's, and so does ``ENU:lat,lon,height``. For a
         file with geocentric positions it is the CRS in which its software delivers clouds, unless
         it is geocentric itself.
     offset_m : tuple of 3 float, optional
@@ -218,12 +192,12 @@ def georeference(
     crs = stated or ""
     if not is_tied(stated, name):
         if cloud is None:
-            return Georeference(_same, None, offset, stated, (), name)
+            return Georeference(name, offset, stated)
         if stated is not None and not given.strip() and not systems.is_local(cloud):
             sentence = f"is in a local frame, the cloud in {cloud.name}. Export the cameras in that"
             sentence += " CRS, or give --cameras-crs local to use their numbers as they are."
             raise bad_file(name, "cameras.local", sentence, cloud_crs=cloud.name)
-        return Georeference(_same, None, offset, systems.crs_text(cloud), (), name)
+        return Georeference(name, offset, systems.crs_text(cloud))
     if cloud is not None and systems.is_local(cloud):
         sentence = f"is in {systems.shortened(crs)}, the cloud in a local frame. Set the cloud's"
         sentence += " CRS, or give --cameras-crs local to use the numbers as they are."
@@ -233,7 +207,7 @@ def georeference(
         return _into(cloud, frame, project, cameras, offset, name, trusted=trusted)
     if frame.topocentric or (frame.direct and frame.crs.is_projected):
         words = systems.shortened(crs) if frame.topocentric else frame.crs.name
-        found = Georeference(_same, None, offset, stated, (), name)
+        found = Georeference(name, offset, stated)
     elif frame.direct or project is None or not project.is_projected:
         kind = "degrees" if frame.direct else "geocentric coordinates"
         sentence = f"is in {kind} ({frame.crs.name}). Give a cloud that names its CRS."
@@ -261,12 +235,24 @@ def _into(
         vertical = systems.parts(frame.crs if project is None else project)[1]
         target = cloud if vertical is None else systems.with_heights(cloud, vertical)
     crs = systems.crs_text(target)
-    assumed = _assumed_heights(frame, target, project, trusted)
+    own, there = systems.heights_of(frame.crs), systems.heights_of(target)
+    unit, size = systems.plan_unit(frame.crs)
+    axes = [e.semi_major_metre for e in (frame.crs.ellipsoid, target.ellipsoid) if e is not None]
+    other_datum = bool(axes) and max(axes) - min(axes) > 1.0
+    is_guess = other_datum or (project is None and not frame.topocentric)
+    assumed = ""
+    if own == "unstated" and frame.crs.is_projected and size != 1.0:
+        assumed = f"heights are assumed to be in {unit}, like x and y"
+    elif own == "unstated" != there and not trusted:
+        assumed = f"names no vertical datum; that of the cloud is assumed ({target.name})"
+    elif own == "ellipsoidal" and there == "unstated" and is_guess and not trusted:
+        words = "names no vertical datum; ellipsoidal is assumed"
+        assumed = f"the cloud's CRS ({target.name}) {words}"
     notes = (note(name, "cameras.heights_assumed", f"{assumed}."),) if assumed else ()
     by_user = trusted and not frame.direct
     heights = not (by_user or systems.heights_agree(frame.crs, target))
     if frame.direct and not heights and systems.is_same_numbers(frame.crs, target):
-        return Georeference(_same, None, offset, crs, notes, name)
+        return Georeference(name, offset, crs, notes)
     plan = systems.typed(systems.parts(frame.crs if frame.direct else target)[0])
     given = "ENU:latitude,longitude,height" if frame.topocentric else plan
     instead = f"or, if the heights of cameras and cloud agree, give --cameras-crs {given}"
@@ -274,7 +260,7 @@ def _into(
         frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
     )
     notes = (*(PcfixWarning("crs.transformation", str(one), path=name) for one in of_step), *notes)
-    found = Georeference(lambda xyz: forward(frame.enter(xyz)), frame, offset, crs, notes, name)
+    found = Georeference(name, offset, crs, notes, frame, lambda xyz: forward(frame.enter(xyz)))
     # heights that --cameras-crs declares can be tested if the GNSS heights are above the geoid too
     if by_user and not frame.topocentric and systems.heights_of(target) == "gravity":
         up = adjusted_minus_gnss(found.cameras(cameras), name)[0][:, 2]
@@ -288,28 +274,12 @@ def _into(
     return found
 
 
-def _assumed_heights(frame: Frame, target: CRS, project: CRS | None, trusted: bool) -> str:
-    """Return what is assumed about heights, in words; nothing if both sides state theirs."""
-    own, cloud = systems.heights_of(frame.crs), systems.heights_of(target)
-    unit, size = systems.plan_unit(frame.crs)
-    axes = [e.semi_major_metre for e in (frame.crs.ellipsoid, target.ellipsoid) if e is not None]
-    other_datum = bool(axes) and max(axes) - min(axes) > 1.0
-    is_guess = other_datum or (project is None and not frame.topocentric)
-    if own == "unstated" and frame.crs.is_projected and size != 1.0:
-        return f"heights are assumed to be in {unit}, like x and y"
-    if own == "unstated" != cloud and not trusted:
-        return f"names no vertical datum; that of the cloud is assumed ({target.name})"
-    if own == "ellipsoidal" and cloud == "unstated" and is_guess and not trusted:
-        return f"the cloud's CRS ({target.name}) names no vertical datum; ellipsoidal is assumed"
-    return ""
-
-
 def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatArray, str]:
     """Return how far the adjusted centres are from where the GNSS stated that they were.
 
     That is metres along the axes of the cameras' map, or east, north, up where they are in none,
     shape (k, 3); NaN where a camera has no position, and where the two cannot be compared, which is
-    often so of heights. The text says why they cannot.
+    often so of heights. The text is the reason why they cannot.
 
     Parameters
     ----------
@@ -345,6 +315,11 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatA
         reason = str(error).partition("; or, if")[0].rstrip(".") + "; only plan is compared."
         forward, _ = systems.transformation(other.crs, own.crs, measured, name, heights=False)
     measured = forward(measured)
-    off = (adjusted - measured) * _metres(own.crs, measured)
+    unit = systems.plan_unit(own.crs)[1]
+    off = (adjusted - measured) * [unit, unit, abs(systems.metres_up(own.crs))]
+    if own.crs.is_geographic and (geod := own.crs.get_geod()) is not None:
+        x, y, other_x, other_y = unit * np.hstack([measured[:, :2], adjusted[:, :2]]).T
+        azimuth, _, metres = geod.inv(x, y, other_x, other_y, radians=True)
+        off[:, :2] = np.column_stack([metres * np.sin(azimuth), metres * np.cos(azimuth)])
     found[rows] = off * [1.0, 1.0, np.nan] if reason else off
     return found, reason

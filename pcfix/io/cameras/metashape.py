@@ -1,28 +1,26 @@
 """Agisoft Metashape and PhotoScan: exported cameras or markers, and whole projects.
 
 Read are the XML of *Export Cameras* and *Export Markers*, projects of one file (.psz, a zip) and
-projects with a folder (.psx, whose documents lie in zips in ``<name>.files``).
+projects with a folder (.psx, whose documents are zips in ``<name>.files``).
 
 Convention. ``camera/transform`` is a 4x4 matrix from the camera (x right, y down, z forward) to the
 chunk, whose origin, axes and scale mean nothing. The ``transform`` of the camera's component, or of
 the chunk, leads on to the world as s R X + t. With a CRS in ``reference`` the world is geocentric,
-on the datum of that CRS, whatever its kind; heights there are ellipsoidal, and only the export to
-that CRS brings a geoid in. With ``LOCAL_CS``, or no transform, the world is local. The image of a
-slave camera (``master_id``) has the pose T_master [R, t], with the rotation and location of its
-sensor in the master's frame, t in the unit of the chunk. EXIF orientations turn only what is
-displayed: matrices and pixels are those of the image as stored.
+on the datum of that CRS, whatever its kind, with ellipsoidal heights. With ``LOCAL_CS``, or no
+transform, it is local. The image of a slave camera (``master_id``) has the pose T_master [R, t],
+with the rotation and location of its sensor in the master's frame, t in the unit of the chunk. EXIF
+orientations turn only what is displayed: matrices and pixels are those of the image as stored.
 
 The tie points of a frame are PLY files in one archive: ``points`` has x, y, z in the frame of the
-component and the id of the track, ``projections`` of each camera have x and y in pixels from the
-corner of the image and the id of the track. A project of one file has them beside its document.
-Markers stand in the document of the frame, as ``location`` with x and y; only the pinned ones were
-measured, the others Metashape computed from the poses. Where the GNSS put the cameras is their
-``reference``, in the CRS of the cameras or of the chunk.
+component and the id of the track, ``projections`` of each camera x and y in pixels from the corner
+of the image and the id of the track. The document of the frame has the markers, with a ``location``
+x, y in each image; only the pinned ones were measured, Metashape computed the others. The GNSS
+positions are the ``reference`` of each camera, in the CRS of the cameras or of the chunk.
 
 Calibration. The formula is that of `pcfix.model.Lens`, with cx and cy from the centre of the image.
 A fisheye is equidistant, and since version 2.3 can be equisolid. Files of PhotoScan up to 1.2 can
-have fx and fy instead of f; there cx and cy count from the corner, and p1 and p2 change places.
-The element decides this, as the version of the document does not.
+have fx and fy instead of f (the version of the document does not show it): there cx and cy count
+from the corner, and p1 and p2 change places.
 
 References: "Agisoft Metashape User Manual, Professional Edition", appendix "Camera models";
 "Metashape Python Reference", Chunk.transform, Sensor.location, CoordinateSystem.geoccs;
@@ -31,47 +29,25 @@ References: "Agisoft Metashape User Manual, Professional Edition", appendix "Cam
 
 from __future__ import annotations
 
-import io
 import re
 import zipfile
 from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import (
-    ZIP_MAGIC,
-    Source,
-    damaged,
-    note,
-    number,
-    numbers,
-    read_xml,
-    text_of,
-)
+from pcfix.io.cameras.checks import Source, damaged, note, number, numbers, read_xml, text_of
 from pcfix.io.cameras.lenses import lens_by_name
-from pcfix.io.crs import LOCAL, METRES, crs_text, is_local, parse_crs, shortened, unbound
+from pcfix.io.crs import LOCAL, crs_text, is_local, parse_crs, shortened, unbound
 from pcfix.io.ply import parse_header
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
 
-Spreads: TypeAlias = "tuple[tuple[str, tuple[int, ...]], ...]"
-"""Names of stated standard deviations and the axes that they are of."""
-SPREADS: Spreads = (
-    *(("sxyz", (0, 1, 2)), ("sxy", (0, 1))),
-    *(("sx", (0,)), ("sy", (1,)), ("sz", (2,))),
-)
-DEFAULTS: Spreads = (
-    ("accuracy_cameras", (0, 1, 2)),
-    ("accuracy_cameras_xy", (0, 1)),
-    ("accuracy_cameras_z", (2,)),
-)
 PARAMETERS = {
     *("f", "fx", "fy", "cx", "cy", "b1", "b2", "skew"),
     *("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4"),
@@ -83,38 +59,29 @@ PROJECTIONS: dict[str, Projection] = {
     "equisolid_fisheye": "equisolid",
 }
 """Kinds of sensors that a lens can describe: not spherical, cylindrical or RPC."""
-ROOT = re.compile(  # a project, chunks or a chunk, after the declaration and comments
-    r"\s*(<\?.*?\?>\s*|<!--.*?-->\s*)*"
+SPREADS = {"sxyz": [0, 1, 2], "sxy": [0, 1], "sx": [0], "sy": [1], "sz": [2]}
+"""Names of stated standard deviations and the axes that they are of."""
+INSIDE = r"project\.zip"
+CONTENT = re.compile(  # a project, chunks or a chunk, after the declaration and comments
+    r"\A\s*(<\?.*?\?>\s*|<!--.*?-->\s*)*"
     r"(<(document|collection)\b.*?(<chunks?\b|\bpath=)|<chunk\b.*?<sensors\b)",
     re.DOTALL,
 )
-
-
-def recognises(source: Source) -> bool:
-    """Whether the content is a project, a chunk, or an archive of one."""
-    if source.path.is_dir():
-        return "project.zip" in source.names
-    text = source.text
-    if source.head.startswith(ZIP_MAGIC):
-        with suppress(Exception), zipfile.ZipFile(source.path) as archive:
-            text = archive.open("doc.xml").read(len(source.head)).decode("utf-8", "replace")
-    return bool(ROOT.match(text))
 
 
 def read(source: Source) -> Cameras:
     """Read the aligned images of a chunk: geocentric, or in a ``local`` frame."""
     chunk = open_chunk(source.path)
     images, unposed, notes = aligned_images(chunk)
-    path, (crs, project_crs, of_world) = chunk.path, _world(chunk)
-    notes += of_world
+    crs, project_crs = _world(chunk)
+    gnss, of_gnss = _gnss_positions(chunk, images)
     in_world = np.array([image.place @ image.pose for image in images])
     scales = np.cbrt(np.linalg.det(in_world[:, :3, :3]))[:, None, None]
     lenses: dict[Element, Lens] = {}
     for image in images:
         if image.sensor not in lenses:
-            lenses[image.sensor], of_lens = _lens(path, image.sensor, image.label)
+            lenses[image.sensor], of_lens = _lens(chunk.path, image.sensor, image.label)
             notes += of_lens
-    gnss, of_gnss = _gnss_positions(chunk, images)
     return Cameras(
         labels=tuple(image.label for image in images),
         centres=in_world[:, :3, 3],
@@ -133,60 +100,47 @@ def read(source: Source) -> Cameras:
 
 
 class Document(NamedTuple):
-    """An element, and the file or archive that contains it."""
+    """An element, and the file or archive that contains it; of a chunk also what wrote it."""
 
     root: Element
     path: Path
+    software: str = ""
+    notes: tuple[PcfixWarning, ...] = ()
 
-    def follow(self, element: Element) -> Document:
-        """Return the document that an element refers to by its path, or the element itself."""
-        path = self.leads_to(element)
-        return Document(element, self.path) if path is None else _unpacked(path)
-
-    def leads_to(self, element: Element) -> Path | None:
-        """Return the file that an element refers to; None if it has no path."""
+    def path_to(self, element: Element) -> Path | None:
+        """Return the archive that an element refers to; None if it has no path."""
         relative = element.get("path")
         return None if relative is None else self.path.parent / relative.replace("\\", "/")
 
-
-class Chunk(NamedTuple):
-    """The chunk that is read; `path` is what the user named, for messages."""
-
-    path: Path
-    document: Document
-    software: str
-    notes: list[PcfixWarning]
-
-    @property
-    def element(self) -> Element:
-        """The ``chunk`` element."""
-        return self.document.root
+    def follow(self, element: Element) -> Document:
+        """Return the document that an element refers to by its path, or the element itself."""
+        path = self.path_to(element)
+        return Document(element, self.path) if path is None else Document(read_xml(path), path)
 
     @property
     def frame(self) -> Document | None:
-        """The first frame, which has the images of every marker and the tie points."""
-        first = self.element.find("frames/frame")
-        return None if first is None else self.document.follow(first)
+        """The first frame of a chunk, which has the images of every marker and the tie points."""
+        first = self.root.find("frames/frame")
+        return None if first is None else self.follow(first)
 
-    @property
-    def settings(self) -> dict[str, str]:
-        """The settings of the chunk by their names."""
-        return _properties(self.element, "settings")
-
-
-def _properties(element: Element, path: str = ".") -> dict[str, str]:
-    """Return the names and values of the properties in an element."""
-    entries = element.iterfind(f"{path}/property")
-    return {entry.get("name") or "": entry.get("value") or "" for entry in entries}
+    def properties(self, name: str) -> dict[str, str]:
+        """Return the names and values of the properties in an element of a chunk."""
+        found = self.root.iterfind(f"{name}/property")
+        return {one.get("name") or "": one.get("value") or "" for one in found}
 
 
-def open_chunk(path: Path) -> Chunk:
+def open_chunk(path: Path) -> Document:
     """Return the active chunk, or the first that has aligned images where that one has none."""
-    top, notes = _top(path), list[PcfixWarning]()
+    named = path / "project.zip" if path.is_dir() else path
+    top = Document(read_xml(named), named)
+    if top.root.tag == "document" and (inside := top.root.get("path")):  # .psx: in its folder
+        named = path.parent / inside.replace("{projectname}", path.stem)
+        top = Document(read_xml(named), named)
     chosen = top
+    notes: tuple[PcfixWarning, ...] = ()
     if top.root.tag != "chunk":
-        chunks = top.root.find("chunks")
-        active = None if chunks is None else chunks.get("active_id")
+        parent = top.root.find("chunks")
+        active = None if parent is None else parent.get("active_id")
         listed = top.root.findall("chunk") or top.root.findall("chunks/chunk")
         listed.sort(key=lambda chunk: chunk.get("id") != active)
         found = [top.follow(chunk) for chunk in listed]
@@ -198,35 +152,12 @@ def open_chunk(path: Path) -> Chunk:
             names = [one.root.get("label") or "without a name" for one in (chosen, *others)]
             sentence = f"several chunks have aligned images; {names[0]} is read. Activate another"
             values = {"chunk": names[0], "others": names[1:]}
-            notes = [note(path, "cameras.several_chunks", f"{sentence} for that.", **values)]
-    about = _properties(top.root, "meta") | _properties(chosen.root, "meta")
-    name = about.get("Info/OriginalSoftwareName", "Agisoft Metashape")
-    version = about.get("Info/LastSavedSoftwareVersion") or about.get(
-        "Info/OriginalSoftwareVersion", ""
-    )
-    return Chunk(path, chosen, f"{name} {version}".strip(), notes)
-
-
-def _top(path: Path) -> Document:
-    """Return the outermost document; that of a .psx is in the folder beside it."""
-    if path.is_dir():
-        return _unpacked(path / "project.zip")
-    if zipfile.is_zipfile(path):
-        return _unpacked(path)
-    root = read_xml(path)
-    inside = root.get("path")
-    if root.tag != "document" or inside is None:
-        return Document(root, path)
-    archive = Path(inside.replace("{projectname}", path.stem))
-    if archive.is_absolute():
-        raise damaged(path, f"its path '{inside}' leads out of its folder")
-    return _unpacked(path.parent / archive)
-
-
-def _unpacked(path: Path) -> Document:
-    """Return the document in an archive."""
-    with checks.open_archive(path) as archive:
-        return Document(read_xml(path, io.BytesIO(checks.unpacked(archive, "doc.xml"))), path)
+            notes = (note(path, "cameras.several_chunks", f"{sentence} for that.", **values),)
+    about = top.properties("meta") | chosen.properties("meta")
+    software = about.get("Info/OriginalSoftwareName", "Agisoft Metashape")
+    original = about.get("Info/OriginalSoftwareVersion", "")
+    version = about.get("Info/LastSavedSoftwareVersion") or original
+    return chosen._replace(software=f"{software} {version}".strip(), notes=notes)
 
 
 # ---- images and their places ----
@@ -247,14 +178,14 @@ class Image(NamedTuple):
     place: FloatArray
 
 
-def aligned_images(chunk: Chunk) -> tuple[list[Image], tuple[str, ...], list[PcfixWarning]]:
+def aligned_images(chunk: Document) -> tuple[list[Image], tuple[str, ...], list[PcfixWarning]]:
     """Return the images of a chunk that are read, the names of all others, and notes.
 
     The others are not aligned, disabled (they took no part in the dense cloud), not of a central
     projection, or in a component without a place in the frame of the others. Photos may be in
     groups; keyframes of animations are none.
     """
-    path, element = chunk.path, chunk.element
+    path, element = chunk.path, chunk.root
     places, _ = _places(path, element)
     sensors = {sensor.get("id"): sensor for sensor in element.iterfind("sensors/sensor")}
     homes: dict[str, str | None] = {  # the component of each image
@@ -268,7 +199,7 @@ def aligned_images(chunk: Chunk) -> tuple[list[Image], tuple[str, ...], list[Pcf
         for i, camera in enumerate(element.iterfind("cameras//camera"))
         if camera.get("type", "regular") == "regular"
     }
-    own = dict[str, FloatArray]()
+    own = dict[str, FloatArray]()  # poses in the chunk
     for name, camera in photos.items():
         if text := text_of(camera, "transform"):
             where = f"image {camera.get('label')}"
@@ -276,18 +207,17 @@ def aligned_images(chunk: Chunk) -> tuple[list[Image], tuple[str, ...], list[Pcf
             own[name] = _rigid(path, where, matrix[:3, :3], matrix[:3, 3])
     images, others, unused = list[Image](), list[str](), 0
     for name, camera in photos.items():
-        label = camera.get("label") or f"number {name}"
-        master = camera.get("master_id") or ""
+        label, master = camera.get("label") or f"number {name}", camera.get("master_id") or ""
         home = camera.get("component_id") or homes.get(name) or homes.get(master)
         homes[name] = home
-        sensor, pose = sensors.get(camera.get("sensor_id")), own.get(name)
-        if pose is None and master in own and sensor is not None:  # a slave
-            where = f"sensor {name_of(sensor)}"  # its place on the master, in the chunk's unit
-            turn, shift = text_of(sensor, "rotation"), text_of(sensor, "location")
-            rotation = numbers(path, where, turn, 9) if turn else np.eye(3)
-            location = numbers(path, where, shift, 3) if shift else np.zeros(3)
-            pose = own[master] @ _rigid(path, where, rotation, location)
         place = places.get(home, places[None])
+        sensor, pose = sensors.get(camera.get("sensor_id")), own.get(name)
+        if pose is None and master in own and sensor is not None:  # its sensor is on the master
+            where = f"sensor {name_of(sensor)}"
+            rotation = text_of(sensor, "rotation") or "1 0 0 0 1 0 0 0 1"
+            shift = numbers(path, where, text_of(sensor, "location") or "0 0 0", 3)
+            turn = numbers(path, where, rotation, 9)
+            pose = own[master] @ _rigid(path, where, turn, shift)
         if pose is None:
             others.append(label)
         elif sensor is None:
@@ -359,29 +289,21 @@ def _similarity(path: Path, element: Element | None) -> FloatArray | None:
     return matrix
 
 
-def _world(chunk: Chunk) -> tuple[str, str | None, list[PcfixWarning]]:
-    """Return the frame that a chunk's transforms lead to, its CRS if another, and notes on them."""
-    text, name = text_of(chunk.element, "reference"), str(chunk.path)
-    if not text or text.upper() == "LOCAL" or not _places(chunk.path, chunk.element)[1]:
-        return LOCAL, None, []
+def _world(chunk: Document) -> tuple[str, str | None]:
+    """Return the frame that a chunk's transforms lead to, and its CRS if that is another."""
+    text, name = text_of(chunk.root, "reference"), str(chunk.path)
+    if not text or text.upper() == "LOCAL" or not _places(chunk.path, chunk.root)[1]:
+        return LOCAL, None
     crs = parse_crs(text, name)
     if is_local(crs):
-        unit = crs.axis_info[0].unit_name
-        sentence = f"the local coordinates of the chunk are in {unit}, its transform in metres."
-        foreign = note(chunk.path, "cameras.local_unit", sentence, unit=unit)
-        return LOCAL, None, [] if unit in METRES else [foreign]
+        return LOCAL, None
     if crs.geodetic_crs is None:
         raise damaged(chunk.path, f"the CRS {shortened(text)} has no datum")
-    axes = [
-        {"name": f"Geocentric {a}", "abbreviation": a, "direction": f"geocentric{a}"}
-        | {"unit": "metre"}
-        for a in "XYZ"
-    ]
-    geocentric = unbound(crs.geodetic_crs).to_json_dict()  # on the datum of the CRS
-    geocentric |= {"coordinate_system": {"subtype": "Cartesian", "axis": axes}}
-    geocentric |= {"type": "GeodeticCRS", "id": None}
-    frame = crs_text(type(crs).from_json_dict({k: v for k, v in geocentric.items() if v}))
-    return frame, frame if crs.is_geocentric else text, []
+    # the geocentric CRS on the same datum; of WGS 84 it has the code 4978
+    axes = {"coordinate_system": type(crs)("EPSG:4978").to_json_dict()["coordinate_system"]}
+    given = unbound(crs.geodetic_crs).to_json_dict() | axes | {"type": "GeodeticCRS", "id": None}
+    frame = crs_text(type(crs).from_json_dict({k: v for k, v in given.items() if v}))
+    return frame, frame if crs.is_geocentric else text
 
 
 # ---- lenses ----
@@ -398,7 +320,45 @@ def read_calibration(path: Path) -> Lens:
         remedy = f"Use a lens of type {', '.join(PROJECTIONS)}"
         raise checks.unsupported(path, f"the projection '{kind}'", remedy, model=kind)
     size = [number(path, side, root.findtext(side)) for side in ("width", "height")]
-    return checks.lens(path, path.stem, _calibrated(path, path.stem, kind, root, size))
+    return _calibrated(path, path.stem, kind, root, size)
+
+
+def name_of(element: Element) -> str:
+    """Return the label of a sensor or marker, or its number."""
+    return element.get("label") or f"number {element.get('id')}"
+
+
+def _calibration(sensor: Element) -> Element | None:
+    """Return the last adjusted calibration, else the last one."""
+    found = sensor.findall("calibration")
+    chosen = [one for one in found if one.get("class") == "adjusted"] or found
+    return chosen[-1] if chosen else None
+
+
+def _kind(sensor: Element) -> str:
+    """Return the type of a sensor, which may be none of `PROJECTIONS`."""
+    found = _calibration(sensor)
+    return (found is not None and found.get("type")) or sensor.get("type") or "frame"
+
+
+def _lens(path: Path, sensor: Element, image: str) -> tuple[Lens, list[PcfixWarning]]:
+    """Return the adjusted calibration, else the initial one; and a note on what is ignored."""
+    label, found = name_of(sensor), _calibration(sensor)
+    sizes = [one.find("resolution") for one in (found, sensor) if one is not None]
+    resolution = next((one for one in sizes if one is not None), None)
+    if resolution is None or found is None:
+        sentence = f"sensor {label} of {image} has no calibration or no size. Align the images."
+        raise bad_file(path, "cameras.no_calibration", sentence, sensor=label)
+    sides = (resolution.get(side) for side in ("width", "height"))
+    size = [number(path, f"sensor {label}, resolution", side) for side in sides]
+    lens = _calibrated(path, label, _kind(sensor), found, size)
+    coefficients = found.findtext("corrections/coeffs")
+    if not coefficients:
+        return lens, []
+    where, count = f"sensor {label}, corrections", len(coefficients.split())
+    rms_px = float(np.linalg.norm(numbers(path, where, coefficients, count)) / 2.0**0.5)
+    sentence = f"the additional corrections of {label} are ignored ({rms_px:.2f} px rms)."
+    return lens, [note(path, "cameras.corrections", sentence, sensor=label, rms_px=rms_px)]
 
 
 def _calibrated(
@@ -421,100 +381,54 @@ def _calibrated(
     return lens_by_name(given, width, height, projection=PROJECTIONS[kind], sensor=sensor)
 
 
-def name_of(element: Element) -> str:
-    """Return the label of a sensor or marker, or its number."""
-    return element.get("label") or f"number {element.get('id')}"
-
-
-def _kind(sensor: Element) -> str:
-    """Return the type of a sensor, which may be none of `PROJECTIONS`."""
-    found = _calibration(sensor)
-    return (found is not None and found.get("type")) or sensor.get("type") or "frame"
-
-
-def _calibration(sensor: Element) -> Element | None:
-    """Return the last adjusted calibration, else the last one."""
-    found = sensor.findall("calibration")
-    chosen = [one for one in found if one.get("class") == "adjusted"] or found
-    return chosen[-1] if chosen else None
-
-
-def _lens(path: Path, sensor: Element, image: str) -> tuple[Lens, list[PcfixWarning]]:
-    """Return the adjusted calibration, else the initial one, else the data sheet; and notes."""
-    label, found, notes = name_of(sensor), _calibration(sensor), list[PcfixWarning]()
-    sizes = [one.find("resolution") for one in (found, sensor) if one is not None]
-    resolution = next((one for one in sizes if one is not None), None)
-    stated = _properties(sensor)
-    pixel_mm, focal_mm = (
-        number(path, f"sensor {label}, {name}", stated.get(name, "0"))
-        for name in ("pixel_width", "focal_length")
-    )
-    if resolution is None or (found is None and not min(pixel_mm, focal_mm) > 0.0):
-        sentence = f"sensor {label} of {image} has no calibration or no size. Align the images."
-        raise bad_file(path, "cameras.no_calibration", sentence, sensor=label)
-    sides = (resolution.get(side) for side in ("width", "height"))
-    size = [number(path, f"sensor {label}, resolution", side) for side in sides]
-    if found is not None:
-        lens = _calibrated(path, label, _kind(sensor), found, size)
-        if coefficients := found.findtext("corrections/coeffs"):
-            where, count = f"sensor {label}, corrections", len(coefficients.split())
-            rms_px = float(np.linalg.norm(numbers(path, where, coefficients, count)) / 2.0**0.5)
-            sentence = f"the additional corrections of {label} are ignored ({rms_px:.2f} px rms)."
-            notes.append(note(path, "cameras.corrections", sentence, sensor=label, rms_px=rms_px))
-    else:
-        given = {"f": focal_mm / pixel_mm}  # what Metashape itself starts from
-        lens = lens_by_name(given, *size, projection=PROJECTIONS[_kind(sensor)], sensor=label)
-        sentence = f"sensor {label} has no calibration; the lens of its data sheet is used."
-        notes.append(note(path, "cameras.data_sheet_lens", sentence, sensor=label))
-    return lens, notes
-
-
 # ---- what was measured ----
 
 
 def _gnss_positions(
-    chunk: Chunk, images: list[Image]
+    chunk: Document, images: list[Image]
 ) -> tuple[GnssPositions | None, list[PcfixWarning]]:
     """Return the reference positions of images, and notes on them.
 
-    Positions that the user unticked are no measurement and left out, unless all are, as is usual
+    Positions that the user unticked are no measurement and skipped, unless all are, as is usual
     when only control points determine the block.
     """
     path, given = chunk.path, [image.element.find("reference") for image in images]
     stated = {i: one.attrib for i, one in enumerate(given) if one is not None}
     ticked = {i: of for i, of in stated.items() if of.get("enabled") != "false"}
-    settings = {name.replace("/", "_"): value for name, value in chunk.settings.items()}
-    start = spreads(path, "settings of the chunk", settings, DEFAULTS, np.full(3, np.nan))
+    settings = {
+        name.replace("/", "_"): value for name, value in chunk.properties("settings").items()
+    }
+    names = {"sxyz": "accuracy_cameras", "sxy": "accuracy_cameras_xy", "sz": "accuracy_cameras_z"}
+    of_all = {name: settings.get(one, "") for name, one in names.items()}
+    start = spreads(path, "settings of the chunk", of_all, np.full(3, np.nan))
     places = {}
     for i, of in (ticked or stated).items():
         where = f"image {images[i].label}, reference"
         xyz = [number(path, where, of[axis]) if axis in of else np.nan for axis in "xyz"]
-        sigma = spreads(path, where, of, SPREADS, start)
+        sigma = spreads(path, where, of, start)
         places[i] = xyz, np.where(np.isfinite(xyz) & (sigma > 0.0), sigma, np.nan)
     # the CRS of the cameras may differ from that of the chunk
-    own, notes = text_of(chunk.element, "camera_reference"), list[PcfixWarning]()
-    crs = own or text_of(chunk.element, "reference") or "LOCAL"
+    own = text_of(chunk.root, "camera_reference")
+    crs = own or text_of(chunk.root, "reference") or "LOCAL"
     found = checks.measured(range(len(images)), places, crs)
     if found is None:
         return None, []
-    are_degrees = bool((np.nanmax(np.abs(found.xyz[:, :2]), axis=0) <= [180.0, 90.0]).all())
     if crs.upper() == "LOCAL" or is_local(parsed := parse_crs(crs, str(path))):
-        crs = LOCAL
-    elif are_degrees and not own and not parsed.is_geographic:
-        sentence = "the camera positions are degrees in a CRS in metres; WGS 84 is assumed."
-        crs, notes = "EPSG:4979", [note(path, "cameras.gnss_in_degrees", sentence)]
-    return replace(found, crs=crs), notes
+        return replace(found, crs=LOCAL), []
+    largest = np.nanmax(np.abs(found.xyz[:, :2]), axis=0)
+    if own or parsed.is_geographic or (largest > [180.0, 90.0]).any():
+        return found, []
+    sentence = "the camera positions are degrees in a CRS in metres; WGS 84 is assumed."
+    return replace(found, crs="EPSG:4979"), [note(path, "cameras.gnss_in_degrees", sentence)]
 
 
-def spreads(
-    path: Path, where: str, stated: dict[str, str], names: Spreads, start: FloatArray
-) -> FloatArray:
+def spreads(path: Path, where: str, stated: dict[str, str], start: FloatArray) -> FloatArray:
     """Return `start` with what is stated, the widest first: one number for its axes, or each."""
     sigma = start.copy()
-    for name, axes in names:
+    for name, axes in SPREADS.items():
         if text := stated.get(name):
             count = 1 if len(text.split()) == 1 else len(axes)
-            sigma[list(axes)] = numbers(path, f"{where}, {name}", text, count)
+            sigma[axes] = numbers(path, f"{where}, {name}", text, count)
     return sigma
 
 
@@ -533,7 +447,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the tie points of a project, then the markers, with what was measured of them.
 
     A marker has no position (NaN), as the file has only its surveyed coordinates. Projections
-    that Metashape itself computed are left out.
+    that Metashape itself computed are skipped.
     """
     chunk = open_chunk(source.path)
     images, frame, seen = aligned_images(chunk)[0], chunk.frame, list[checks.Seen]()
@@ -553,19 +467,17 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
 
 
 def _tie_points(frame: Document, images: list[Image]) -> Iterator[checks.Seen]:
-    """Yield the points of every component that has a place; their archive may be left out."""
+    """Yield the points of every component that has a place; their archive may be missing."""
     clouds = (*frame.root.iterfind("point_cloud"), *frame.root.iterfind("tie_points"))
-    found = [
-        frame.follow(cloud)
-        for cloud in clouds
-        if (path := frame.leads_to(cloud)) is None or path.is_file()
-    ]
-    document = next((d for d in found if d.root.find("projections") is not None), None)
-    if document is None:
+    there = [one for one in clouds if (path := frame.path_to(one)) is None or path.is_file()]
+    for document in map(frame.follow, there):
+        listed = document.root.findall("projections")
+        if listed:
+            break
+    else:
         return
-    listed = document.root.iterfind("projections")
     files = {entry.get("camera_id") or "": entry.get("path") or "" for entry in listed}
-    with checks.open_archive(document.path) as archive:
+    with checks.reading(document.path), zipfile.ZipFile(document.path) as archive:
         for points in document.root.iterfind("points"):
             component = points.get("component_id")
             rows = [

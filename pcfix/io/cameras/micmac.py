@@ -2,28 +2,26 @@
 
 `Externe` has the projection centre (`Centre`) and the matrix camera to world as rows L1, L2, L3
 (`CodageMatr`); the camera is x right, y down, z forward. The interior orientation is `Interne` in
-the same file or another file, `FileInterne`, named from the folder in which MicMac ran; it is
-looked for beside the orientation first. `OrIntImaM2C` is an affine map from the camera's pixels
-to those of a scaled image. Where MicMac's pixels begin, at the corner or the centre of the first,
-its formats do not say; they are taken as they are. The files name no CRS.
+the same file, or in the file that `FileInterne` names from the folder in which MicMac ran; it is
+looked for next to the orientation first. `OrIntImaM2C` is an affine map from the camera's pixels to
+those of a scaled image. The formats do not say whether pixels begin at the corner or the centre of
+the first; they are taken as they are. The files name no CRS.
 
-An ideal position F (x, y) / z + PP, in pixels, goes through the distortion of the calibration to
-the observed one (eConvApero_DistM2C), or from the observed to the ideal one (eConvApero_DistC2M).
-Read are the formulas that `pcfix.model.Lens` holds exactly, d being the distance from the centre of
-distortion: none; radial, d (k1 d^2 + k2 d^4 + ...); and Fraser's with decentring P1 (2 x^2 + d^2) +
-2 P2 x y beside it. The affinity b1 x + b2 y of Fraser's is of the ideal place, that of a lens of
-the distorted one: it is read where that makes no difference, up to `AFFINITY_PX`. mm3d ConvertCalib
-turns any other formula into one of these.
+An ideal position F (x, y) / z + PP, in pixels, goes through the distortion to the observed one
+(eConvApero_DistM2C), or the observed to the ideal one (eConvApero_DistC2M). Read are the formulas
+that `pcfix.model.Lens` holds exactly, d being the distance from the centre of distortion: none;
+radial, d (k1 d^2 + k2 d^4 + ...); and Fraser's with decentring P1 (2 x^2 + d^2) + 2 P2 x y. The
+affinity b1 x + b2 y of Fraser's is of the ideal place, that of a lens of the distorted one: it is
+read where that makes no difference, up to `AFFINITY_PX`. mm3d ConvertCalib converts the others.
 
 MMVII has the centre (`Center`) and the camera's axes in the world (`AxeI`, `AxeJ`, `AxeK`), the
-same matrix by columns, and the calibration in a file beside it. Its distortion is of the ideal
-place (X, Y) / Z and leads to the observed one: K1, K2, ... radial, p1 and p2 as P1 and P2 above, b1
-and b2 as there; anything beyond is refused.
+same matrix by columns, and the calibration in a file next to it: ideal places (X, Y) / Z to
+observed ones with K1, K2, ... radial, p1, p2, b1 and b2 as above; anything beyond is refused.
 
 References: M. Pierrot-Deseilligny and others, "MicMac, Apero, Pastis and other beverages in a
 nutshell", https://github.com/micmacIGN/Documentation, "Distortion models" and ConvertCalib;
 include/XML_GEN/ParamChantierPhotogram.xml of https://github.com/micmacIGN/micmac for the elements;
-MMVII's files write the formula of each coefficient beside it.
+MMVII's files write the formula of each coefficient next to it.
 """
 
 from __future__ import annotations
@@ -43,6 +41,7 @@ from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.model import Cameras, FloatArray, Lens
 
 PREFIX, PREFIX_2, SUFFIX = "Orientation-", "Ori-PerspCentral-", ".xml"
+CONTENT, INSIDE = "<OrientationConique|<NameInternalCalib>", rf"({PREFIX}|{PREFIX_2}).*\{SUFFIX}"
 UNIFIED = ("eModele_DRad_PPaEqPPs", "eModele_Fraser_PPaEqPPs")
 """Of `ModUnif`: radial and Fraser's about the principal point; five k, P1, P2, b1, b2."""
 NO_DISTORTION = ("ModNoDist", "eModelePolyDeg0")
@@ -51,14 +50,6 @@ AFFINITY_PX = 0.1
 
 NAMES = (*(f"k{i}" for i in range(1, 10)), "p1", "p2", "b1", "b2")
 _IS_INVERSE = {"": False, "eConvApero_DistM2C": False, "eConvApero_DistC2M": True}
-
-
-def recognises(source: Source) -> bool:
-    """Whether a folder has orientations by their names, or a file is one."""
-    if source.path.is_dir():
-        begins = (PREFIX, PREFIX_2)
-        return any(name.startswith(begins) and name.endswith(SUFFIX) for name in source.names)
-    return "<OrientationConique" in source.text or "<NameInternalCalib>" in source.text
 
 
 def read(source: Source) -> Cameras:

@@ -1,4 +1,4 @@
-"""What is likely wrong where cameras do not lie over their cloud."""
+"""What is likely wrong where cameras are not over their cloud."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 FOOT_M = 0.3048
 MARGIN_M = 100.0
-"""With half the cloud's sides: how far outside the cloud a block may stand."""
+"""With half the cloud's sides: how far outside the cloud a block may be."""
 UNDULATION_M = (15.0, 110.0)
 """Of the geoid, where it is worth a word."""
 ABSURD_HEIGHTS = 3.0
@@ -28,7 +28,7 @@ _SAMPLE = 200
 def likely_mistake(
     centres: FloatArray, low: FloatArray, high: FloatArray, cloud_crs: str | CRS | None
 ) -> str | None:
-    """Return what is likely wrong where a block does not fit its cloud.
+    """Return what is likely wrong where a block does not fit its cloud; None where it does.
 
     Parameters
     ----------
@@ -37,18 +37,13 @@ def likely_mistake(
     low, high : array, shape (3,)
         Corners of the cloud, metres.
     cloud_crs : str, CRS or None
-
-    Returns
-    -------
-    str or None
-        One sentence; None where the block is over the cloud.
     """
     centres = np.asarray(centres, np.float64)[:: max(1, len(centres) // _SAMPLE)]
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     size, margin = high - low, 0.5 * (high - low)[:2] + MARGIN_M
 
     def is_over(moved: FloatArray) -> bool:
-        """Whether the middle of a block is over the cloud, or not far beside it."""
+        """Whether the middle of a block is over the cloud, or not far from it."""
         middle = np.median(moved[:, :2], axis=0)
         return bool(np.all((middle >= low[:2] - margin) & (middle <= high[:2] + margin)))
 
@@ -58,11 +53,11 @@ def likely_mistake(
         if is_over(moved):
             return f"The cameras would lie over the cloud {words}."
     x, y = (low + high)[:2] / 2.0 - np.median(centres[:, :2], axis=0)
-    span, apart = np.ptp(centres[:, :2], axis=0).max(), float(np.hypot(x, y))
+    span, away = np.ptp(centres[:, :2], axis=0).max(), float(np.hypot(x, y))
     advice = "check the CRS of both."
     if 0.2 < span / max(size[:2].max(), 1e-9) < 5.0:
         advice = f"perhaps by an offset of {x:.0f}, {y:.0f} m; see --cameras-offset."
-    far = f"{apart / 1000.0:,.1f} km" if apart >= 1e4 else f"{apart:.0f} m"
+    far = f"{away / 1000.0:,.1f} km" if away >= 1e4 else f"{away:.0f} m"
     return f"The cameras are {far} from the cloud in plan; {advice}"
 
 
@@ -78,18 +73,17 @@ def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str,
     plan = None if crs is None else parts(parse_crs(crs, "the cloud"))[0]
     if plan is None or not plan.is_projected:
         return
-    say = "; set it with --cameras-crs"
+    remedy, zone = "set it with --cameras-crs", int((plan.utm_zone or "0N")[:-1])
     others = [
-        (f"longitude and latitude in degrees{say} EPSG:4326", 4326, centres),
+        (f"longitude and latitude in degrees; {remedy} EPSG:4326", 4326, centres),
         ("degrees, latitude before longitude; exchange the columns", 4326, swapped),
-        (f"web Mercator{say} EPSG:3857", 3857, centres),
+        (f"web Mercator; {remedy} EPSG:3857", 3857, centres),
     ]
-    if plan.utm_zone is not None:  # the zones within two of the cloud's, and the other hemisphere
-        zone = int(plan.utm_zone[:-1])
-        for near in ((zone + step - 1) % 60 + 1 for step in (0, -1, 1, -2, 2)):
-            for side, first in (("N", 32600), ("S", 32700)):
-                words = f"UTM zone {near}{side} (the cloud is in {plan.utm_zone}){say}"
-                others.append((words, first + near, centres))
+    # the zones within two of the cloud's, and the other hemisphere
+    for near in [(zone + step - 1) % 60 + 1 for step in (0, -1, 1, -2, 2)] if zone else []:
+        for side, first in (("N", 32600), ("S", 32700)):
+            words = f"UTM zone {near}{side} (the cloud is in {plan.utm_zone}); {remedy}"
+            others.append((words, first + near, centres))
     for words, code, numbers in others:
         with suppress(ProjError):  # of a CRS that is no single map, as all zones of UTM in one
             to_cloud = Transformer.from_crs(code, plan, always_xy=True)
@@ -98,12 +92,13 @@ def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str,
 
 
 def _wrong_height(middle: float, low: FloatArray, high: FloatArray) -> str | None:
-    """Return what is likely wrong where cameras lie over the cloud, but not above it."""
+    """Return what is likely wrong where cameras are over the cloud in plan, but not above it."""
     below, above = float(low[2]) - middle, middle - float(high[2])
-    limit = ABSURD_HEIGHTS * max(float((high - low)[:2].max()), MARGIN_M)
+    width = max(float((high - low)[:2].max()), MARGIN_M)
+    limit = ABSURD_HEIGHTS * width
     if below <= 0.0 and above <= limit:
         return None
-    what = f"{above:.0f} m above the cloud, which is {limit / ABSURD_HEIGHTS:.0f} m wide"
+    what = f"{above:.0f} m above the cloud, which is {width:.0f} m wide"
     if below > 0.0:
         what = f"{below:.0f} m below the lowest point of the cloud"
     why = "their heights have another origin; see --cameras-offset"

@@ -4,16 +4,14 @@ ODM reconstructs with OpenSfM and delivers its cloud in a projected CRS, named i
 the first line of coords.txt. Its reconstruction has been in three frames:
 
 - up to 2020 topocentric as OpenSfM writes it, with geocoords_transformation.txt, an affine map
-  (turn by the meridian convergence, scale, shift) that makes projected coordinates of it, and so
-  of the cloud;
+  from it to projected coordinates, and so to the cloud;
 - then with the axes of the projected CRS, less its coordinates of the reference; the reference is
   at whole metres, which distinguishes this frame from a topocentric one;
 - topocentric again in versions that project the finished cloud point by point, and in
   reconstruction.topocentric.json, which the second kind keeps.
 
-Where the reference is at whole metres, shots.geojson decides between the last two, or the GNSS
-positions (always topocentric). Poses come out in the projected CRS in the first two frames,
-topocentric in the third.
+Where the reference is at whole metres, shots.geojson or the GNSS positions (always topocentric)
+decide between the last two. Poses come out in the projected CRS, in the third frame topocentric.
 
 shots.geojson has per image `translation`, the projection centre in the projected CRS, `rotation`,
 axis times angle from the axes of that CRS to the camera (x right, y down, z forward), and size and
@@ -52,6 +50,8 @@ SCALE_TOLERANCE = 0.1
 WHOLE_M = 2e-3
 """Newer ODM puts the origin at whole metres; reference_lla is rounded a little."""
 SAME_FOCAL = 1e-6
+FEWEST = 3
+"""Images that show in which frame a reconstruction is."""
 GNSS_KEYS = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev")
 
 _FOLDERS = ("opensfm", "odm_georeferencing", "odm_georeferencing_25d", "odm_report")
@@ -106,7 +106,7 @@ def _files_of(path: Path) -> Files:
     """Return the files of the project that a file or folder belongs to.
 
     A file is taken as it is; of a folder its reconstruction, or else its shots.geojson. Other files
-    are beside it, or in the project's own folders.
+    are next to it, or in the project's own folders.
     """
     folder = path if path.is_dir() else path.parent
     root = folder.parent if folder.name == "undistorted" else folder
@@ -128,8 +128,7 @@ def _crs_of(files: Files) -> str | None:
 
 def named_crs(path: Path) -> str:
     """Return the CRS in the first line of a file: a PROJ string, EPSG:n or WGS84 UTM 16N."""
-    text = path.read_bytes()[:4096].decode("utf-8-sig", errors="replace").strip()
-    return checks.crs(path, checks.utm_as_code(text.partition("\n")[0].strip()))
+    return checks.crs(path, [*read_lines(path), ""][0])
 
 
 def _frame(files: Files, found: opensfm.Reconstruction) -> AffineFrame | None:
@@ -156,19 +155,21 @@ def _frame(files: Files, found: opensfm.Reconstruction) -> AffineFrame | None:
     moved = AffineFrame(np.eye(3), np.array([*place, 0.0]), crs)
     # centres of shots.geojson, else the GNSS, which stays topocentric, show whether it was moved:
     # the two readings differ by the meridian convergence and the scale
-    labels, there = found.cameras.labels, _shots(files[SHOTS]) if SHOTS in files else {}
-    shared = [i for i, label in enumerate(labels) if label in there]
-    places = [triple(there[labels[i]]["translation"]) for i in shared]
-    truth, own = np.array(places).reshape(-1, 3), found.cameras.centres[shared]
-    if len(own) < 3 and found.cameras.gnss is not None:
-        known = np.isfinite(found.cameras.gnss.xyz).all(axis=1)
-        truth = _from_topocentric(found.cameras.gnss.xyz[known], reference, crs)
-        own = found.cameras.centres[known]
-    if len(own) < 3:
-        return moved
+    there = _shots(files[SHOTS]) if SHOTS in files else {}
+    shared = [i for i, label in enumerate(found.cameras.labels) if label in there]
+    own, gnss = found.cameras.centres, found.cameras.gnss
+    if len(shared) >= FEWEST:
+        names = [found.cameras.labels[i] for i in shared]
+        truth = np.array([triple(there[name]["translation"]) for name in names])
+    else:
+        known = np.zeros(len(own), bool) if gnss is None else np.isfinite(gnss.xyz).all(axis=1)
+        shared = np.flatnonzero(known).tolist()
+        if gnss is None or len(shared) < FEWEST:
+            return moved
+        truth = _from_topocentric(gnss.xyz[shared], reference, crs)
     still_m, moved_m = (
         np.linalg.norm((guess - truth)[:, :2])
-        for guess in (_from_topocentric(own, reference, crs), moved.points(own))
+        for guess in (_from_topocentric(own[shared], reference, crs), moved.points(own[shared]))
     )
     return unmoved._replace(project_crs=crs) if still_m < 0.5 * moved_m else moved
 
@@ -213,8 +214,7 @@ def _read_shots(files: Files) -> Cameras:
     centres = np.array([triple(shot["translation"]) for shot in each])
     if crs is None and (place := (next(iter(each))["geometry"] or {}).get("coordinates")):
         lon, lat, _ = triple(place).tolist()  # a project without GNSS has made-up coordinates
-        named = _located(lat, lon, None, centres[0, :2])
-        crs = None if named is None else named[0]
+        crs, _ = _located(lat, lon, None, centres[0, :2]) or (None, None)
     # the lens is that of the camera that the shot names, or else of the only one that is alike
     known = {}
     if beside := files.get("cameras.json"):
@@ -223,19 +223,19 @@ def _read_shots(files: Files) -> Cameras:
             known = {k: lens(beside, k, entry) for k, entry in entries if not is_panorama(entry)}
     lenses, plain = [], 0
     for shot in each:
-        width, height, focal = (float(shot[key]) for key in ("width", "height", "focal"))
-        scale = max(width, height)
+        size = width, height = float(shot["width"]), float(shot["height"])
+        focal = float(shot["focal"]) * max(size)
         alike = [
             one
             for one in known.values()
-            if (one.width, one.height) == (width, height)
-            and abs((one.focal + one.b1) / scale - focal) < SAME_FOCAL
+            if (one.width, one.height) == size
+            and abs(one.focal + one.b1 - focal) < SAME_FOCAL * max(size)
         ]
         found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else None)
         plain += found is None
-        lenses.append(found or lens_by_name({"f": focal * scale}, width, height))
+        lenses.append(found or lens_by_name({"f": focal}, width, height))
     sentence = f"cameras.json has no camera of {plain} images; no distortion is assumed."
-    said = note(files["poses"], "cameras.no_distortion", sentence, images=plain)
+    notes = (note(files["poses"], "cameras.no_distortion", sentence, images=plain),)
     gnss, listed = read_images(files.get("images.json"), labels)
     return Cameras(
         labels=labels,
@@ -243,7 +243,7 @@ def _read_shots(files: Files) -> Cameras:
         rotations=from_rotation_vectors(np.array([triple(shot["rotation"]) for shot in each])),
         lenses=tuple(lenses),
         crs=crs or "local",
-        notes=(said,) if plain else (),
+        notes=notes if plain else (),
         gnss=gnss,
         unposed=unnamed(listed, labels),
         source="OpenDroneMap",
@@ -261,15 +261,13 @@ def read_images(
         return None, []
     places = {}
     with checks.reading(path):
-        images = load_json(path)
-        names = [str(image.get("filename")) for image in images]
-        for name, image in zip(names, images, strict=True):
+        images = {str(image.get("filename")): image for image in load_json(path)}
+        for label in labels:
+            image = images.get(label) or images.get(PurePath(label).stem) or {}
             if image.get("latitude") is not None:
                 values = [np.nan if image.get(k) is None else float(image[k]) for k in GNSS_KEYS]
-                places[name] = values[:3], np.where(np.isfinite(values), values, np.nan)[[3, 3, 4]]
-        known = {one: places.get(one) or places.get(PurePath(one).stem) for one in labels}
-    positions = {one: place for one, place in known.items() if place is not None}
-    return checks.measured(labels, positions, "EPSG:4326"), names
+                places[label] = values[:3], np.where(np.isfinite(values), values, np.nan)[[3, 3, 4]]
+    return checks.measured(labels, places, "EPSG:4326"), list(images)
 
 
 def _shots(path: Path) -> dict[str, dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""OpenSfM: reconstruction.json, and tracks.csv beside it.
+"""OpenSfM: reconstruction.json, and tracks.csv next to it.
 
 The file is a list of reconstructions, each with `cameras`, `shots` and `points`. A shot's
 `rotation` (axis times angle, radians) and `translation` take world to camera, x right, y down, z
@@ -61,34 +61,43 @@ def read_reconstruction(path: Path) -> Reconstruction:
     data = checks.load_json(path)
     with checks.reading(path):
         sets = [entry.get("shots", {}) for entry in data]
-        counts = [len(shots) for shots in sets]
-        if not any(counts):
-            raise checks.no_pose(path)
-        best = counts.index(max(counts))
-        chosen, notes = data[best], []
-        others = [name for i, shots in enumerate(sets) if i != best for name in shots]
+        chosen, all_shots = max(zip(data, sets, strict=True), key=lambda two: len(two[1]))
+        entries, notes = chosen["cameras"], []
+        shots = {k: v for k, v in all_shots.items() if not is_panorama(entries[v["camera"]])}
+        panoramas = [k for k in all_shots if k not in shots]
+        others = [name for some in sets if some is not all_shots for name in some]
         if others:
-            notes.append(checks.several(path, len(data), counts[best]))
-        entries = chosen["cameras"]
-        panoramas = [k for k, shot in sets[best].items() if is_panorama(entries[shot["camera"]])]
-        shots = {k: shot for k, shot in sets[best].items() if k not in set(panoramas)}
+            notes.append(checks.several(path, len(data), len(all_shots)))
         if panoramas:
             sentence = f"{len(panoramas)} images of spherical cameras are skipped."
             notes.append(checks.note(path, "cameras.panoramas", sentence, images=panoramas))
         if not shots:
-            raise checks.no_pose(path, "all images are of spherical cameras")
+            raise checks.no_pose(path)
         lenses = {k: lens(path, k, entries[k]) for k in {shot["camera"] for shot in shots.values()}}
-        rotations, shifts = _poses(chosen, shots)
-        dops = {k: shot.get("gps_dop") for k, shot in shots.items()}
-        places = {
-            k: (
-                checks.triple(shot["gps_position"]),
-                np.full(3, np.nan if dops[k] is None else dops[k]),
-            )
-            for k, shot in shots.items()
-            if shot.get("gps_position") is not None and dops[k] != NO_GNSS
+        on_rig = {  # the pose of the rig in the world, then that of the camera on the rig
+            label: (instance, chosen.get("rig_cameras", {}).get(str(camera)))
+            for instance in chosen.get("rig_instances", {}).values()
+            for label, camera in instance.get("rig_camera_ids", {}).items()
         }
-        reference = _reference(path, chosen)
+        poses = [
+            _pose(shot) if "rotation" in shot else _pose(*on_rig.get(label, (shot,)))
+            for label, shot in shots.items()
+        ]
+        rotations, shifts = (np.array(each) for each in zip(*poses, strict=True))
+        places = {}
+        for label, shot in shots.items():
+            position, dop = shot.get("gps_position"), shot.get("gps_dop")
+            if position is not None and dop != NO_GNSS:
+                places[label] = position, [np.nan if dop is None else dop] * 3
+        origin, beside = chosen.get("reference_lla"), path.with_name("reference_lla.json")
+        if origin is None and beside.is_file() and beside.read_bytes()[:100].lstrip()[:1] == b"{":
+            origin = checks.load_json(beside)
+        reference = None
+        if origin is not None:
+            lat, lon, alt = (float(origin[key]) for key in ("latitude", "longitude", "altitude"))
+            if not (abs(lat) <= 90.0 and abs(lon) <= 360.0 and abs(alt) < np.inf):
+                raise checks.damaged(path, f"reference_lla {lat:g}, {lon:g} is no place on earth")
+            reference = None if lat == lon == 0.0 else (lat, lon, alt)
         crs = "local" if reference is None else "ENU:" + ",".join(map(repr, reference))
         listed = path.with_name("image_list.txt")  # the images that the project was given
         lines = read_lines(listed) if listed.is_file() else []
@@ -107,46 +116,13 @@ def read_reconstruction(path: Path) -> Reconstruction:
         return Reconstruction(path, cameras, reference, chosen.get("points", {}))
 
 
-def _poses(chosen: Any, shots: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
-    """Return R and t; x_camera = R x + t.
-
-    An image on a rig has the pose of the rig in the world, then that of its camera on the rig.
-    """
-    riders = {
-        label: (instance, chosen.get("rig_cameras", {}).get(str(camera)))
-        for instance in chosen.get("rig_instances", {}).values()
-        for label, camera in instance.get("rig_camera_ids", {}).items()
-    }
-    pairs = []
-    for label, shot in shots.items():
-        if "rotation" in shot or label not in riders:
-            pairs.append(_pose(shot))
-            continue
-        (rig_r, rig_t), (turn, shift) = map(_pose, riders[label])
-        pairs.append((turn @ rig_r, turn @ rig_t + shift))
-    rotations, shifts = (np.array(each) for each in zip(*pairs, strict=True))
-    return rotations, shifts
-
-
-def _pose(entry: Any) -> tuple[FloatArray, FloatArray]:
-    """Return R and t of an entry with an axis-angle rotation."""
-    turn = from_rotation_vectors(checks.triple(entry["rotation"]))
-    return turn, checks.triple(entry["translation"])
-
-
-def _reference(path: Path, chosen: Any) -> tuple[float, float, float] | None:
-    """Return latitude, longitude, height of the origin, from the file or the one beside it."""
-    entry = chosen.get("reference_lla")
-    beside = path.with_name("reference_lla.json")
-    if entry is None and beside.is_file() and beside.read_bytes()[:100].lstrip()[:1] == b"{":
-        path, entry = beside, checks.load_json(beside)
-    if entry is None:
-        return None
-    with checks.reading(path):
-        lat, lon, alt = (float(entry[key]) for key in ("latitude", "longitude", "altitude"))
-        if not (abs(lat) <= 90.0 and abs(lon) <= 360.0 and abs(alt) < np.inf):
-            raise checks.damaged(path, f"reference_lla {lat:g}, {lon:g} is no place on earth")
-    return None if lat == lon == 0.0 else (lat, lon, alt)
+def _pose(*parts: Any) -> tuple[FloatArray, FloatArray]:
+    """Return R and t, x_camera = R x + t, of one pose after the other."""
+    rotation, shift = np.eye(3), np.zeros(3)
+    for part in parts:
+        turn = from_rotation_vectors(checks.triple(part["rotation"]))
+        rotation, shift = turn @ rotation, turn @ shift + checks.triple(part["translation"])
+    return rotation, shift
 
 
 HEADER = b"OPENSFM_TRACKS_VERSION"

@@ -1,7 +1,7 @@
 """OPF, the Open Photogrammetry Format of PIX4Dmatic and PIX4Dcatch: a project and its parts.
 
 The project (``.opf``, JSON) names files by item and format. Of the item `calibration` come the
-calibrated cameras and the tracks; `input_cameras` has frames, pixel sizes and what the GNSS said;
+calibrated cameras and the tracks; `input_cameras` has frames, pixel sizes and the GNSS positions;
 `camera_list` the names of the images; `scene_reference_frame` the CRS.
 
 Poses are in the processing CRS, which is right-handed and isometric: coordinates of the project's
@@ -13,16 +13,15 @@ image axes x right, y up, z back to the processing CRS.
 Pixels start at the corner of the image; T1 and T2 are in OpenCV's order. A fisheye has an affine
 matrix [c d; e f] and a polynomial of 2 theta / pi, as in `pcfix.io.cameras.pix4d`.
 
-Tracks are a glTF model with its buffers beside it: positions in the axes of each node, whose matrix
-leads to y up (so processing x, y, z are its x, -z, y), and for each point 40 bits that say where
-its matches begin and 24 how many they are.
+Tracks are a glTF model with its buffers next to it: positions in the axes of each node, whose
+matrix leads to y up (so processing x, y, z are its x, -z, y), and of each point the first of its
+matches in 40 bits and their count in 24.
 
 Reference: Pix4D, "Open Photogrammetry Format Specification" 1.0, https://pix4d.github.io/opf-spec.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,9 +29,9 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning, bad_file
+from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import AffineFrame, Source, load_json, note, triple
+from pcfix.io.cameras.checks import AffineFrame, Source, load_json, triple
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.cameras.pix4d import fisheye
 from pcfix.io.crs import crs_text, parse_crs, plan_unit
@@ -41,17 +40,10 @@ from pcfix.model import Cameras, GnssPositions, Lens, TiePoints
 
 FORMAT = "application/opf-{}+json"
 PROJECT = FORMAT.format("project")
+CONTENT = '"application/opf-|"orientation_deg"'
+INSIDE = r".*\.opf"
 Part = dict[str, Any]
 """An object of a JSON file."""
-
-
-def recognises(source: Source) -> bool:
-    """Whether a file is a project or calibrated cameras, or a folder holds a project."""
-    if source.path.is_dir():
-        return any(name.endswith(".opf") for name in source.names)
-    return '"application/opf-' in source.text or (
-        '"orientation_deg"' in source.text and '"sensor_id"' in source.text
-    )
 
 
 def read(source: Source) -> Cameras:
@@ -59,7 +51,7 @@ def read(source: Source) -> Cameras:
     project = _open_project(source.path)
     path, calibrated = project.part("calibration", "calibrated-cameras")
     _, given = project.part("input_cameras", "input-cameras", needed=False)
-    (frame, notes), names = _frame_of(project), dict[int, str]()
+    frame, names = _frame_of(project), dict[int, str]()
     for listed in project.files("camera_list", FORMAT.format("camera-list")):
         for camera in load_json(listed)["cameras"] if listed.is_file() else []:
             name = camera["uri"].replace("\\", "/").rpartition("/")[2]
@@ -74,17 +66,17 @@ def read(source: Source) -> Cameras:
         for sensor in calibrated["sensors"]
         if "image_size_px" in sensors.get(sensor["id"], {})
     }
-    lenses = [known.get(shot["sensor_id"]) for shot in shots.values()]
+    lenses = [known[shot["sensor_id"]] for shot in shots.values() if shot["sensor_id"] in known]
     captures = given.get("captures", [])
     captured = [shot["id"] for capture in captures for shot in capture.get("cameras", [])]
     return Cameras(
         labels=labels,
         centres=frame.points(xyz),
         rotations=from_omega_phi_kappa(*angles.T) if len(shots) else None,
-        lenses=tuple(one for one in lenses if one) if lenses and all(lenses) else None,
+        lenses=tuple(lenses) if shots and len(lenses) == len(shots) else None,
         crs=frame.crs,
         project_crs=frame.project_crs,
-        notes=(*notes, *checks.repeated(path, labels)),
+        notes=checks.repeated(path, labels),
         gnss=_gnss(path, captures, list(shots)),
         unposed=tuple(names.get(i, f"camera {i}") for i in captured if i not in shots),
         source=project.generator,
@@ -120,41 +112,34 @@ class Project(NamedTuple):
 
 def _open_project(path: Path) -> Project:
     """Read the project at a path, in a folder, or that a part belongs to."""
-    if path.is_dir():
-        found = sorted(path.glob("*.opf"))
-    else:
-        content = load_json(path)
-        if content.get("format") == PROJECT:
-            generator = content.get("generator", {})
-            words = ("OPF", generator.get("name", ""), generator.get("version", ""))
-            return Project(path, content["items"], " ".join(map(str, words)).strip())
-        above = path.resolve().parent
-        found = [*sorted(above.glob("*.opf")), *sorted(above.parent.glob("*.opf"))]
-    if len(found) != 1 or found[0] == path:
-        sentence = f"belongs to one of {len(found)} OPF projects. Give the project file (.opf)."
-        raise bad_file(path, "cameras.several_projects", sentence, projects=len(found))
-    return _open_project(found[0])
+    content = {} if path.is_dir() else load_json(path)
+    if content.get("format") != PROJECT:
+        folders = [path] if path.is_dir() else [*path.resolve().parents][:2]
+        found = [one for folder in folders for one in sorted(folder.glob("*.opf"))]
+        if len(found) != 1:
+            sentence = f"belongs to one of {len(found)} OPF projects. Give the project file (.opf)."
+            raise bad_file(path, "cameras.several_projects", sentence, projects=len(found))
+        path, content = found[0], load_json(found[0])
+    generator = content.get("generator", {})
+    words = ("OPF", generator.get("name", ""), generator.get("version", ""))
+    return Project(path, content["items"], " ".join(map(str, words)).strip())
 
 
-def _frame_of(project: Project) -> tuple[AffineFrame, tuple[PcfixWarning, ...]]:
-    """Return the frame of the processing, east, north, up, and notes on it."""
+def _frame_of(project: Project) -> AffineFrame:
+    """Return the frame of the processing, east, north, up."""
     path, scene = project.part("scene_reference_frame", "scene-reference-frame", needed=False)
     if not scene:  # the frame of the processing is arbitrary
-        return AffineFrame(np.eye(3), np.zeros(3), "local"), ()
+        return AffineFrame(np.eye(3), np.zeros(3), "local")
     way = scene["base_to_canonical"]
     shift, scale = triple(way["shift"]), triple(way["scale"])
     if not (scale > 0.0).all():
         raise checks.damaged(path, f"the scale {scale.tolist()} is not positive")
     if way.get("swap_xy"):
         scale = scale[[1, 0, 2]]  # positions are east, north already, scales in the CRS's order
-    said = checks.crs(path, scene["crs"]["definition"])
-    crs, unit = (said, 1.0) if said == "local" else _with_heights(said, str(path))
-    geoid_m = float(scene["crs"].get("geoid_height") or 0.0)
-    sentence = f"its heights refer to a constant geoid height of {geoid_m:g} m."
-    geoid = note(path, "cameras.constant_geoid", sentence, geoid_m=geoid_m)
+    stated = checks.crs(path, scene["crs"]["definition"])
+    crs, unit = (stated, 1.0) if stated == "local" else _with_heights(stated, str(path))
     size = [1.0, 1.0, unit] / scale
-    frame = AffineFrame(np.diag(size), -shift * size, crs, None if crs == said else said)
-    return frame, (geoid,) if geoid_m else ()
+    return AffineFrame(np.diag(size), -shift * size, crs, None if crs == stated else stated)
 
 
 def _with_heights(text: str, name: str) -> tuple[str, float]:
@@ -195,8 +180,8 @@ def _gnss(path: Path, captures: list[Part], ids: list[int]) -> GnssPositions | N
     text = next((place["crs"]["definition"] for place in found.values()), "local")
     if checks.crs(path, text) == "local":
         return None
-    said, up_m = _with_heights(text, str(path))
-    crs = parse_crs(said, str(path))
+    stated, up_m = _with_heights(text, str(path))
+    crs = parse_crs(stated, str(path))
     order = [1, 0, 2] if crs.axis_info[0].direction.lower() == "north" else [0, 1, 2]
     unit_m = 1.0 if crs.is_geographic else plan_unit(crs)[1]
     places = {
@@ -204,7 +189,7 @@ def _gnss(path: Path, captures: list[Part], ids: list[int]) -> GnssPositions | N
         for i, p in found.items()
         if p["crs"]["definition"] == text
     }
-    return checks.measured(ids, places, said)
+    return checks.measured(ids, places, stated)
 
 
 COMPONENTS = {"5121": "u1", "5123": "<u2", "5125": "<u4", "5126": "<f4"}
@@ -213,44 +198,44 @@ OFFSET_BITS = 40
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
-    """Read the tracks of the calibration."""
+    """Read the tracks of the calibration: the points and matches of the nodes of its models."""
     project = _open_project(source.path)
     _, calibrated = project.part("calibration", "calibrated-cameras")
     row_of = {shot["id"]: i for i, shot in enumerate(calibrated["cameras"])}
-    models = project.files("calibration", "model/gltf+json")
-    found = [node for model in models for node in _nodes(model, row_of)]
+    frame, found = _frame_of(project), list[checks.Seen]()
+    for path in project.files("calibration", "model/gltf+json"):
+        with checks.reading(path):
+            model = load_json(path)
+            for node in model.get("nodes", []):
+                matrix = np.array(node.get("matrix", np.eye(4).ravel()), float).reshape(4, 4).T
+                for primitive in model["meshes"][node["mesh"]]["primitives"]:
+                    matches = primitive.get("extensions", {}).get(MATCHES, {})
+                    if "pixelCoordinates" in matches.get("imagePoints", {}):
+                        seen = _matches(path, model, primitive, row_of)
+                        x, y, z = (seen.xyz @ matrix[:3, :3].T + matrix[:3, 3]).T
+                        xyz = frame.points(np.column_stack([x, -z, y]))  # the model has y up
+                        found.append(seen._replace(xyz=xyz))
     if not found:
         raise checks.no_tie_points(project.path, "its calibration has no tracks")
-    frame, _ = _frame_of(project)
-    return checks.tie_points(*(node._replace(xyz=frame.points(node.xyz)) for node in found))
+    return checks.tie_points(*found)
 
 
-def _nodes(path: Path, row_of: dict[int, int]) -> Iterator[checks.Seen]:
-    """Yield the points and matches of the nodes of a model."""
-    with checks.reading(path):
-        model = load_json(path)
-        for node in model.get("nodes", []):
-            for primitive in model["meshes"][node["mesh"]]["primitives"]:
-                matches = primitive.get("extensions", {}).get(MATCHES, {})
-                images = matches.get("imagePoints", {})
-                if "pixelCoordinates" in images:
-                    xyz = _accessor(path, model, primitive["attributes"]["POSITION"], 3)
-                    uv = _accessor(path, model, images["pixelCoordinates"], 2)
-                    ranges = _accessor(path, model, matches["pointIndexRanges"], 2)
-                    packed = ranges.astype("<u4").view("<u8")[:, 0]
-                    first = (packed & np.uint64(2**OFFSET_BITS - 1)).astype(np.int64)
-                    count = (packed >> np.uint64(OFFSET_BITS)).astype(np.int64)
-                    index = _accessor(path, model, matches["cameraIds"], 1)[:, 0].astype(np.int64)
-                    rows = np.array([row_of.get(i, -1) for i in matches["cameraUids"]], np.int64)
-                    if (first + count > len(index)).any() or len(count) > len(xyz):
-                        raise checks.damaged(path, "its points have more matches than there are")
-                    point = np.repeat(np.arange(len(count)), count)
-                    before = np.repeat(first - (np.cumsum(count) - count), count)
-                    at = np.arange(len(point)) + before
-                    matrix = np.array(node.get("matrix", np.eye(4).ravel()), float).reshape(4, 4).T
-                    x, y, z = (xyz.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]).T
-                    z_up = np.column_stack([x, -z, y])  # the model itself has y up
-                    yield checks.Seen(z_up, point, rows[index[at]], uv[at].astype(np.float64))
+def _matches(path: Path, model: Part, primitive: Part, row_of: dict[int, int]) -> checks.Seen:
+    """Return the points of a primitive, in the axes of its node, and where images saw them."""
+    matches = primitive["extensions"][MATCHES]
+    xyz = _accessor(path, model, primitive["attributes"]["POSITION"], 3).astype(np.float64)
+    uv = _accessor(path, model, matches["imagePoints"]["pixelCoordinates"], 2).astype(np.float64)
+    ranges = _accessor(path, model, matches["pointIndexRanges"], 2)
+    packed = ranges.astype("<u4").view("<u8")[:, 0]
+    first = (packed & np.uint64(2**OFFSET_BITS - 1)).astype(np.int64)
+    count = (packed >> np.uint64(OFFSET_BITS)).astype(np.int64)
+    index = _accessor(path, model, matches["cameraIds"], 1)[:, 0].astype(np.int64)
+    rows = np.array([row_of.get(i, -1) for i in matches["cameraUids"]], np.int64)
+    if (first + count > len(index)).any() or len(count) > len(xyz):
+        raise checks.damaged(path, "its points have more matches than there are")
+    point = np.repeat(np.arange(len(count)), count)
+    at = np.arange(len(point)) + np.repeat(first - (np.cumsum(count) - count), count)
+    return checks.Seen(xyz, point, rows[index[at]], uv[at])
 
 
 def _accessor(path: Path, model: Part, index: int, width: int) -> Any:

@@ -13,8 +13,8 @@ similar rotations belong together.
 ``pix4d_calibrated_internal_camera_parameters.cam`` has the interior orientation in millimetres,
 ``wkt.prj`` the CRS, and the project file (.p4d) the GNSS positions.
 Image measurements are in ``tp_bingo.txt`` (mm from the image centre, y up, the size of the sensor
-beside each name) and ``tp_pix4d.txt`` (pixels). ``calibrated_images_position.txt`` and
-``pmatrix.txt`` repeat what the tables say.
+after each name) and ``tp_pix4d.txt`` (pixels). ``calibrated_images_position.txt`` and
+``pmatrix.txt`` repeat the tables.
 
 References: Pix4D, "What does the Output Params Folder contain?" (support.pix4d.com, article
 202977149), "How are the Internal and External Camera Parameters defined?" (article 202559089).
@@ -56,10 +56,8 @@ HEADERS = (
     ["imagename", "x", "y", "z", "omega", "phi", "kappa"],
     ["imagename", "longitude", "latitude", "altitude", "omega", "phi", "kappa"],
 )
-FOLDERS = ("", "params", "1_initial/params", "*/params", "*/1_initial/params")
+FOLDERS = ("", "params/", "1_initial/params/", "*/params/", "*/1_initial/params/")
 """Where a project may have its files, seen from its folder."""
-Files = dict[str, Path]
-"""The files of a project that are there, by the names in `NAMES`, and ``project``."""
 FIELDS = {
     "camera matrix": "fx skew cx b3 fy cy - - -",
     "radial": "k1 k2 k3",
@@ -70,7 +68,7 @@ FIELDS = {
     "position": "centre",
     "rotation": "rotation",
 }
-"""What the header of the camera parameters says, and the names of the numbers in `lenses`."""
+"""What the header of the camera parameters names, and the names of the numbers in `lenses`."""
 SHAPE = re.compile(r"^(.*?)\s*\[\s*(\d{1,2})\s*x\s*(\d{1,2})\s*\]\s*$")
 SENSOR = re.compile(r"sensor width of\s*([-+.\deE]+)\s*x\s*([-+.\deE]+)")
 CALIBRATION = re.compile(r"(?im)^pix4d camera calibration file.*$")
@@ -89,37 +87,39 @@ def read(source: Source) -> Cameras:
     """Read poses and lenses, in the CRS of the project."""
     files = _find(source)
     calibrations = read_calibrations(files["calibration"]) if "calibration" in files else []
-    calibration = calibrations[0] if len(calibrations) == 1 else None
+    calibration = calibrations[0] if len(calibrations) == 1 else {}
     notes: tuple[PcfixWarning, ...] = ()
-    if "parameters" in files:
-        images = read_parameters(files["parameters"])
-        labels = names = [image.label for image in images]
-        turns = np.array([image.fields["rotation"] for image in images]).reshape(-1, 3, 3)
-        rotations = checks.rotations(files["parameters"], labels, turns)
-        if "external" in files:
-            names, there, turned = read_external(files["external"])
-            rows = _rows(labels, names, (rotations, turned))
-            if max(rows) < 0:
-                raise damaged(files["external"], f"names none of the images of {PARAMETERS}")
-            centres, rotations = there[rows], turned[rows]
-            centres[np.array(rows) < 0] = np.nan
-        else:
-            centres = np.array([image.fields["centre"] for image in images])
-            if "offset" in files:
-                centres += _offset(files["offset"])
-            else:
-                sentence = "there is no offset.xyz next to it. Give the offset by --cameras-offset."
-                notes = (note(files["parameters"], "cameras.no_offset", sentence),)
-        posed = np.flatnonzero(np.isfinite(centres).all(axis=1))
-        given = [*labels, *names]
-        labels, centres, rotations = [labels[i] for i in posed], centres[posed], rotations[posed]
-        own = [lens_of_image(images[i], calibration) for i in posed]
-    elif "external" in files:
+    labels, centres, rotations = list[str](), np.empty((0, 3)), np.empty((0, 3, 3))
+    if "external" in files:
         labels, centres, rotations = read_external(files["external"])
-        own, given = [lens_of_calibration(calibration)] * len(labels), labels
-    else:
+    elif "parameters" not in files:
         sentence = f"{PARAMETERS} is missing. Give the params folder of the project."
         raise bad_file(source.path, "cameras.missing_file", sentence)
+    given, own = labels, [_lens({}, calibration)] * len(labels)
+    if path := files.get("parameters"):
+        images = read_parameters(path)
+        names = [image.label for image in images]
+        matrices = np.array([image.fields["rotation"] for image in images]).reshape(-1, 3, 3)
+        turns, posed = checks.rotations(path, names, matrices), [*range(len(images))]
+        if "external" in files:
+            rows, given = _rows(names, labels, (turns, rotations)), [*names, *labels]
+            posed = [i for i in posed if rows[i] >= 0]
+            if not posed:
+                raise damaged(files["external"], f"names none of the images of {PARAMETERS}")
+            centres, rotations = (each[rows][posed] for each in (centres, rotations))
+        else:
+            centres, rotations = np.array([image.fields["centre"] for image in images]), turns
+            if beside := files.get("offset"):  # one line, or the same for each group of images
+                lines = [line.replace(",", " ").split() for line in read_lines(beside)]
+                offsets = {" ".join(words[-3:]) for words in lines if words}
+                if len(offsets) != 1:
+                    raise damaged(beside, "it should have one offset x y z")
+                centres += numbers(beside, "the offset", offsets.pop(), 3)
+            else:
+                sentence = "there is no offset.xyz next to it. Give the offset by --cameras-offset."
+                notes = (note(path, "cameras.no_offset", sentence),)
+        labels = [names[i] for i in posed]
+        own = [_lens(images[i].fields, calibration, images[i].size) for i in posed]
     lenses = tuple(lens for lens in own if lens is not None)
     gnss, enabled = _priors(files["project"], labels) if "project" in files else (None, [])
     wkt = " ".join(read_lines(files["wkt"])).strip() if "wkt" in files else ""
@@ -141,18 +141,16 @@ def _columns(source: Source) -> list[str]:
     return source.text.lstrip().partition("\n")[0].lower().split()
 
 
-def _find(source: Source) -> Files:
-    """Return the files of the project that a folder holds, or that a file belongs to.
+def _find(source: Source) -> dict[str, Path]:
+    """Return the files of the project that are there, by the names in `NAMES`, and ``project``.
 
-    Its name precedes that of the files; the project file lies beside or in the project's folder.
+    The project's name precedes that of the files; its file is next to its folder or in it.
     """
     path, columns = source.path, _columns(source)
-    is_project = b"<pix4uav" in source.head
+    is_project, found = b"<pix4uav" in source.head, TABLE.fullmatch(path.name)
+    tables = [(path.parent, found[1] if found else "")]
     if is_project or path.is_dir():
         tables = _tables_in(path.with_suffix("") if is_project else path)
-    else:
-        found = TABLE.fullmatch(path.name)
-        tables = [(path.parent, found[1] if found else "")]
     if not tables:
         return {}
     folder, prefix = tables[0]
@@ -175,11 +173,10 @@ def _find(source: Source) -> Files:
 
 def _tables_in(root: Path) -> list[tuple[Path, str]]:
     """Return folders with tables of poses, and the name of the project before that of each."""
-    folders = [f for one in FOLDERS for f in (sorted(root.glob(one)) if one else [root])]
     return [
-        (folder, found[1])
-        for folder in folders
-        for file in (folder.iterdir() if folder.is_dir() else ())
+        (file.parent, found[1])
+        for inside in FOLDERS
+        for file in sorted(root.glob(f"{inside}*.txt"))
         if (found := TABLE.fullmatch(file.name)) and not found[2]
     ]
 
@@ -198,19 +195,10 @@ def _rows(
     for i, label in enumerate(labels):
         rows, nearest = left[label], 0
         if turns and len(rows) > 1:
-            apart = np.linalg.norm(turns[1][rows] - turns[0][i], axis=(1, 2))
-            nearest = int(np.argmin(apart))
+            differences = turns[1][rows] - turns[0][i]
+            nearest = int(np.argmin(np.linalg.norm(differences, axis=(1, 2))))
         found.append(rows.pop(nearest) if rows else -1)
     return found
-
-
-def _offset(path: Path) -> FloatArray:
-    """Read the offset: one line, or the same one for each group of images."""
-    lines = [line.replace(",", " ").split()[-3:] for line in read_lines(path) if line.strip()]
-    offsets = np.array([numbers(path, "the offset", " ".join(line), 3) for line in lines])
-    if not len(offsets) or (offsets != offsets[0]).any():
-        raise damaged(path, "it should have one offset x y z")
-    return offsets[0]
 
 
 def _priors(path: Path, labels: list[str]) -> tuple[GnssPositions | None, list[str]]:
@@ -225,13 +213,12 @@ def _priors(path: Path, labels: list[str]) -> tuple[GnssPositions | None, list[s
         if image.get("path") and image.get("enabled", "true").lower() != "false"
     ]
     names = [PureWindowsPath(image.get("path", "")).name for image in images]
-    of_row = {i: images[row] for i, row in enumerate(_rows(labels, names)) if row >= 0}
-    kinds = [kind for image in of_row.values() for kind in PRIORS if image.find(kind) is not None]
+    of_label = {i: images[row] for i, row in enumerate(_rows(labels, names)) if row >= 0}
+    kinds = [kind for image in of_label.values() for kind in PRIORS if image.find(kind) is not None]
     places = {}
-    for i, image in of_row.items():
-        position = image.find(kinds[0]) if kinds else None
+    for i, image in of_label.items():
+        position, where = image.find(kinds[0]) if kinds else None, f"image {labels[i]}, "
         if position is not None:
-            where = f"image {labels[i]}, "
             stated = [image.find(f"tolerance{axes}") for axes in ("XY", "XY", "Z")]
             sigma = [
                 np.nan if e is None else number(path, where + e.tag, e.get("value")) for e in stated
@@ -246,12 +233,20 @@ def _priors(path: Path, labels: list[str]) -> tuple[GnssPositions | None, list[s
     return checks.measured(range(len(labels)), places, crs), names
 
 
+def read_external(path: Path) -> tuple[list[str], FloatArray, FloatArray]:
+    """Read the absolute table: labels, centres (k, 3) and rotations (k, 3, 3)."""
+    rows = [line.rsplit(None, 6) for line in read_lines(path)[1:] if line.strip()]
+    if not rows:
+        raise damaged(path, "has a header but no images")
+    values = np.array([numbers(path, f"image {row[0]}", " ".join(row[1:]), 6) for row in rows])
+    return [row[0].strip() for row in rows], values[:, :3], from_omega_phi_kappa(*values[:, 3:].T)
+
+
 class Image(NamedTuple):
     """One image of the camera parameters; `fields` has its numbers by the names in `FIELDS`."""
 
     label: str
-    width: float
-    height: float
+    size: tuple[float, float]
     fields: dict[str, FloatArray]
 
 
@@ -272,38 +267,26 @@ def read_parameters(path: Path) -> list[Image]:
     images = []
     while row < len(lines):
         label, *size = lines[row].rsplit(None, 2)
-        words_of: list[str] = []
+        where, words_of = f"image {label}", list[str]()
         row += 1
         while len(words_of) < ends[-1] and row < len(lines):
             words_of += lines[row].split()
             row += 1
-        width, height = numbers(path, f"image {label}", " ".join(size), 2)
-        values = numbers(path, f"image {label}", " ".join(words_of), ends[-1])
-        parts = np.split(values, ends[:-1])
+        width, height = numbers(path, where, " ".join(size), 2).tolist()
+        parts = np.split(numbers(path, where, " ".join(words_of), ends[-1]), ends[:-1])
         fields = {name: part for (name, _), part in zip(layout, parts, strict=True) if name}
-        images.append(Image(label.strip(), float(width), float(height), fields))
+        images.append(Image(label.strip(), (width, height), fields))
     if not images:
         raise damaged(path, "has a header but no images")
     return images
 
 
-def read_external(path: Path) -> tuple[list[str], FloatArray, FloatArray]:
-    """Read the absolute table: labels, centres (k, 3) and rotations (k, 3, 3)."""
-    rows = [line.rsplit(None, 6) for line in read_lines(path)[1:] if line.strip()]
-    if not rows:
-        raise damaged(path, "has a header but no images")
-    values = np.array([numbers(path, f"image {row[0]}", " ".join(row[1:]), 6) for row in rows])
-    rotations = from_omega_phi_kappa(*values[:, 3:].T)
-    return [row[0].strip() for row in rows], values[:, :3], rotations
+def read_calibrations(path: Path) -> list[dict[str, float]]:
+    """Read the cameras of a ``pix4d_..._internal_camera_parameters.cam``.
 
-
-Calibration = dict[str, float]
-"""The first number of each line by its name, and `width`, `height` of the sensor, mm."""
-
-
-def read_calibrations(path: Path) -> list[Calibration]:
-    """Read the cameras of a ``pix4d_..._internal_camera_parameters.cam``."""
-    cameras: list[Calibration] = []
+    They are the first number of each line by its name, and `width`, `height` of the sensor, mm.
+    """
+    cameras: list[dict[str, float]] = []
     for text in CALIBRATION.split("\n".join(read_lines(path)))[1:]:
         size, rows = SENSOR.search(text), [line.split() for line in text.splitlines()]
         sides = " ".join(size.groups()) if size else "0 0"
@@ -315,16 +298,36 @@ def read_calibrations(path: Path) -> list[Calibration]:
     return cameras
 
 
-def lens_of_image(image: Image, calibration: Calibration | None) -> Lens | None:
-    """Return the lens in pixels, from the block of the image or the only calibration."""
+def _lens(
+    fields: dict[str, FloatArray], calibration: dict[str, float],
+    size_px: tuple[float, float] | None = None,
+) -> Lens | None:  # fmt: skip
+    """Return the lens of an image, in pixels, or else that of the calibration of all images.
+
+    The latter is in mm where the size of the image is not known. None where neither suffices: a
+    fisheye needs the size, as its matrix is in pixels and its principal point in mm.
+    """
     given: dict[str, float] = {}
-    for names, values in image.fields.items():
-        if names in FIELDS.values():
-            given |= dict(zip(names.split(), values.tolist(), strict=False))
-    size = image.width, image.height
-    if "polynomial" in image.fields and "fx" in given:
-        return fisheye(given, image.fields["polynomial"].tolist(), *size)
-    return lens_by_name(given, *size) if "fx" in given else lens_of_calibration(calibration, size)
+    for names, values in fields.items():
+        given |= zip(names.split(), values.tolist(), strict=False)
+    if "fx" in given and size_px:
+        if "polynomial" in fields:
+            return fisheye(given, fields["polynomial"].tolist(), *size_px)
+        return lens_by_name(given, *size_px)
+    value = defaultdict(float, calibration)
+    size_mm, is_fisheye = (value["width"], value["height"]), "c" in calibration
+    is_known = {"px", "py", "f"} <= calibration.keys() and min(size_mm) > 0.0
+    if not is_known or (is_fisheye and not size_px):
+        return None
+    scale = size_px[0] / size_mm[0] if size_px else 1.0
+    given = {"cx": value["px"] * scale, "cy": value["py"] * scale}
+    if is_fisheye:
+        given |= {"fx": value["c"], "skew": value["d"], "b3": value["e"], "fy": value["f"]}
+        shape = [value["p0"], calibration.get("p1", 1.0), value["p2"], value["p3"], value["p4"]]
+        return fisheye(given, shape, *(size_px or size_mm))
+    given |= {"f": value["f"] * scale, "p1": value["t2"], "p2": value["t1"]}
+    given |= {k: value[k] for k in ("k1", "k2", "k3")}
+    return lens_by_name(given, *(size_px or size_mm), unit="px" if size_px else "mm")
 
 
 def fisheye(given: dict[str, float], shape: Sequence[float], *frame: float) -> Lens:
@@ -335,32 +338,11 @@ def fisheye(given: dict[str, float], shape: Sequence[float], *frame: float) -> L
     return lens_by_name(given, *frame, projection="polynomial", shape=tuple(shape))
 
 
-def lens_of_calibration(
-    calibration: Calibration | None, size: tuple[float, float] | None = None
-) -> Lens | None:
-    """Return the lens of a calibration: in pixels where the size of the image is known, else in mm.
-
-    None where the calibration does not say enough: a fisheye needs the size of the image, as its
-    matrix is in pixels and its principal point in mm.
-    """
-    if calibration is None or not {"px", "py", "f"} <= calibration.keys():
-        return None
-    value, size_mm = defaultdict(float, calibration), (calibration["width"], calibration["height"])
-    if not min(size_mm) > 0.0 or ("c" in value and size is None):
-        return None
-    scale = 1.0 if size is None else size[0] / size_mm[0]
-    given = {"cx": value["px"] * scale, "cy": value["py"] * scale}
-    if "c" in value:
-        given |= {"fx": value["c"], "skew": value["d"], "b3": value["e"], "fy": value["f"]}
-        shape = [value["p0"], calibration.get("p1", 1.0), *(value[f"p{i}"] for i in (2, 3, 4))]
-        return fisheye(given, shape, *(size or size_mm))
-    given |= {"f": value["f"] * scale, "p1": value["t2"], "p2": value["t1"]}
-    given |= {k: value[k] for k in ("k1", "k2", "k3")}
-    return lens_by_name(given, *(size or size_mm), unit="mm" if size is None else "px")
-
-
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
-    """Read ``tp_bingo.txt``, or ``tp_pix4d.txt`` where there is no other."""
+    """Read ``tp_bingo.txt``, or ``tp_pix4d.txt`` where there is no other.
+
+    Lines are an image (and the size of its sensor, as in H_23.52_15.68), its points, and -99.
+    """
     files = _find(source)
     path = files.get("bingo") or files.get("ties")
     if path is None:
@@ -368,50 +350,38 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     if cameras.lenses is None:
         raise checks.no_tie_points(path, "it needs lenses, and the cameras have none")
     labels = list(enumerate(cameras.labels))[::-1]  # of equal names the first counts
-    rows = {PurePath(label).stem: i for i, label in labels} | {label: i for i, label in labels}
+    row_of = {PurePath(label).stem: i for i, label in labels} | {label: i for i, label in labels}
+    names, rows, measured = list[str](), list[int](), list[list[str]]()
     with checks.reading(path):
-        measured = _measured(path, rows)
-        camera = np.array([row for _, row, _ in measured], dtype=np.int64)
-        numbers = np.array([words for *_, words in measured], dtype=float).reshape(-1, 4)
-        posed = camera >= 0
-        if not posed.any():
+        image: int | None = None
+        for line in read_lines(path):
+            words = line.split()
+            if not words or words[0] == "-99":
+                image = None
+            elif image is None:
+                text, size = line.strip(), words[-1].split("_")
+                image = row_of.get(text, row_of.get(text.rpartition(" ")[0].strip(), -1))
+                sides = size[-2:] if len(size) >= 3 else ["nan", "nan"]
+            elif len(words) not in (3, 4):
+                raise damaged(path, f"'{line.strip()[:60]}' is not a point and its x and y")
+            elif image >= 0:
+                names.append(words[0])
+                rows.append(image)
+                measured.append([*words[1:3], *sides])
+        if not rows:
             raise checks.no_tie_points(path, "it measures nothing in the images that are posed")
-        xy, sensor = np.split(numbers, 2, axis=1)
+        xy, sensor = np.split(np.array(measured, np.float64), 2, axis=1)
         if path == files.get("bingo"):
-            if not (sensor[posed] > 0.0).all():
+            if not (sensor > 0.0).all():
                 raise damaged(path, "the line of an image lacks its sensor size H_width_height")
-            frame = np.array([(lens.width, lens.height) for lens in cameras.lenses])[camera]
+            frame = np.array([(lens.width, lens.height) for lens in cameras.lenses])[rows]
             # from mm from the image centre, y up, to the unit of the lens from the upper left
             xy = frame / 2.0 + xy * np.array([1.0, -1.0]) * frame / sensor
-        points = np.array([name for name, *_ in measured])
-        names, point = np.unique(points[posed], return_inverse=True)
+        points, point = np.unique(names, return_inverse=True)
         known = {}  # where the adjustment placed the control points
         if "gcps" in files:
             lines = [line.split(",") for line in read_lines(files["gcps"])[1:]]
             known = {row[0].strip(): checks.triple(row[4:7]) for row in lines if len(row) > 1}
         unknown = np.full(3, np.nan)
-        xyz = np.array([known.get(name.partition("_")[2], unknown) for name in names.tolist()])
-        return checks.tie_points(checks.Seen(xyz, point, camera[posed], xy[posed]))
-
-
-def _measured(path: Path, rows: dict[str, int]) -> list[tuple[str, int, list[str]]]:
-    """Read the lines: an image (and the size of its sensor), its points, and -99.
-
-    Out come rows of the name of the point, the camera (-1: not posed), and x and y, and width and
-    height of the sensor, as in H_23.52_15.68 after the name of the image.
-    """
-    found = []
-    image: tuple[int, list[str]] | None = None
-    for line in read_lines(path):
-        words = line.split()
-        if not words or words[0] == "-99":
-            image = None
-        elif image is None:
-            text, size = line.strip(), words[-1].split("_")
-            row = rows.get(text, rows.get(text.rpartition(" ")[0].strip(), -1))
-            image = row, size[-2:] if len(size) >= 3 else ["nan", "nan"]
-        elif len(words) in (3, 4):
-            found.append((words[0], image[0], [*words[1:3], *image[1]]))
-        else:
-            raise damaged(path, f"'{line.strip()[:60]}' is not a point and its x and y")
-    return found
+        xyz = np.array([known.get(name.partition("_")[2], unknown) for name in points.tolist()])
+        return checks.tie_points(checks.Seen(xyz, point, np.array(rows), xy))

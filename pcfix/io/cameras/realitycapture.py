@@ -1,29 +1,26 @@
-"""RealityCapture and RealityScan: .xmp files beside the images, one each.
+"""RealityCapture and RealityScan: .xmp files next to the images, one each.
 
 The fields of the namespace ``xcr`` are attributes or child elements. `Rotation` is world to
-camera by rows (x right, y down, z forward) and `Position` the projection centre. Focal length and
-principal point are shares of the larger side of the image, the focal length times 36 (the film of
-35 mm cameras), the principal point from the centre of the image:
+camera by rows (x right, y down, z forward) and `Position` the projection centre. Lengths in the
+image are shares of its larger side, the focal length times 36 (the film of 35 mm cameras), the
+principal point from the centre of the image:
 
     scale = max(width, height),  f = FocalLength35mm / 36 scale
     u = width / 2 + U scale + f x' + Skew scale y'
     v = height / 2 + V scale + AspectRatio f y'
 
-The coefficients are k1, k2, k3, k4, t1, t2 of Brown's formula, in Brown's order,
+The coefficients are k1, k2, k3, k4, t1, t2 of Brown's formula, in his order,
 x' = ... + t1 (r^2 + 2 x^2) + 2 t2 x y; models named brown3 leave k4 out, those without "t2" the
 last two. The division model undoes the distortion after the calibration matrix, about the centre
 of the image: m = m' / (1 + k1 |m'|^2), m and m' places in shares of the larger side.
 
-The width and height are not in the file: they are those of the image beside it, or from the
-proportions of ``--sensor``. Positions called relative or rigid are in a local frame; absolute
-ones are in the CRS of the export, which the file does not name. `latitude` and `longitude` are
-not those of the image.
+The size of an image is not in the file: it is that of the image next to it, or from the proportions
+of ``--sensor``. Positions called relative or rigid are in a local frame; absolute ones are in the
+CRS of the export, which the file does not name; its `latitude` and `longitude` are others.
 
 References: Epic Games, "RealityScan/RealityCapture XMP camera math" and RealityScan Help, "XMP
-Metadata" (tools/xmpalign). The software's own export template for OpenCV writes t2, t1 where
-OpenCV has p1, p2, and its template of projection matrices builds K [R | -R C] with one scale for
-both axes; the converters of AliceVision and EasyVolcap agree. There was no file with measurements
-to check any of this.
+Metadata" (tools/xmpalign). The software's own templates for OpenCV and projection matrices, and the
+converters of AliceVision and EasyVolcap, agree. No file with measurements was there for a check.
 """
 
 from __future__ import annotations
@@ -66,9 +63,14 @@ def read(source: Source) -> Cameras:
     path = source.path
     folder = path if path.is_dir() else path.parent
     beside = {p.stem: p.name for p in folder.iterdir() if p.suffix.lower() in IMAGES}
-    images = {  # a file _common speaks of no image
-        file: _fields(file) for file in _files(path) if file.stem != "_common"
-    }
+    images: dict[Path, dict[str, str]] = {}
+    for file in _files(path):
+        if file.stem != "_common":  # which speaks of no image
+            images[file] = {}
+            for one in read_xml(file).iter(DESCRIPTION):
+                fields = one.attrib | {str(child.tag): child.text or "" for child in one}
+                own = {k: v.strip() for k, v in fields.items() if k.startswith("{" + NAMESPACE)}
+                images[file] |= {name.partition("}")[2]: text for name, text in own.items()}
     names = {file: beside.get(file.stem, file.stem) for file in images}
     posed = {f: of for f, of in images.items() if {"Rotation", "Position"} <= of.keys()}
     if not posed:
@@ -98,17 +100,6 @@ def _files(path: Path) -> list[Path]:
         return [path]
     listed = sorted(p for p in path.iterdir() if p.suffix.lower() == ".xmp" and p.is_file())
     return [file for file in listed if NAMESPACE.encode() in file.read_bytes()]
-
-
-def _fields(path: Path) -> dict[str, str]:
-    """Return the fields of all descriptions, from attributes and child elements."""
-    fields: dict[str, str] = {}
-    for description in read_xml(path).iter(DESCRIPTION):
-        pairs = [*description.attrib.items(), *((str(e.tag), e.text) for e in description)]
-        for name, text in pairs:
-            if name.startswith("{" + NAMESPACE):
-                fields[name.partition("}")[2]] = (text or "").strip()
-    return fields
 
 
 def _lens(path: Path, fields: dict[str, str], width: float, height: float) -> Lens:

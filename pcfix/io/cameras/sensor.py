@@ -1,6 +1,6 @@
-"""The lens of the images of a table, and a block written as a table with its sensor beside it.
+"""The lens of the images of a table, and a block written as a table with its sensor next to it.
 
-The lens is that of a table beside it, a calibration, or the table's own columns. Written are
+The lens is that of a table next to it, a calibration, or the table's own columns. Written are
 ``cameras.csv``, with label, x, y, z, qw, qx, qy, qz: projection centre and rotation from the world
 to the camera (x right, y down, z forward), after a comment with the CRS where there is one; and
 ``sensor.csv``, with the one lens of all images, in pixels with OpenCV's names or, of an undistorted
@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import csv
 import io
+import math
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +22,6 @@ from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import write_new
 from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
 from pcfix.io.crs import is_topocentric
-from pcfix.io.files import check_input
 from pcfix.io.tables import Table, read_table
 from pcfix.model import Cameras, Lens
 from pcfix.options.declare import File
@@ -30,6 +31,7 @@ PIXELS = ("focal_px", "width_px", "height_px")
 NAMES = {"d1": "k4", "d2": "k5", "d3": "k6", "p2": "p1", "p1": "p2"}
 """What OpenCV calls the parameters that have another name in `lenses`."""
 OPENCV = {"OpenCV": LensModel("f cx cy k1 k2 k3 d1 d2 d3 p2 p1")}
+TERMS = OPENCV["OpenCV"].names.split()[1:]
 CENTRED = {"centred": LensModel("f")}
 FRAME = ("width_px", "height_px")
 DISTORTION = ("k1", "k2", "k3", "k4", "t1", "t2")
@@ -59,25 +61,18 @@ def read_sensor(path: Path) -> Lens:
     if table is None:
         from pcfix.io.cameras.metashape import read_calibration
 
-        return read_calibration(path)
-    columns = PIXELS if table.has(*PIXELS) else MILLIMETRES
+        return checks.lens(path, path.stem, read_calibration(path))
     if len(table.rows) != 1:
         sentence = f"has {len(table.rows)} rows. Give one row for all images."
         raise bad_file(path, "cameras.sensor_rows", sentence, rows=len(table.rows))
-
-    def value(name: str, default: float = 0.0) -> float:
-        return float(table.of((name,))[0, 0]) if table.has(name) else default
-
-    focal, width, height = map(value, columns)
-    given = {"f": focal}
-    if columns == PIXELS:
-        names = OPENCV["OpenCV"].names.split()[1:]
-        middle = {"cx": width / 2.0, "cy": height / 2.0}
-        given |= {one: value(NAMES.get(one, one), middle.get(one, 0.0)) for one in names}
-    lens = lens_by_name(given, width, height, unit="px" if columns == PIXELS else "mm")
+    is_px = table.has(*PIXELS)
+    (focal, width, height), given = table.of(PIXELS if is_px else MILLIMETRES)[0].tolist(), {}
+    if is_px:
+        values = table.where_there(NAMES.get(one, one) for one in TERMS)[0].tolist()
+        given = {one: v for one, v in zip(TERMS, values, strict=True) if not math.isnan(v)}
+    lens = lens_by_name({"f": focal} | given, width, height, unit="px" if is_px else "mm")
     checks.lens(path, path.stem, lens)
-    shares = lens.principal_x / width, lens.principal_y / height
-    if not all(0.25 < share < 0.75 for share in shares):
+    if not all(0.25 < at < 0.75 for at in (lens.principal_x / width, lens.principal_y / height)):
         sentence = "cx, cy is far from the centre. Give pixels from the upper left corner."
         raise bad_file(path, "cameras.principal_point", sentence)
     return lens
@@ -95,11 +90,9 @@ def read_frame(path: Path) -> tuple[float, float]:
 
 def _table(path: Path, *needed: tuple[str, ...]) -> Table | None:
     """Return a table with the needed columns; None of a calibration of Metashape (XML)."""
-    with check_input(path).open("rb") as stream:
-        is_xml = stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
-    if is_xml:
+    if checks.Source(path).text.lstrip().startswith("<"):
         return None
-    names = (*MILLIMETRES, *PIXELS, *(NAMES.get(n, n) for n in OPENCV["OpenCV"].names.split()))
+    names = (*MILLIMETRES, *PIXELS, *(NAMES.get(one, one) for one in TERMS))
     return read_table(path, *needed, spellings={name: (name,) for name in names})
 
 
@@ -125,25 +118,26 @@ def write_table(folder: File, cameras: Cameras) -> None:
         raise bad_file(target, "output.crs", sentence, crs=cameras.crs)
     given, *others = dict.fromkeys(lenses)
     if others:
-        sentence = (
-            f"a table holds one lens, but the images have {1 + len(others)}. Use another format."
-        )
-        raise bad_file(target, "output.lens", sentence)
-    is_mm = given.unit == "mm"
-    _, values = model_of(target, given, CENTRED if is_mm else OPENCV, unit=given.unit)
+        sentence = f"a table holds one lens, but the images have {1 + len(others)}. Use another"
+        raise bad_file(target, "output.lens", f"{sentence} format.")
+    is_px = given.unit == "px"
+    _, values = model_of(target, given, OPENCV if is_px else CENTRED, unit=given.unit)
     frame = (values.pop("f"), given.width, given.height)
-    sensor = dict(zip(MILLIMETRES if is_mm else PIXELS, frame, strict=True))
-    sensor |= {NAMES.get(name, name): value for name, value in values.items()}
-    lines = [",".join(sensor), ",".join(repr(float(value)) for value in sensor.values())]
+    sensor = dict(zip(PIXELS if is_px else MILLIMETRES, map(float, frame), strict=True))
+    sensor |= {NAMES.get(name, name): float(value) for name, value in values.items()}
     turns = Rotation.from_matrix(rotations).as_quat(canonical=True)
-    numbers = np.column_stack([cameras.centres, np.roll(turns, 1, axis=1)]).tolist()
+    poses = np.column_stack([cameras.centres, np.roll(turns, 1, axis=1)]).tolist()
+    has_crs = cameras.crs is not None and cameras.crs.strip().lower() != "local"
+    comment = f"# CoordinateSystem: {' '.join((cameras.crs or '').split())}\n" if has_crs else ""
+    rows = [[label, *row] for label, row in zip(cameras.labels, poses, strict=True)]
+    contents = {
+        "cameras.csv": comment.encode() + _csv(POSE, *rows),
+        "sensor.csv": _csv(sensor, sensor.values()),
+    }
+    write_new(target, contents)
+
+
+def _csv(*rows: Iterable[object]) -> bytes:
     stream = io.StringIO()
-    if cameras.crs is not None and cameras.crs.strip().lower() != "local":
-        stream.write(f"# CoordinateSystem: {' '.join(cameras.crs.split())}\n")
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(POSE)
-    writer.writerows(
-        [label, *map(repr, row)] for label, row in zip(cameras.labels, numbers, strict=True)
-    )
-    written = "\n".join([*lines, ""]).encode()
-    write_new(target, {"cameras.csv": stream.getvalue().encode(), "sensor.csv": written})
+    csv.writer(stream, lineterminator="\n").writerows(rows)
+    return stream.getvalue().encode()

@@ -3,7 +3,7 @@
 Fields are separated by comma, semicolon, tab or spaces; the header may be a comment (#), and units
 may stand in it (x[m], omega[gon]). What its columns may be called is in `SPELLINGS`: the image, its
 projection centre (longitude and latitude in degrees of WGS 84 are EPSG:4326, or EPSG:4979 if the
-header says that the heights are ellipsoidal), and how it is turned, or nothing:
+header calls the heights ellipsoidal), and how it is turned, or nothing:
 
 - omega, phi, kappa: photogrammetric camera axes (x right, y up, z back) go to the world by
   Rx(omega) Ry(phi) Rz(kappa); a matrix next to them is ignored.
@@ -12,12 +12,12 @@ header says that the heights are ellipsoidal), and how it is turned, or nothing:
   pitch, roll of RealityCapture.
 - yaw, pitch, roll of a gimbal, -90 for a view straight down (``angles="aircraft"``, or
   exiftool's GimbalPitchDegree): Rz(-yaw) Rx(90 + pitch) Rz(-roll). Angles that fit this better
-  than the former are refused until the user says which they are.
+  than the former are refused until the user names their kind.
 - qw, qx, qy, qz: world to camera with axes x right, y down, z forward, as in COLMAP.
 - only r11 ... r33: world to camera, to either of the two axes; the cameras look down.
 
 Axes of the world are those of the CRS of the positions: its grid north, or for degrees the east,
-north and up of the place. Values called ``_est`` are adjusted ones; the others beside them are then
+north and up of the place. Values called ``_est`` are adjusted ones; the others are then
 positions by GNSS, with the stated accuracies (Metashape's reference table).
 
 RealityCapture's ``f, px, py, k1 ... k4, t1, t2``: f in mm for a film of 36 mm along the larger side
@@ -39,7 +39,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning, bad_file
+from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io import tables
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Angles, Source, note
@@ -159,8 +159,8 @@ def open_table(path: Path) -> Table:
         rows = [[*fields, *[""] * len(GEO)][: len(GEO)] for _, fields in split]
         place = {name: GEO.index(name) for name in ("label", "x", "y", "z")}
         place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
-        crs = checks.utm_as_code(lines[0].strip())
-        return Table(path, [*GEO], rows, [i for i, _ in split], place, [""] * len(GEO), crs=crs)
+        numbers, units = [i for i, _ in split], [""] * len(GEO)
+        return Table(path, [*GEO], rows, numbers, place, units, crs=lines[0].strip())
     kinds = [("label", *three) for three in (*AXES, ("x_est", "y_est", "z_est"), TRANSLATION)]
     table = tables.read_table(path, *kinds, spellings=SPELLINGS)
     for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
@@ -219,23 +219,22 @@ def crs(columns: Table) -> tuple[str | None, tuple[PcfixWarning, ...]]:
     """Return the CRS that a table states or implies, and notes on it.
 
     Longitude and latitude without more are those of WGS 84. Heights then are ellipsoidal only
-    if the header calls them so; else the CRS has no heights. A ``.prj`` of the table's name beside
-    it counts where the table itself says nothing.
+    if the header calls them so; else the CRS has no heights. A ``.prj`` of the table's name next
+    to it counts where the table itself states none.
     """
-    said, beside = columns.crs, columns.path.with_suffix(".prj")
-    if not said and beside != columns.path and beside.is_file():
-        said = " ".join(tables.read_lines(beside)).strip() or None
-    if said is None:
+    stated, beside = columns.crs, columns.path.with_suffix(".prj")
+    if not stated and beside != columns.path and beside.is_file():
+        stated = " ".join(tables.read_lines(beside)).strip() or None
+    if stated is None:
         if axes(columns.place) != ("longitude", "latitude", "z"):
             return None, ()
         ellipsoidal = columns.name("z").startswith("ellipsoid")
         return WGS84_ELLIPSOIDAL if ellipsoidal else WGS84, ()
-    if said.startswith("LOCAL_CS"):
-        return "local", ()
-    if not checks.names_crs(said):
-        sentence = f"PROJ does not know its CRS '{shortened(said)}'. The cloud's is assumed."
-        return None, (note(columns.path, "cameras.crs_unknown", sentence, crs=said),)
-    return said, ()
+    try:
+        return checks.crs(columns.path, stated), ()
+    except InputError:
+        sentence = f"PROJ does not know its CRS '{shortened(stated)}'. The cloud's is assumed."
+        return None, (note(columns.path, "cameras.crs_unknown", sentence, crs=stated),)
 
 
 def is_geo(lines: list[str]) -> bool:
@@ -246,15 +245,13 @@ def is_geo(lines: list[str]) -> bool:
     return len(first) >= 3 and np.isnan(tables.number(first[0]))
 
 
-OMEGA_PHI_KAPPA = ("omega", "phi", "kappa")
-YAW_PITCH_ROLL = ("yaw", "pitch", "roll")
-QUATERNION = ("qw", "qx", "qy", "qz")
-MATRIX = tuple(f"r{i}{j}" for i in "123" for j in "123")
 CONVERSIONS = {
-    "omega-phi-kappa": (OMEGA_PHI_KAPPA, rotations.from_omega_phi_kappa),
-    "yaw-pitch-roll": (YAW_PITCH_ROLL, rotations.from_yaw_pitch_roll),
-    "aircraft": (YAW_PITCH_ROLL, rotations.from_aircraft),
+    "omega-phi-kappa": (("omega", "phi", "kappa"), rotations.from_omega_phi_kappa),
+    "yaw-pitch-roll": (("yaw", "pitch", "roll"), rotations.from_yaw_pitch_roll),
+    "aircraft": (("yaw", "pitch", "roll"), rotations.from_aircraft),
 }
+OMEGA_PHI_KAPPA, YAW_PITCH_ROLL, _ = (roles for roles, _ in CONVERSIONS.values())
+QUATERNION, MATRIX = ("qw", "qx", "qy", "qz"), tuple(f"r{i}{j}" for i in "123" for j in "123")
 LARGEST_DEG = 360.0
 LOOKS_DOWN_DEG = 80.0
 """Largest tilt from the vertical of a camera that looks at the ground."""
@@ -263,27 +260,50 @@ LOOKS_DOWN_DEG = 80.0
 def _rotations(columns: Table, angles: Angles | None) -> FloatArray | None:
     """Return world to camera rotations, or None where the table has nothing that turns.
 
-    `angles` is what the user says that they are.
+    `angles` is their kind as the user names it. Where the header cannot, the view must decide: the
+    cameras look down at the ground.
     """
-    wanted, convert = ((), None) if angles is None else CONVERSIONS[angles]
+    path, wanted = columns.path, CONVERSIONS[angles][0] if angles else ()
+
+    def unclear(sentence: str) -> InputError:
+        return bad_file(path, "cameras.angles", sentence)
+
     for kind in (OMEGA_PHI_KAPPA, YAW_PITCH_ROLL, QUATERNION, MATRIX):
         missing = [role for role in kind if not columns.has(role)]
         if len(missing) < len(kind) or kind == wanted:
-            tables.check_columns(columns.path, columns.header, kind, missing)
-    if convert is not None:
-        return convert(*_degrees(columns, wanted))
+            tables.check_columns(path, columns.header, kind, missing)
+    if angles is not None:
+        return CONVERSIONS[angles][1](*_degrees(columns, wanted))
     if columns.has(*OMEGA_PHI_KAPPA):
         reality_capture = columns.after_hash and columns.name("label") == "name"
         if columns.place["phi"] < columns.place["omega"] or reality_capture:
             sentence = "omega, phi, kappa may be turns in another order here. Export heading,"
-            sentence += " pitch, roll, or give --angles omega-phi-kappa."
-            raise bad_file(columns.path, "cameras.angles", sentence)
+            raise unclear(f"{sentence} pitch, roll, or give --angles omega-phi-kappa.")
         return rotations.from_omega_phi_kappa(*_degrees(columns, OMEGA_PHI_KAPPA))
     if columns.has(*QUATERNION):
-        return checks.quaternions(columns.path, columns.labels, columns.of(QUATERNION))
-    if columns.has(*MATRIX):
-        return _from_matrix(columns)
-    return _from_yaw_pitch_roll(columns) if columns.has(*YAW_PITCH_ROLL) else None
+        return checks.quaternions(path, columns.labels, columns.of(QUATERNION))
+    if columns.has(*MATRIX):  # to axes either y up, z back or y down, z forward
+        found = checks.rotations(path, columns.labels, columns.of(MATRIX))
+        back_is_up = found[:, 2, 2] > 0.0
+        if back_is_up.any() and not back_is_up.all():
+            raise unclear("r33 has both signs, so the axes are not clear. Give omega, phi, kappa.")
+        return rotations.from_photogrammetric(found) if back_is_up.all() else found
+    if not columns.has(*YAW_PITCH_ROLL):
+        return None
+    values = _degrees(columns, YAW_PITCH_ROLL)
+    found, gimbal = rotations.from_yaw_pitch_roll(*values), rotations.from_aircraft(*values)
+    if columns.name("yaw").startswith("gimbal"):
+        return gimbal
+    tilt, other = (  # the angles between the views and straight down
+        np.degrees(np.arctan2(np.hypot(each[:, 2, 0], each[:, 2, 1]), -each[:, 2, 2]))
+        for each in (found, gimbal)
+    )
+    reality_capture = columns.after_hash and columns.name("yaw") == "heading"
+    is_likely = other.max() < LOOKS_DOWN_DEG and np.median(other) < np.median(tilt)
+    if is_likely and not reality_capture:
+        sentence = "yaw, pitch, roll are likely those of a gimbal. Give --angles aircraft, or"
+        raise unclear(f"{sentence} --angles yaw-pitch-roll.")
+    return found
 
 
 def _degrees(columns: Table, roles: tuple[str, ...]) -> FloatArray:
@@ -303,48 +323,10 @@ def _own_lenses(columns: Table, source: Source) -> tuple[Lens, ...]:
     if path is None:
         raise checks.no_sensor(columns.path, "width_px,height_px")
     width, height = read_frame(path)
-    side = max(width, height)
-    roles = columns.of(("f", "px", "py")), np.nan_to_num(columns.where_there(DISTORTION))
-    lenses = []
-    for focal, x, y, *brown in np.hstack(roles).tolist():
-        given = {"f": focal * side / FILM_MM}
+    side, lenses = max(width, height), []
+    distortion = np.nan_to_num(columns.where_there(DISTORTION))
+    for focal, x, y, *brown in np.hstack([columns.of(("f", "px", "py")), distortion]).tolist():
+        given = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), brown, strict=True))
         given |= {"cx": width / 2.0 + x * side, "cy": height / 2.0 + y * side}
-        given |= dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), brown, strict=True))
-        lenses.append(lens_by_name(given, width, height))
+        lenses.append(lens_by_name(given | {"f": focal * side / FILM_MM}, width, height))
     return tuple(lenses)
-
-
-def _from_matrix(columns: Table) -> FloatArray:
-    """Return rotations from r11 ... r33, to axes either y up, z back or y down, z forward.
-
-    Both turn world to camera. Which one it is shows where the cameras look: at the ground.
-    """
-    matrices = columns.of(MATRIX).reshape(-1, 3, 3)
-    found = checks.rotations(columns.path, columns.labels, matrices)
-    back_is_up = found[:, 2, 2] > 0.0
-    if back_is_up.any() and not back_is_up.all():
-        sentence = "r33 has both signs, so the axes are not clear. Give omega, phi, kappa."
-        raise bad_file(columns.path, "cameras.angles", sentence)
-    return rotations.from_photogrammetric(found) if back_is_up.all() else found
-
-
-def _from_yaw_pitch_roll(columns: Table) -> FloatArray:
-    """Return rotations from angles of the view; what the header cannot say, the view must.
-
-    Refused are angles that are more likely those of a gimbal, which are -90 straight down.
-    """
-    values = _degrees(columns, YAW_PITCH_ROLL)
-    found, aircraft = rotations.from_yaw_pitch_roll(*values), rotations.from_aircraft(*values)
-    if columns.name("yaw").startswith("gimbal"):
-        return aircraft
-    if columns.after_hash and columns.name("yaw") == "heading":  # RealityCapture's
-        return found
-    tilt, other = (  # the angles between the views and straight down
-        np.degrees(np.arctan2(np.hypot(each[:, 2, 0], each[:, 2, 1]), -each[:, 2, 2]))
-        for each in (found, aircraft)
-    )
-    if other.max() < LOOKS_DOWN_DEG and np.median(other) < np.median(tilt):
-        sentence = "yaw, pitch, roll are likely those of a gimbal. Give --angles aircraft, or"
-        sentence += " --angles yaw-pitch-roll."
-        raise bad_file(columns.path, "cameras.angles", sentence)
-    return found

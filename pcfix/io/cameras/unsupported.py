@@ -20,8 +20,7 @@ POSES = "Give the file or folder with the camera poses"
 OPK = "Write a table with the header label,x,y,z,omega,phi,kappa and give its lens by --sensor"
 COLMAP = "Export a COLMAP model (cameras, images, points3D)"
 TABLES = "Give calibrated_camera_parameters.txt of the same export, or its folder params"
-Refusal = tuple[str, str]
-"""What a file is, and what to do instead."""
+Refusal = tuple[str, str]  # what a file is, and what to do instead
 PIX4D = "a project of Pix4D", "Give its folder 1_initial/params"
 MICMAC = "a calibration of MicMac", "Give the folder with its orientations"
 ODM = "a list of lenses of OpenDroneMap or OpenSfM, without poses", "Give reconstruction.json"

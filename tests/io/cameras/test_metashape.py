@@ -8,7 +8,7 @@ import pytest
 from pyproj import CRS
 
 from pcfix.io.cameras import metashape
-from pcfix.io.cameras.checks import Source
+from pcfix.io.cameras.checks import Source, recognises
 from pcfix.io.cameras.metashape import read_calibration
 from pcfix.lens.imaging import project
 from pcfix.model import Lens
@@ -319,7 +319,7 @@ def test_calibration_file(tmp_path):
         tangential=(0.0, 0.25),
         sensor="calibration",
     )
-    assert not metashape.recognises(Source(path))
+    assert not recognises(metashape, Source(path))
 
 
 # GNSS
