@@ -29,9 +29,9 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from pcfix.errors import bad_file
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import AffineFrame, Source, load_json, triple
+from pcfix.io.cameras.checks import AffineFrame, Source, load_json, note, triple
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.cameras.pix4d import fisheye
 from pcfix.io.crs import crs_text, parse_crs, plan_unit
@@ -51,7 +51,7 @@ def read(source: Source) -> Cameras:
     project = _open_project(source.path)
     path, calibrated = project.part("calibration", "calibrated-cameras")
     _, given = project.part("input_cameras", "input-cameras", needed=False)
-    frame, names = _frame_of(project), dict[int, str]()
+    (frame, notes), names = _frame_of(project), dict[int, str]()
     for listed in project.files("camera_list", FORMAT.format("camera-list")):
         for camera in load_json(listed)["cameras"] if listed.is_file() else []:
             name = camera["uri"].replace("\\", "/").rpartition("/")[2]
@@ -76,7 +76,7 @@ def read(source: Source) -> Cameras:
         lenses=tuple(lenses) if shots and len(lenses) == len(shots) else None,
         crs=frame.crs,
         project_crs=frame.project_crs,
-        notes=checks.repeated(path, labels),
+        notes=(*notes, *checks.repeated(path, labels)),
         gnss=_gnss(path, captures, list(shots)),
         unposed=tuple(names.get(i, f"camera {i}") for i in captured if i not in shots),
         source=project.generator,
@@ -125,11 +125,11 @@ def _open_project(path: Path) -> Project:
     return Project(path, content["items"], " ".join(map(str, words)).strip())
 
 
-def _frame_of(project: Project) -> AffineFrame:
-    """Return the frame of the processing, east, north, up."""
+def _frame_of(project: Project) -> tuple[AffineFrame, list[PcfixWarning]]:
+    """Return the frame of the processing, east, north, up, and notes on it."""
     path, scene = project.part("scene_reference_frame", "scene-reference-frame", needed=False)
     if not scene:  # the frame of the processing is arbitrary
-        return AffineFrame(np.eye(3), np.zeros(3), "local")
+        return AffineFrame(np.eye(3), np.zeros(3), "local"), []
     way = scene["base_to_canonical"]
     shift, scale = triple(way["shift"]), triple(way["scale"])
     if not (scale > 0.0).all():
@@ -138,8 +138,12 @@ def _frame_of(project: Project) -> AffineFrame:
         scale = scale[[1, 0, 2]]  # positions are east, north already, scales in the CRS's order
     stated = checks.crs(path, scene["crs"]["definition"])
     crs, unit = (stated, 1.0) if stated == "local" else _with_heights(stated, str(path))
-    size = [1.0, 1.0, unit] / scale
-    return AffineFrame(np.diag(size), -shift * size, crs, None if crs == stated else stated)
+    size, notes = [1.0, 1.0, unit] / scale, list[PcfixWarning]()
+    if geoid_m := float(scene["crs"].get("geoid_height") or 0.0):
+        sentence = f"its heights refer to a constant geoid height of {geoid_m:g} m."
+        notes.append(note(path, "cameras.constant_geoid", sentence, geoid_m=geoid_m))
+    frame = AffineFrame(np.diag(size), -shift * size, crs, None if crs == stated else stated)
+    return frame, notes
 
 
 def _with_heights(text: str, name: str) -> tuple[str, float]:
@@ -202,7 +206,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     project = _open_project(source.path)
     _, calibrated = project.part("calibration", "calibrated-cameras")
     row_of = {shot["id"]: i for i, shot in enumerate(calibrated["cameras"])}
-    frame, found = _frame_of(project), list[checks.Seen]()
+    (frame, _), found = _frame_of(project), list[checks.Seen]()
     for path in project.files("calibration", "model/gltf+json"):
         with checks.reading(path):
             model = load_json(path)
