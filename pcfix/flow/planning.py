@@ -23,8 +23,14 @@ from pcfix.flow.inputs import (
     paths_in,
     read_blocks,
 )
-from pcfix.flow.shore import check_shoreline
-from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
+from pcfix.flow.surfaces import (
+    CloudView,
+    Points,
+    check_shoreline,
+    own_water_of,
+    parts_of,
+    sample_of,
+)
 from pcfix.io.las.source import CHUNK_POINTS
 from pcfix.io.views import ViewMatch
 from pcfix.label.labelling import Labelling

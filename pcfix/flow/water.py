@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from pcfix.errors import plain, shown_once
 from pcfix.flow.runner import check_summary, write_summary
-from pcfix.flow.shore import check_shoreline, write_shoreline
-from pcfix.flow.surfaces import file_points, find_surface, sample_of, view_of
+from pcfix.flow.surfaces import check_shoreline, find_surface, sample_of, view_of, write_shoreline
 from pcfix.grid.shoreline import NearWater
 from pcfix.io.files import check_input
 from pcfix.model import FloatArray, WaterDimension
 from pcfix.options.declare import taken
 from pcfix.options.survey import WaterCheckOptions
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, draw_cloud, label_plan, new_figure
-from pcfix.report.text import Plain, Rows, RowTable, aligned, filled, shoreline_rows
+from pcfix.report.text import Plain, RowTable, aligned, filled, shoreline_rows
 from pcfix.water.auto import WaterProposal
 from pcfix.water.fit import ShoreFit, WaterFit
 from pcfix.water.river import RiverFit
@@ -30,6 +28,7 @@ if TYPE_CHECKING:
 SAMPLE_POINTS = 200_000
 """Points of the cloud that are compared with the water, evenly spread."""
 MOST_LISTED = 10
+"""Rejected points in the summary, the largest residual first."""
 _FIT: RowTable = (
     ("Model", "{model}, {accepted} of {points} points; scatter {sigma_point_m:.3f} m", "points"),
     ("Level", "{level_m:.3f} m at {at_xy[0]:.1f}, {at_xy[1]:.1f}; standard error"
@@ -38,8 +37,6 @@ _FIT: RowTable = (
      " {downhill_deg:.0f} deg", "tilt_percent"),
     ("Length", "{length_m:.1f} m, falls {drop_m:.3f} m; standard error of the level"
      " {sigma_level_m:.3f} m", "length_m"),
-    ("Residuals", "of the accepted points: rms {rms:.3f} m, median {median:.3f} m, largest"
-     " {largest:.3f} m", "points"),
 )  # fmt: skip
 
 
@@ -71,7 +68,7 @@ def check_water(
             below = float(np.mean(sample[:, 2] < height))
     if view is not None and given.shoreline is not None:
         near = NearWater()
-        for one in file_points(Path(view.name), found.surface):
+        for one in view.chunks(found.surface):
             above = surface_above(found.surface, one.xyz, one.heights)
             near += NearWater.of(one.xyz, one.xyz[:, 2] - above.height_m)
         shoreline = write_shoreline(
@@ -110,7 +107,12 @@ def water_text(report: WaterReport) -> str:
     """Return the summary of a water surface."""
     (found, r), rows = report, list[tuple[str, str]]()
     if isinstance(found, ShoreFit):
-        rows = _fit_rows(found)
+        rows = filled(_FIT, found.as_dict())
+        off = np.where(found.accepted, 0.0, np.nan_to_num(found.residual_m))
+        listed = min(MOST_LISTED, np.count_nonzero(off))
+        for i in np.argsort(-np.abs(off), kind="stable")[:listed]:
+            x, y, z = found.points[i]
+            rows.append(("Rejected", f"{x:.2f}, {y:.2f}, {z:.2f}: {off[i]:+.3f} m"))
     elif isinstance(found, WaterProposal):
         rows = [
             ("Level", f"{found.level_m:.3f} m, standard error {found.sigma_level_m:.3f} m,"
@@ -125,32 +127,13 @@ def water_text(report: WaterReport) -> str:
     return aligned(f"{r['water']}: {r['surface']}", rows, found.notes)
 
 
-def _fit_rows(fit: ShoreFit) -> Rows:
-    """Return the rows of a fit, and its rejected points, the largest residual first."""
-    residual = fit.residual_m
-    good = np.abs(residual[fit.accepted])
-    rms, median, largest = np.sqrt(np.mean(good**2)), np.median(good), good.max()
-    spread = {"rms": rms, "median": median, "largest": largest}
-    rows = filled(_FIT, fit.as_dict() | spread)
-    rejected = np.flatnonzero(~fit.accepted & np.isfinite(residual))
-    rejected = rejected[np.argsort(-np.abs(residual[rejected]), kind="stable")]
-    for i in rejected[:MOST_LISTED]:
-        x, y, z = fit.points[i]
-        rows.append(("Rejected", f"{x:.2f}, {y:.2f}, {z:.2f}: {residual[i]:+.3f} m"))
-    more = len(rejected) - MOST_LISTED
-    return [*rows, ("", f"and {more} more")] if more > 0 else rows
-
-
 def water_figure(found: FoundSurface, cloud_xyz: FloatArray) -> Figure:
     """Draw cloud and shoreline in plan, and below the residuals of a fit, or the evidence."""
     figure, (plan, side) = new_figure(8.0, 7.5, nrows=2, height_ratios=[3, 2])
     title, shown = str(found.surface), cloud_xyz
     if isinstance(found, WaterProposal):
-        shown = found.ground
         title = f"Water {found.level_m:.3f} ± {found.sigma_level_m:.3f} m"
-        tilt = 100.0 * float(np.hypot(*found.tilt))
-        title += f", tilt {tilt:.2f} %" if tilt else ""
-        title += f", confidence {found.confidence:.2f}"
+        title, shown = f"{title}, confidence {found.confidence:.2f}", found.ground
     draw_cloud(figure, plan, shown, getattr(found, "level_m", None))
     if isinstance(found, WaterProposal):
         _draw_evidence(plan, side, found)
@@ -178,14 +161,13 @@ def _draw_evidence(plan: Axes, side: Axes, found: WaterProposal) -> None:
 
 
 def _draw_fit(plan: Axes, side: Axes, fit: WaterFit | RiverFit) -> None:
-    """Draw the points of a fit in plan, and their heights along the river or the tilt."""
+    """Draw the points of a fit in plan, and their heights along the river or their long side."""
     points = fit.points
     if isinstance(fit, RiverFit):
         station, label = np.asarray(fit.axis.locate(points[:, :2])[0]), "Down the flow (m)"
     else:
-        centred = points[:, :2] - points[:, :2].mean(axis=0)
-        axis = np.linalg.svd(centred, full_matrices=False)[2][0]  # of their longest extent
-        station = centred @ (-fit.tilt / np.hypot(*fit.tilt) if fit.tilt.any() else axis)
+        local = points[:, :2] - points[:, :2].mean(axis=0)
+        station = local @ np.linalg.svd(local, full_matrices=False)[2][0]
         station, label = station - station.min(), "Along the points (m)"
     order = np.argsort(station)
     height = fit.height_at(points[order, :2])
@@ -208,7 +190,5 @@ def _draw_fit(plan: Axes, side: Axes, fit: WaterFit | RiverFit) -> None:
 def found_picture(found: FoundSurface) -> Picture:
     """Return the evidence for a level that was found in the cloud, for the page."""
     alt = "How the water was found: shoreline in plan, and the evidence for each height."
-    reasons = found.reasons if isinstance(found, WaterProposal) else ()
-    alt += "".join(f" {reason[:1].upper()}{reason[1:].rstrip('.')}." for reason in reasons)
     figure = water_figure(found, np.zeros((0, 3)))
     return Picture("water", "The water level found in the cloud", alt, figure)

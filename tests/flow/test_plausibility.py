@@ -84,7 +84,7 @@ UNCHECKED = {
     "47 m too high": "heights (no tie points; cameras 129 m above the cloud)",
     "feet": "heights (no tie points; cameras 26",
     "yaw + 90": "yaw (the images lie across the flight lines)",
-    "40 m beside": "a shift in plan (the frames reach far beyond the cloud)",
+    "40 m beside": "a shift in plan (no GNSS positions)",
 }
 
 
