@@ -113,7 +113,7 @@ def find_elsewhere(
         coarse = _scanned(samples)
         tilted, gain = _find_tilt(coarse), _gains(coarse, NO_TILT)
         here = gain[np.abs(coarse.heights_m + samples.origin[2]) <= DIFFERENT_M].max(initial=0.0)
-        if gain.max() >= LEAST_AGREED and here <= MOST_RIVAL_AGREED * gain.max():
+        if here <= MOST_RIVAL_AGREED * gain.max():
             found = _judged(coarse)
     if found is None:
         return None, tilted
@@ -210,19 +210,18 @@ def _best(scan: Scan, tilts: FloatArray) -> Peak:
     return max(found, key=lambda peak: peak.score)
 
 
-def _tilts_along(step: FloatArray, steps: int) -> FloatArray:
-    """Return multiples of a tilt, the level one first, shape (2 steps + 1, 2)."""
-    up_and_down = np.arange(-steps, steps + 1)
-    return up_and_down[np.argsort(np.abs(up_and_down), kind="stable")][:, None] * step
+def _along(step: FloatArray, steps: int) -> FloatArray:
+    """Return multiples of a tilt, zero first, shape (2 steps + 1, 2)."""
+    return np.outer(sorted(range(-steps, steps + 1), key=abs), step)
 
 
 def _refine(samples: Samples, start: Peak, step: FloatArray) -> tuple[Peak, Scan]:
     """Search near a surface in fine steps of height and of tilt; a step of zero keeps it level."""
-    peak = start
+    peak, steps = start, 2 if step.any() else 0
     reach = np.arange(-FINE_REACH_M, FINE_REACH_M + FINE_M / 2.0, FINE_M)
-    for halvings in range(1, 4 if step.any() else 2):
+    for size in (0.5, 0.25, 0.125)[: 3 if steps else 1]:
         scan = _scan_at(samples, peak.level_m + reach, peak.tilt)
-        peak = _best(scan, _tilts_along(step / 2.0**halvings, 2 if step.any() else 0))
+        peak = _best(scan, _along(size * step, steps))
     return peak, _scan_at(samples, peak.level_m + reach, peak.tilt)
 
 
@@ -240,7 +239,7 @@ def _choose(coarse: Scan) -> tuple[Peak, Scan]:
     axis = np.linalg.svd(shore - shore.mean(axis=0), full_matrices=False)[2][0]
     extent = float(np.ptp(samples.xyz[:, :2], axis=0).max())
     step = max(TILT_STEP_M / extent, LARGEST_TILT / MOST_TILT_STEPS)
-    tilted = _best(coarse, _tilts_along(step * axis, math.ceil(LARGEST_TILT / step)))
+    tilted = _best(coarse, _along(step * axis, math.ceil(LARGEST_TILT / step)))
     if tilted.score > start.score:
         plane, near_plane = _refine(samples, tilted, step * axis)
         along = abs(float(plane.tilt @ axis))
@@ -272,10 +271,10 @@ def _judged(coarse: Scan) -> WaterProposal:
     """Return the best surface; GeometryError ``water.not_found`` if its evidence is not enough."""
     samples, origin = coarse.samples, coarse.samples.origin
     peak, near = _choose(coarse)
-    sigma_m = _sigma_level(near)
+    sigma_m, middle = _sigma_level(near), len(near.heights_m) // 2
     total, evidence, sentences, strong = 0.0, dict[str, float](), list[str](), list[str]()
     for sums in near.cues:
-        cue, middle = sums.cue, len(near.heights_m) // 2
+        cue = sums.cue
         gain, size, sigma = (float(figure[middle]) for figure in gain_of(sums))
         evidence[f"{cue.name} gain"] = gain
         total += max(gain, 0.0)
@@ -303,27 +302,24 @@ def _judged(coarse: Scan) -> WaterProposal:
     if strong == [SLOPE.name]:
         lift = evidence["slope amplitude"]
     shore = samples.xyz[peak.shore(samples)]
-    reason = ""
-    if not LEAST_SHARE <= wet <= 1.0 - LEAST_SHARE or len(shore) == 0:
-        reason, why = "no_shoreline", "nearly all of the cloud is on one side of it"
-    elif not LIFTS[0] <= lift <= LIFTS[1]:  # a break that refraction does not make
-        reason = "bank"
-        why = f"slopes change there by a factor of {1.0 + lift:.2f}, refraction gives about 1.36"
-    elif total < least:
-        reason, why = "weak", f"its evidence is {total:.0f}, and {least:.0f} is needed"
-    elif rival > most_rival * total:
-        reason = "contradictory"
-        why = f"its evidence is {total:.0f}, and {rival_m:.2f} m has {rival:.0f}, nearly as much"
-    elif sigma_m > MOST_SIGMA_M:
-        reason, why = "inconsistent", f"parts of the cloud differ by {sigma_m:.2f} m"
-    if reason:
-        height = peak.level_m + float(samples.xyz[:, :2].mean(axis=0) @ peak.tilt + origin[2])
-        raise GeometryError(
-            "water.not_found",
-            f"No water surface was found. The best candidate is {height:.2f} m, but {why}."
-            f" {INSTEAD}",
-            reason=reason, evidence=evidence,
-        )  # fmt: skip
+    is_one_sided = not LEAST_SHARE <= wet <= 1.0 - LEAST_SHARE or len(shore) == 0
+    for reason, is_refused, why in (
+        ("no_shoreline", is_one_sided, "nearly all of the cloud is on one side of it"),
+        ("bank", not LIFTS[0] <= lift <= LIFTS[1],
+         f"slopes change there by a factor of {1.0 + lift:.2f}, refraction gives about 1.36"),
+        ("weak", total < least, f"its evidence is {total:.0f}, and {least:.0f} is needed"),
+        ("contradictory", rival > most_rival * total,
+         f"its evidence is {total:.0f}, and {rival_m:.2f} m has {rival:.0f}, nearly as much"),
+        ("inconsistent", sigma_m > MOST_SIGMA_M, f"parts of the cloud differ by {sigma_m:.2f} m"),
+    ):  # fmt: skip
+        if is_refused:
+            height = peak.level_m + float(samples.xyz[:, :2].mean(axis=0) @ peak.tilt + origin[2])
+            raise GeometryError(
+                "water.not_found",
+                f"No water surface was found. The best candidate is {height:.2f} m, but {why}."
+                f" {INSTEAD}",
+                reason=reason, evidence=evidence,
+            )  # fmt: skip
     shore = shore[:: math.ceil(len(shore) / MOST_SHORELINE)] + origin
     centre = shore[:, :2].mean(axis=0)
     rise = float((centre - origin[:2]) @ peak.tilt + origin[2])
@@ -369,7 +365,7 @@ def _find_tilt(coarse: Scan) -> Tilted | None:
     angles = np.pi + np.arange(len(_WINDS)) * np.pi / 4.0
     directions = np.column_stack([np.cos(angles), np.sin(angles)])
     peaks = list[Peak]()
-    for tilt in (NO_TILT, *(slope * one for slope in TILTS for one in directions)):
+    for tilt in np.vstack([NO_TILT, *(slope * directions for slope in TILTS)]):
         at_middle = coarse.heights_m + samples.origin[2] + middle @ tilt
         gain = np.where(np.abs(at_middle) <= REACH_M, _gains(coarse, tilt), 0.0)
         row = int(np.argmax(gain))
@@ -581,16 +577,21 @@ def sample_cloud(xyz: FloatArray, rgb: npt.NDArray[Any] | None) -> Samples:
 
     Colours, shape (n, 3), are in any unit from zero up; equal ones count as none.
     """
+    from scipy import ndimage  # slow to import
+
     origin = xyz.min(axis=0)
     local = xyz - origin
-    cell_m = _cell_m(local)
-    cell = square_tiles(local, cell_m)
-    _, of_point, count = np.unique(cell, return_inverse=True, return_counts=True)
+    # cells of about `POINTS_PER_CELL`, at most `MOST_CELLS`; clouds seldom fill their bounding box
+    wanted = min(len(local) / POINTS_PER_CELL, MOST_CELLS)
+    cell_m = float(np.sqrt(max(np.prod(np.ptp(local[:, :2], axis=0)), 1e-6) / wanted))
+    for _ in range(_TRIES):
+        cell_m *= np.sqrt(len(np.unique(square_tiles(local, cell_m))) / wanted)
+    _, of_point, count = np.unique(
+        square_tiles(local, cell_m), return_inverse=True, return_counts=True
+    )
     of_point = of_point.reshape(-1)
     mean = [np.bincount(of_point, local[:, i]) / count for i in (0, 1)]
-    ordered = local[np.lexsort((local[:, 2], of_point)), 2]
-    first = np.cumsum(count) - count
-    median = (ordered[first + (count - 1) // 2] + ordered[first + count // 2]) / 2.0
+    median = ndimage.median(local[:, 2], of_point, np.arange(len(count)))
     ground = np.column_stack([*mean, median])
     colour = np.empty((0, 3))
     if rgb is not None and (rgb != rgb[:1]).any():
@@ -599,16 +600,6 @@ def sample_cloud(xyz: FloatArray, rgb: npt.NDArray[Any] | None) -> Samples:
         logs = np.log(light + 0.004 * white)  # a small part of white keeps black finite
         colour = np.column_stack([np.bincount(of_point, column) / count for column in logs.T])
     return Samples(ground, _smoothed(ground), colour, cell_m, origin)
-
-
-def _cell_m(local: FloatArray) -> float:
-    """Return the side of cells of about `POINTS_PER_CELL`, at most `MOST_CELLS` of them."""
-    wanted = min(len(local) / POINTS_PER_CELL, MOST_CELLS)
-    side = float(np.sqrt(max(np.prod(np.ptp(local[:, :2], axis=0)), 1e-6) / wanted))
-    for _ in range(_TRIES):  # clouds seldom fill their bounding box
-        held = len(np.unique(square_tiles(local, side)))
-        side *= np.sqrt(held / wanted)
-    return side
 
 
 def square_tiles(local: FloatArray, side_m: float) -> IntArray:
@@ -625,8 +616,5 @@ def _smoothed(ground: FloatArray) -> FloatArray:
     _, near = cKDTree(ground[:, :2]).query(ground[:, :2], k=k + 1)
     around = ground[np.asarray(near)[:, 1:]] - ground[:, None]
     design = np.concatenate([np.ones((*around.shape[:2], 1)), around[..., :2]], axis=2)
-    normal = np.einsum("mki,mkj->mij", design, design)
-    scale = np.trace(normal, axis1=1, axis2=2)[:, None, None]
-    right = np.einsum("mki,mk->mi", design, around[..., 2])
-    plane = np.linalg.solve(normal + 1e-9 * scale * np.eye(3), right[..., None])[..., 0]
-    return np.asarray(ground[:, 2] + plane[:, 0])
+    plane = np.linalg.pinv(design) @ around[..., 2:]
+    return np.asarray(ground[:, 2] + plane[:, 0, 0])
