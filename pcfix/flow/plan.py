@@ -11,11 +11,11 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.adjust.block import Unknowns, plain_block, restricted, well_seen
+from pcfix.adjust.block import Block, Unknowns, plain_block, restricted, well_seen
 from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import prepare, solved_cameras
@@ -72,16 +72,6 @@ PARTS = {
 """Parts of the error budget: their options, the colour in the figure, and the remedy."""
 
 
-class _Bed(NamedTuple):
-    """The points of a flat bed in three or more images, and their pixels there."""
-
-    truth: FloatArray
-    apparent: FloatArray
-    views: Views
-    image_xy: FloatArray
-    cameras: Cameras
-
-
 def plan_flight(
     *,
     options: PlanOptions | None = None,
@@ -131,18 +121,18 @@ def _predicted(given: PlanOptions, depth_m: float) -> Figures:
 
     If no precision of the poses is given, they are those of an adjustment through the water.
     """
-    bed = _bed(given, depth_m)
-    corrected, adjusted_m = _corrected(given, bed), 0.0
+    bed, apparent = _bed(given, depth_m)
+    corrected, adjusted_m = _corrected(given, bed, apparent), 0.0
     if given.sigma_centre == given.sigma_attitude == 0.0:
-        adjusted_m = _of_adjusted_poses(given, bed)
+        adjusted_m = _of_adjusted_poses(given, bed, apparent)
     sigma_m = float(np.hypot(_rms(corrected.sigma_z_m), adjusted_m))
-    parts_m = {part: _rms(_corrected(given, bed, part).sigma_z_m) for part in PARTS}
+    parts_m = {part: _rms(_corrected(given, bed, apparent, part).sigma_z_m) for part in PARTS}
     parts_m["poses"] = float(np.hypot(parts_m["poses"], adjusted_m))
-    share, left_m = _absorbed(given, bed)
+    share, left_m = _absorbed(given, bed, apparent)
     depth, tvu = np.array([depth_m]), COVERAGE_95 * sigma_m
     return Figures(
         depth_m=depth_m,
-        apparent_m=float(-bed.apparent[:, 2].mean()),  # as reconstructed with straight rays
+        apparent_m=float(-apparent[:, 2].mean()),  # as reconstructed with straight rays
         rays=float(corrected.ray_count.mean()),  # per point
         sigma_m=sigma_m,  # standard error of the corrected heights, rms over the bed
         parts_m=parts_m,  # of it; their squares add up
@@ -164,8 +154,11 @@ def _scene(given: PlanOptions, depth_m: float) -> SceneSettings:
     )  # fmt: skip
 
 
-def _bed(given: PlanOptions, depth_m: float) -> _Bed:
-    """Return the image points of a flat bed, and its apparent points by straight rays."""
+def _bed(given: PlanOptions, depth_m: float) -> tuple[Block, FloatArray]:
+    """Return points of a flat bed in three or more images, and its points by straight rays.
+
+    The block has their true places and error-free images.
+    """
     scene = _scene(given, depth_m)
     most = (MOST_BASES, MOST_SPACINGS) * np.array(scene.base_and_spacing_m)
     scene = replace(scene, area_m=tuple(np.minimum(scene.area_m, most).tolist()))
@@ -184,20 +177,24 @@ def _bed(given: PlanOptions, depth_m: float) -> _Bed:
     apparent = sight.intersected(sight.ideal)[seen]
     block = plain_block(site.true, TiePoints(sight.truth[seen], views, sight.ideal))
     block = restricted(block, well_seen(block))  # without images that hardly see the bed
-    views = Views(block.start, block.camera)
-    return _Bed(block.xyz, apparent, views, block.image_xy, block.cameras)
+    return replace(
+        block,
+        sigma_px=np.full(len(block.camera), max(given.sigma_image, 0.01)),
+        gnss_xyz=block.cameras.centres,
+        gnss_sigma_m=np.full((len(block.cameras), 3), given.gnss_sigma),
+    ), apparent
 
 
-def _corrected(given: PlanOptions, bed: _Bed, part: str = "") -> Correction:
+def _corrected(given: PlanOptions, bed: Block, apparent: FloatArray, part: str = "") -> Correction:
     """Correct the bed, with standard errors of the whole budget or of one part."""
     off: dict[str, Any] = {}
     if part:
         names = {one.name for one in options_of(BudgetOptions)}
         off = dict.fromkeys(names.difference(PARTS[part][0]), 0.0)
-    options = replace(_refraction(given), **off)
+    views, options = Views(bed.start, bed.camera), replace(_refraction(given), **off)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PcfixWarning)
-        return correct_points(bed.apparent, bed.cameras, 0.0, views=bed.views, options=options)
+        return correct_points(apparent, bed.cameras, 0.0, views=views, options=options)
 
 
 def _refraction(given: PlanOptions) -> RefractionOptions:
@@ -208,49 +205,34 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _of_adjusted_poses(given: PlanOptions, bed: _Bed) -> float:
+def _of_adjusted_poses(given: PlanOptions, bed: Block, apparent: FloatArray) -> float:
     """Return what the errors of poses add after `pcfix adjust`, with a calibrated lens."""
-    problem, start = _prepared(given, bed, through_water=True)
-    members, found = precision_of(problem, start).members, None
+    water, wet = WaterPlane(0.0), np.ones(len(bed.xyz), np.bool_)
+    index = given.refractive_index
+    block = replace(bed, water=water, refractive_index=index, wet=wet)
+    members, found = precision_of(*prepare(block, Unknowns(lens=()))).members, None
     if members is not None:
-        survey = Survey(WaterPlane(0.0), bed.cameras, _refraction(given).part(ScienceOptions))
-        classes = np.zeros(len(bed.truth), np.uint8)
-        sample = Points(bed.apparent, None, classes, views=bed.views)
-        found = pose_errors(sample, survey, members, None)
+        survey = Survey(water, bed.cameras, _refraction(given).part(ScienceOptions))
+        classes, views = np.zeros(len(apparent), np.uint8), Views(bed.start, bed.camera)
+        found = pose_errors(Points(apparent, None, classes, views=views), survey, members, None)
     return float("nan") if found is None else found.middle_m
 
 
-def _absorbed(given: PlanOptions, bed: _Bed) -> tuple[float, float]:
+def _absorbed(given: PlanOptions, bed: Block, apparent: FloatArray) -> tuple[float, float]:
     """Return the absorbed share of the refraction, and the bias of the bed with such poses.
 
     The share is of the misfit of straight rays at the true poses; the bias, true minus corrected
     height, is of the bed corrected with the adjusted poses.
     """
-    problem, start = _prepared(given, bed, through_water=False)
+    problem, start = prepare(replace(bed, xyz=apparent), Unknowns(lens=("f",)))
     found = solve(problem, start)
     before, after = (_rms(residuals(one.state, problem.given)) for one in (start, found))
-    apparent, cameras = found.state.xyz + problem.origin, solved_cameras(problem, found)
-    moved = _corrected(given, bed._replace(apparent=apparent, cameras=cameras))
+    adjusted = replace(bed, cameras=solved_cameras(problem, found))
+    moved = _corrected(given, adjusted, found.state.xyz + problem.origin)
     known = moved.corrected
-    off = bed.truth[known, 2] - moved.xyz[known, 2]
+    off = bed.xyz[known, 2] - moved.xyz[known, 2]
     share = 1.0 - after / before if before > NOTHING_PX else 0.0
     return share, float(off.mean())
-
-
-def _prepared(given: PlanOptions, bed: _Bed, *, through_water: bool) -> Any:
-    """Return the adjustment of the block, at the true poses."""
-    water = WaterPlane(0.0) if through_water else None
-    xyz = bed.truth if through_water else bed.apparent
-    ties = TiePoints(xyz, bed.views, bed.image_xy)
-    wet = np.full(len(bed.truth), through_water)
-    index = given.refractive_index if through_water else 1.0
-    block = replace(
-        plain_block(bed.cameras, ties, water, index, wet),
-        sigma_px=np.full(len(ties.image_xy), max(given.sigma_image, 0.01)),
-        gnss_xyz=bed.cameras.centres,
-        gnss_sigma_m=np.full((len(bed.cameras), 3), given.gnss_sigma),
-    )
-    return prepare(block, Unknowns(lens=() if through_water else ("f",)))
 
 
 def plan_text(plan: Figures) -> str:
