@@ -106,28 +106,18 @@ class CloudSample(Sums):
         known = self._known()
         if len(known) < LEAST_POINTS:
             return ()
-        water, doubts = known[:, 3], []
-        found, tilted = find_elsewhere(known[:, :3], water, known[:, 4:])
-        if found is not None:
-            off, level = found.level_m, float(np.median(water)) + found.level_m
-            sentence = (
-                f"The cloud's shoreline is {abs(off):.2f} m {'above' if off > 0.0 else 'below'} the"
-                f" given water, at about {level:.2f} m (standard error {found.sigma_level_m:.2f} m:"
-                f" {'; '.join(found.reasons)}). Check the level and its vertical datum, or try"
-                " --water auto."
-            )
-            code = "water.shoreline_level"
-            doubts.append(PcfixWarning(code, sentence, off_m=off, level_m=level))
-        if tilted is not None:
-            sentence = (
-                f"The cloud's shoreline rises to the {tilted.to} against the given water by"
-                f" {100.0 * tilted.slope:.2g} %, from {tilted.low_m:+.2f} to {tilted.high_m:+.2f}"
-                " m. The water flows or one of the two is tilted; measure shoreline points on"
-                " all sides and give them as --water."
-            )
-            code = "water.shoreline_tilt"
-            doubts.append(PcfixWarning(code, sentence, to=tilted.to, slope=tilted.slope))
-        return tuple(doubts)
+        water = known[:, 3]
+        found = find_elsewhere(known[:, :3], water, known[:, 4:])
+        if found is None:
+            return ()
+        off, level = found.level_m, float(np.median(water)) + found.level_m
+        sentence = (
+            f"The cloud's shoreline is {abs(off):.2f} m {'above' if off > 0.0 else 'below'} the"
+            f" given water, at about {level:.2f} m (standard error {found.sigma_level_m:.2f} m:"
+            f" {'; '.join(found.reasons)}). Check the level and its vertical datum, or try"
+            " --water auto."
+        )
+        return (PcfixWarning("water.shoreline_level", sentence, off_m=off, level_m=level),)
 
 
 def plausible(

@@ -107,14 +107,15 @@ def view_clouds(
         raise SettingError("option.missing", sentence, option="reference")
     paths = [check_input(cloud) for cloud in clouds]
     first, layers = view_of(paths[0]), list[_Layer]()
+    crs_of_all: Any = first.crs
     surface = None if given.water is None else find_surface(given.water, given, first).surface
     for path in paths:
         some, crs = _read(path, given.points)
-        check_same_crs(first.name, first.crs, str(path), crs)
+        check_same_crs(first.name, crs_of_all, str(path), crs)
         layers += some
     if given.reference is not None:
         target = read_reference(given.reference)
-        check_same_crs(first.name, first.crs, target.name, target.crs)
+        check_same_crs(first.name, crs_of_all, target.name, target.crs)
         step = 1 + len(target.xyz) // given.points
         layers.append(_Layer(f"reference {Path(target.name).name}", target.xyz[::step], {}))
     xyz = [one.xyz for one in layers]

@@ -17,7 +17,7 @@ from pcfix.options.survey import WaterCheckOptions
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, draw_cloud, label_plan, new_figure
 from pcfix.report.text import Plain, RowTable, aligned, filled, shoreline_rows
 from pcfix.water.auto import WaterProposal
-from pcfix.water.fit import ShoreFit, WaterFit
+from pcfix.water.fit import ShoreFit
 from pcfix.water.river import RiverFit
 from pcfix.water.surface import FoundSurface, surface_above
 
@@ -128,67 +128,49 @@ def water_text(report: WaterReport) -> str:
 
 
 def water_figure(found: FoundSurface, cloud_xyz: FloatArray) -> Figure:
-    """Draw cloud and shoreline in plan, and below the residuals of a fit, or the evidence."""
+    """Draw cloud and shoreline in plan, and below the surface along the shoreline points."""
     figure, (plan, side) = new_figure(8.0, 7.5, nrows=2, height_ratios=[3, 2])
     title, shown = str(found.surface), cloud_xyz
     if isinstance(found, WaterProposal):
         title = f"Water {found.level_m:.3f} ± {found.sigma_level_m:.3f} m"
         title, shown = f"{title}, confidence {found.confidence:.2f}", found.ground
     draw_cloud(figure, plan, shown, getattr(found, "level_m", None))
-    if isinstance(found, WaterProposal):
-        _draw_evidence(plan, side, found)
-    elif isinstance(found, WaterFit | RiverFit):
-        _draw_fit(plan, side, found)
+    if found.points is not None:
+        _draw_shoreline(plan, side, found, found.points)
     label_plan(plan, 20.0)
     plan.set_title(title)
     return figure
 
 
-def _draw_evidence(plan: Axes, side: Axes, found: WaterProposal) -> None:
-    """Draw the shoreline that was found in plan, and the evidence for each height."""
-    name = f"shoreline, {len(found.points):,} places"
-    plan.plot(*found.points[:, :2].T, ".", color="#c2185b", markersize=3, label=name)
-    reach = 2.0 * found.sigma_level_m
-    for name, gain in found.curves.items():
-        side.plot(found.curve_height_m, np.maximum(gain, 0.0), label=name)
-    side.axvline(found.level_m, color=WATER, label="water")
-    side.axvspan(found.level_m - reach, found.level_m + reach, color=WATER, alpha=0.3, linewidth=0)
-    shown = max(6.0, 4.0 * reach) * np.array([-1.0, 1.0]) + found.level_m
-    side.set(xlim=np.clip(shown, *found.curve_height_m[[0, -1]]), ylim=(0.0, None))
-    side.set(xlabel="Height of the water, if there (m)", ylabel="Evidence (log likelihood ratio)")
-    for axes in (plan, side):
-        axes.legend(loc="best")
-
-
-def _draw_fit(plan: Axes, side: Axes, fit: WaterFit | RiverFit) -> None:
-    """Draw the points of a fit in plan, and their heights along the river or their long side."""
-    points = fit.points
-    if isinstance(fit, RiverFit):
-        station, label = np.asarray(fit.axis.locate(points[:, :2])[0]), "Down the flow (m)"
+def _draw_shoreline(plan: Axes, side: Axes, found: FoundSurface, points: FloatArray) -> None:
+    """Draw shoreline points in plan, and their heights along the river or their long side."""
+    if isinstance(found, RiverFit):
+        station, label = np.asarray(found.axis.locate(points[:, :2])[0]), "Down the flow (m)"
     else:
         local = points[:, :2] - points[:, :2].mean(axis=0)
         station = local @ np.linalg.svd(local, full_matrices=False)[2][0]
         station, label = station - station.min(), "Along the points (m)"
     order = np.argsort(station)
-    height = fit.height_at(points[order, :2])
-    reach = 2.0 * fit.sigma_at(points[order, :2])
+    height = found.height_at(points[order, :2])
+    reach = 2.0 * np.asarray(found.sigma_at(points[order, :2]))
     side.plot(station[order], height, color=WATER, label="surface")
     look: dict[str, Any] = {"color": WATER, "alpha": 0.3, "label": "95 %"}
     side.fill_between(station[order], height - reach, height + reach, **look)
+    accepted = found.accepted if isinstance(found, ShoreFit) else np.ones(len(points), np.bool_)
     for rows, mark, colour, name in (
-        (fit.accepted, "o", AFTER, "accepted"),
-        (~fit.accepted, "x", BEFORE, "rejected"),
+        (accepted, "o", AFTER, "accepted"),
+        (~accepted, "x", BEFORE, "rejected"),
     ):
         if rows.any():
-            plan.plot(*points[rows, :2].T, mark, color=colour, markersize=5, label=name)
-            side.plot(station[rows], points[rows, 2], mark, color=colour, markersize=5)
+            plan.plot(*points[rows, :2].T, mark, color=colour, markersize=4, label=name)
+            side.plot(station[rows], points[rows, 2], mark, color=colour, markersize=4)
     side.set(xlabel=label, ylabel="Height (m)")
     side.legend(loc="best")
     plan.legend(loc="upper right", bbox_to_anchor=(1.0, 1.0))
 
 
 def found_picture(found: FoundSurface) -> Picture:
-    """Return the evidence for a level that was found in the cloud, for the page."""
-    alt = "How the water was found: shoreline in plan, and the evidence for each height."
+    """Return the picture of a surface that was found in the cloud, for the page."""
+    alt = "The shoreline that was found, in plan, and the heights along it."
     figure = water_figure(found, np.zeros((0, 3)))
     return Picture("water", "The water level found in the cloud", alt, figure)

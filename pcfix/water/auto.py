@@ -17,7 +17,6 @@ cheap.
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -50,8 +49,6 @@ class WaterProposal(FoundSurface):
     confidence: float  # 0 to 1, by how much the evidence exceeds what is refused
     evidence: dict[str, float]  # figures by name
     reasons: tuple[str, ...]  # the same in sentences
-    curve_height_m: FloatArray  # (h,), world heights; of a tilted surface, above `centre_xy`
-    curves: dict[str, FloatArray]  # (h,), gain (log likelihood ratio) of each cue at each height
     ground: FloatArray  # (c, 3), the cloud thinned to cells, metres, world frame
 
     def sigma_at(self, xy: FloatArray) -> FloatArray:
@@ -100,28 +97,27 @@ level. They are higher than for `find_water`, to avoid false alarms."""
 
 def find_elsewhere(
     xyz: FloatArray, water_m: FloatArray, rgb: npt.NDArray[Any] | None
-) -> tuple[WaterProposal | None, Tilted | None]:
-    """Return water that a cloud shows elsewhere than the given water surface, and its tilt if any.
+) -> WaterProposal | None:
+    """Return water that a cloud shows at another height than the given water surface.
 
     `water_m`, shape (n,), is the height of the given surface above each point. The heights found
     are above it; None if the cloud shows the water there, or nothing. The full search of
     `find_water` runs only if another height gains most.
     """
     samples = sample_cloud(np.column_stack([xyz[:, :2], xyz[:, 2] - water_m]), rgb)
-    found, tilted = None, None
-    with suppress(GeometryError):  # flat ground, or too little evidence
+    try:
         coarse = _scanned(samples)
-        tilted, gain = _find_tilt(coarse), _gains(coarse, NO_TILT)
-        here = gain[np.abs(coarse.heights_m + samples.origin[2]) <= DIFFERENT_M].max(initial=0.0)
-        if here <= MOST_RIVAL_AGREED * gain.max():
-            found = _judged(coarse)
-    if found is None:
-        return None, tilted
+        gain, heights = _gains(coarse, NO_TILT), coarse.heights_m + samples.origin[2]
+        if gain[np.abs(heights) <= DIFFERENT_M].max(initial=0.0) > MOST_RIVAL_AGREED * gain.max():
+            return None
+        found = _judged(coarse)
+    except GeometryError:  # flat ground, or too little evidence
+        return None
     differs = abs(found.level_m) > max(DIFFERENT_M, DIFFERENT_SIGMAS * found.sigma_level_m)
     sure = found.evidence["total gain"] >= LEAST_AGAINST or (
         found.confidence >= SURE_AGAINST and f"{SLOPE.name} amplitude" in found.evidence
     )
-    return found if differs and sure else None, tilted
+    return found if differs and sure else None
 
 
 LARGEST_TILT, USUAL_TILT = 0.006, 0.002
@@ -322,10 +318,9 @@ def _judged(coarse: Scan) -> WaterProposal:
             )  # fmt: skip
     shore = shore[:: math.ceil(len(shore) / MOST_SHORELINE)] + origin
     centre = shore[:, :2].mean(axis=0)
-    rise = float((centre - origin[:2]) @ peak.tilt + origin[2])
-    level, (b, c) = peak.level_m + rise, peak.tilt.tolist()
+    level = peak.level_m + float((centre - origin[:2]) @ peak.tilt + origin[2])
     return WaterProposal(
-        surface=WaterPlane(level - float(centre @ peak.tilt), b, c),
+        surface=WaterPlane(level - float(centre @ peak.tilt), *peak.tilt.tolist()),
         points=shore,
         sigma_level_m=sigma_m,
         centre_xy=centre,
@@ -334,52 +329,8 @@ def _judged(coarse: Scan) -> WaterProposal:
         confidence=float(min(1.0 - rival / total, 1.0 - math.exp(-total / (2.0 * least)))),
         evidence=evidence,
         reasons=tuple(sentences),
-        curve_height_m=coarse.heights_m + rise,
-        curves={sums.cue.name: gain_of(sums.shifted(peak.tilt))[0] for sums in coarse.cues},
         ground=samples.xyz + origin,
     )
-
-
-TILTS = (0.0025, 0.005, 0.0075, 0.01, 0.015, 0.02)
-REACH_M, LEAST_APART_M = 2.0, 0.3
-"""Largest distance from the given water in the middle of the cloud; least one from end to end."""
-LEAST_GAIN, MOST_LEFT, ABOUT_AS_GOOD = 100.0, 0.4, 0.9
-"""Least evidence of a tilted waterline; the largest share of it for the level one; and the share
-from which another tilt is as likely, as the tilt across a straight shore is unknown."""
-_WINDS = ("west", "south-west", "south", "south-east", "east", "north-east", "north", "north-west")
-
-
-class Tilted(NamedTuple):
-    """A waterline that is tilted against the given water."""
-
-    to: str  # the direction in which it rises
-    slope: float  # rise per metre
-    low_m: float  # lowest and highest place in the cloud, above the given water
-    high_m: float
-
-
-def _find_tilt(coarse: Scan) -> Tilted | None:
-    """Return the tilt of a waterline, if any; heights of `coarse` are above the given water."""
-    samples = coarse.samples
-    middle = np.median(samples.xyz[:, :2], axis=0)
-    angles = np.pi + np.arange(len(_WINDS)) * np.pi / 4.0
-    directions = np.column_stack([np.cos(angles), np.sin(angles)])
-    peaks = list[Peak]()
-    for tilt in np.vstack([NO_TILT, *(slope * directions for slope in TILTS)]):
-        at_middle = coarse.heights_m + samples.origin[2] + middle @ tilt
-        gain = np.where(np.abs(at_middle) <= REACH_M, _gains(coarse, tilt), 0.0)
-        row = int(np.argmax(gain))
-        peaks.append(Peak(float(coarse.heights_m[row]), tilt, float(gain[row])))
-    level, *peaks = peaks
-    least = ABOUT_AS_GOOD * max(one.score for one in peaks)
-    best = next(i for i, one in enumerate(peaks) if one.score >= least)  # the least tilt
-    peak, wind = peaks[best], _WINDS[best % len(_WINDS)]
-    if peak.score < LEAST_GAIN or level.score > MOST_LEFT * peak.score:
-        return None
-    heights = samples.xyz[peak.shore(samples), :2] @ peak.tilt + peak.level_m + samples.origin[2]
-    if len(heights) < 2 or np.ptp(heights) < LEAST_APART_M:
-        return None
-    return Tilted(wind, float(np.hypot(*peak.tilt)), float(heights.min()), float(heights.max()))
 
 
 LEAST_SIDE = 8.0  # least sum of weights of the cells of a tile above a height, and below

@@ -71,10 +71,6 @@ class WaterFit(ShoreFit):
     """Of `level_m` and `tilt`, shape (3, 3): zero for what the model does not have, NaN without
     redundancy. It does not include errors that all points share, as of a wrong datum."""
 
-    def height_at(self, xy: FloatArray) -> FloatArray:
-        """Return the height (m) of the surface at places (m, 2)."""
-        return np.asarray(self.level_m + (xy - self.centre_xy) @ self.tilt)
-
     def sigma_at(self, xy: FloatArray) -> FloatArray:
         """Return the standard error (m) of that height."""
         row = np.column_stack([np.ones(len(xy)), xy - self.centre_xy])
