@@ -76,15 +76,11 @@ def learn_regression(
     covered = ~np.isnan(apparent)
     if not covered.all():
         first = int(np.argmin(covered))
-        nearest, there = nearest_m[first], "the cloud has no submerged point"
-        if np.isfinite(nearest):
-            there = (
-                f"the nearest submerged point is {nearest:,.2f} m away, and {FEWEST}"
-                f" are needed within {radius:.2f} m"
-            )
         notes.append(
             f"{checks.where(first)}: {int((~covered).sum())} of {len(checks)} check depths have no"
-            f" bed around them: {there}. Check that they have the cloud's CRS and lie in the water."
+            f" bed around them: {FEWEST} submerged points are needed within {radius:.2f} m, the"
+            f" nearest is {nearest_m[first]:,.2f} m away. Check that they have the cloud's CRS and"
+            " lie in the water."
         )
         if covered.sum() < LEAST_COUNT:
             raise GeometryError("check_depths.no_bed", notes[0], covered=int(covered.sum()))

@@ -238,7 +238,7 @@ def _absorbed(given: PlanOptions, bed: Block, apparent: FloatArray) -> tuple[flo
 def plan_text(plan: Figures) -> str:
     """Return the plan as the terminal shows it."""
     given, deepest = plan.options, max(plan.depths, key=lambda one: float(one.depth_m))
-    tilt, largest = given["obliques"], max(deepest.parts_m, key=deepest.parts_m.get)
+    tilt = given["obliques"]
     flight = [
         ("Images", f"{plan.images:,}, every {plan.base_m:.1f} m in strips {plan.spacing_m:.1f} m"
          f" apart{'' if tilt is None else f', with obliques of {tilt:g} deg'}"),
@@ -259,17 +259,11 @@ def plan_text(plan: Figures) -> str:
         for one in plan.depths
     ]  # fmt: skip
     title = f"Standard errors of the corrected bed in cm (refractive index {given['index']:g}):"
-    rows = [
-        ("poses", f"after 'pcfix adjust' with GNSS of {given['gnss_sigma']:g} m and a calibrated"
-         " lens, unless --sigma-centre or --sigma-attitude are given"),
-        ("absorbed", "the share of the refraction that an ordinary bundle adjustment absorbs, at"
-         " worst: no land, no control points"),
-        ("bias", "true minus corrected height with such poses"),
-        ("Largest part", f"at {deepest.depth_m:g} m: {PARTS[largest][2]}"),
-    ]  # fmt: skip
-    notes = [f"  {label:<13} {text}" for label, text in rows]
-    return "\n".join([aligned(head, flight), "", title, *Table(title, header, errors).lines(),
-                      *notes])  # fmt: skip
+    largest = max(deepest.parts_m, key=deepest.parts_m.get)
+    advice = f"The largest part of the error at {deepest.depth_m:g} m is {PARTS[largest][2]}."
+    return "\n".join([
+        aligned(head, flight), "", title, *Table(title, header, errors).lines(), "", advice,
+    ])  # fmt: skip
 
 
 def plan_figure(plan: Figures, given: PlanOptions, cameras: Cameras) -> Figure:
