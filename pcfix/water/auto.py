@@ -120,7 +120,7 @@ def find_elsewhere(
     return found if differs and sure else None
 
 
-LARGEST_TILT, USUAL_TILT = 0.006, 0.002
+LARGEST_TILT = 0.006
 TILT_STEP_M, MOST_TILT_STEPS = 0.15, 9
 TILT_GAIN = 6.0
 COARSE_M, FINE_M, MOST_HEIGHTS = 0.04, 0.01, 800
@@ -144,7 +144,7 @@ class Peak(NamedTuple):
 
     level_m: float
     tilt: FloatArray
-    score: float  # total gain of its cues, reduced for unusual tilts
+    score: float  # total gain of its cues
 
     def below(self, samples: Samples) -> FloatArray:
         """Return the depth of the smooth ground of the cells below the surface, shape (m,)."""
@@ -199,10 +199,9 @@ def _best(scan: Scan, tilts: FloatArray) -> Peak:
     """Return the best height and tilt among tilts of shape (k, 2)."""
     found = []
     for tilt in tilts:
-        total, total_tilt = _gains(scan, tilt), scan.tilt + tilt
-        row = int(np.argmax(total))
-        unusual = 0.5 * float(total_tilt @ total_tilt) / USUAL_TILT**2
-        found.append(Peak(float(scan.heights_m[row]), total_tilt, float(total[row]) - unusual))
+        gain = _gains(scan, tilt)
+        row = int(np.argmax(gain))
+        found.append(Peak(float(scan.heights_m[row]), scan.tilt + tilt, float(gain[row])))
     return max(found, key=lambda peak: peak.score)
 
 
@@ -463,7 +462,7 @@ def tile_moments(
     return sums, count
 
 
-LEAST_TILE_CELLS, LEAST_TILE_RELIEF_M = 40, 0.1
+LEAST_TILE_CELLS = 40
 
 
 def cue_moments(
@@ -494,8 +493,6 @@ def cue_moments(
             # the smooth ground passes the height of the break: with the heights themselves, noise
             # would be on both sides of the equation and hide the break
             at = smooth @ np.linalg.lstsq(smooth, y, rcond=None)[0]
-            if np.ptp(at) < LEAST_TILE_RELIEF_M:
-                continue
         tile_sums, tile_count = tile_moments(smooth, y, at, heights_m, cue)
         if tile_count.any():
             found.append((tile_sums, tile_count, xy[rows].mean(axis=0)))
