@@ -225,19 +225,17 @@ def _directions(cameras: Cameras, xyz: FloatArray) -> Iterator[Finding]:
     """Compare the yaw of near-nadir images with the direction of the flight lines."""
     # steps between near-nadir images that follow each other
     step = np.diff(cameras.centres[:, :2], axis=0)
-    length, rows = np.hypot(*step.T), np.zeros(0, np.int64)
+    length, turn, read = np.hypot(*step.T), None, None
     if cameras.rotations is not None and len(length):
         steep = cameras.rotations[:, 2, 2] < -STEEP_COSINE
         usual = 2.0 * np.median(length)
         rows = np.flatnonzero((length > 0.0) & (length < usual) & steep[:-1] & steep[1:])
-    if cameras.rotations is None or len(rows) < LEAST_STEPS:
-        yield "unchecked", "yaw (no flight lines with it)"
-        return
-    top = -cameras.rotations[rows, 1]  # direction of the upper edge of the image, in the world
-    heading, yaw = np.arctan2(*step[rows].T), np.arctan2(top[:, 0], top[:, 1])
-    turn, read = _common(heading - yaw), _common(heading - np.degrees(yaw))
+        if len(rows) >= LEAST_STEPS:
+            top = -cameras.rotations[rows, 1]  # direction of the upper edge, world frame
+            heading, yaw = np.arctan2(*step[rows].T), np.arctan2(top[:, 0], top[:, 1])
+            turn, read = _common(heading - yaw), _common(heading - np.degrees(yaw))
     if turn is None:
-        yield "unchecked", "yaw (it does not follow the flight lines)"
+        yield "unchecked", "yaw (no flight lines with it)"
     elif abs(turn) <= MOST_TURN_DEG:
         yield "fits", "yaw along the flight lines"
     elif read is not None and abs(read) <= MOST_TURN_DEG:
