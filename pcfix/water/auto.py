@@ -108,7 +108,8 @@ def find_elsewhere(
     try:
         coarse = _scanned(samples)
         gain, heights = _gains(coarse, NO_TILT), coarse.heights_m + samples.origin[2]
-        if gain[np.abs(heights) <= DIFFERENT_M].max(initial=0.0) > MOST_RIVAL_AGREED * gain.max():
+        here = gain[np.abs(heights) <= DIFFERENT_M].max(initial=0.0)
+        if gain.max() < LEAST_AGREED or here > MOST_RIVAL_AGREED * gain.max():
             return None
         found = _judged(coarse)
     except GeometryError:  # flat ground, or too little evidence
