@@ -148,7 +148,7 @@ def sample_of(path, above_m):
     """Return the sample of a cloud under water that is this much above `LEVEL_M`."""
     sample, row, view = CloudSample(), 0, view_of(path)
     for points in view.chunks():
-        water = LEVEL_M + above_m(points.xyz) + np.zeros(len(points.xyz))
+        water = np.full(len(points.xyz), LEVEL_M + above_m)
         sample += CloudSample.of(points, water, row, view.points)
         row += len(points.xyz)
     return replace(sample, every=max(1.0, view.points // SAMPLE_POINTS))
@@ -156,7 +156,7 @@ def sample_of(path, above_m):
 
 @pytest.mark.parametrize(("off_m", "found_m"), [(0.0, []), (3.0, [-3.03])])
 def test_shoreline_of_the_cloud(off_m, found_m):
-    doubts = sample_of(SCENE / "cloud.laz", lambda xyz: off_m).level_doubts()
+    doubts = sample_of(SCENE / "cloud.laz", off_m).level_doubts()
     assert [doubt.code for doubt in doubts] == ["water.shoreline_level"] * len(found_m)
     assert [doubt.values["off_m"] for doubt in doubts] == pytest.approx(found_m, abs=0.005)
 
@@ -184,7 +184,7 @@ def test_real_blocks(name):
     path, view = RENDERED.parent / cameras, view_of(RENDERED.parent / cloud)
     inputs = Inputs(cameras=path, water=0.0)
     above_m = np.nan if level is None else level - LEVEL_M
-    sample = sample_of(RENDERED.parent / cloud, lambda xyz: np.full(len(xyz), above_m))
+    sample = sample_of(RENDERED.parent / cloud, above_m)
     ties = quick_ties(inputs, view.crs)
     block = inputs.block(view.crs)[0]
     flight = {"file": path, "water_m": level, "every": sample.every}
