@@ -29,7 +29,7 @@ from pcfix.lens.algebra import (
     transposed_times,
     vector,
 )
-from pcfix.lens.imaging import distorted, image_and_gradients, in_plane, undistorted
+from pcfix.lens.imaging import distorted, image_and_gradients, plane_and_gradients, undistorted
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.port.light import BY_PORT, through_port
 from pcfix.refract.rays import direction, lay, light_and_gradients, light_path, plane_at, settle
@@ -253,7 +253,7 @@ def lens_gradients(c: FloatArray, ahead: FloatArray, codes: IntArray, out: Float
     For a lens whose formula goes from the image to the plane (`inverse`), x' solves B(x') = x, so
     that d x' = -J^-1 d B.
     """
-    px, py = in_plane(c, ahead[0], ahead[1], ahead[2])
+    px, py, _ = plane_and_gradients(c, ahead[0], ahead[1], ahead[2])
     px, py = px - c[formulas.CENTRE_X], py - c[formulas.CENTRE_Y]
     inverse = c[formulas.INVERSE] != 0.0
     if inverse:

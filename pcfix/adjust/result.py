@@ -38,7 +38,7 @@ from pcfix.adjust.problem import (
 )
 from pcfix.errors import PcfixWarning, plain
 from pcfix.model import BoolArray, Cameras, FloatArray, WaterPlane, WaterSurface
-from pcfix.port.shapes import Port, spec_of
+from pcfix.port.shapes import Port
 from pcfix.water.surface import surface_above
 
 Source = Literal["tie points", "cloud"]
@@ -337,7 +337,7 @@ def _port(a: Adjusted) -> Plain | None:
     free = zip(WATER_NAMES, a.unknowns.water_sigma, strict=True)
     of_port = ("index", *WATER_NAMES[PORT:])
     names = [name for name, sigma in free if sigma and name in of_port]
-    return {"port": spec_of(a.port), **_numbers(a, names)}
+    return {"port": str(a.port), **_numbers(a, names)}
 
 
 def _numbers(a: Adjusted, names: Sequence[str]) -> dict[str, Plain]:

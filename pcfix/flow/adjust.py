@@ -53,7 +53,7 @@ from pcfix.model import (
 )
 from pcfix.options.declare import File, taken
 from pcfix.options.survey import WATER_UNKNOWNS, AdjustOptions
-from pcfix.port.shapes import FlatPort, Port, spec_of
+from pcfix.port.shapes import FlatPort, Port
 from pcfix.report.adjustment import adjustment_page
 from pcfix.water.index import index_of
 
@@ -321,7 +321,7 @@ def correct_words(found: Adjusted, model: File, out_dir: File, options: AdjustOp
     if options.port is not None:  # before a port no cloud is transferred: it is reconstructed
         moved = found.port if {"distance", "centre"} & set(options.free) else None
         words[2] = "CLOUD.laz"
-        return shlex.join([*words, "--port", spec_of(moved) if moved else str(options.port)])
+        return shlex.join([*words, "--port", str(moved or options.port)])
     water = water_word(options.water)
     if isinstance(found.water, WaterPlane) or (out / WATER_FILE).exists():
         water, plane = str(out / WATER_FILE), found.water

@@ -28,11 +28,7 @@ def regression_of(
     path, where = inputs.check_depths, ""
     if inputs.regression is not None:
         found = read_regression(inputs.regression)
-        fitted = f", fitted to {found.source}" if found.source else ""
-        where = (
-            f" It comes from {inputs.regression}{fitted}; whether it holds for this cloud"
-            " is not checked."
-        )
+        where = f" It comes from {inputs.regression}; whether it fits this cloud is not checked."
     else:
         found = learn_regression(path, parts_of(chunks, survey.water), survey.settings)
         source = f"{Path(path).name} on {Path(view.name).name}, water {survey.water}"
@@ -76,15 +72,11 @@ def learn_regression(
     covered = ~np.isnan(apparent)
     if not covered.all():
         first = int(np.argmin(covered))
-        nearest, there = nearest_m[first], "the cloud has no submerged point"
-        if np.isfinite(nearest):
-            there = (
-                f"the nearest submerged point is {nearest:,.2f} m away, and {FEWEST}"
-                f" are needed within {radius:.2f} m"
-            )
         notes.append(
             f"{checks.where(first)}: {int((~covered).sum())} of {len(checks)} check depths have no"
-            f" bed around them: {there}. Check that they have the cloud's CRS and lie in the water."
+            f" bed around them: {FEWEST} submerged points are needed within {radius:.2f} m, the"
+            f" nearest is {nearest_m[first]:,.2f} m away. Check that they have the cloud's CRS and"
+            " lie in the water."
         )
         if covered.sum() < LEAST_COUNT:
             raise GeometryError("check_depths.no_bed", notes[0], covered=int(covered.sum()))

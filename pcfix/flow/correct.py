@@ -22,8 +22,7 @@ from pcfix.flow.inputs import CameraInputs, Inputs, paths_in, transfer_between
 from pcfix.flow.planning import plan_correction, plan_of, read_inputs
 from pcfix.flow.plausibility import CloudSample, Plausible, plausible
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
-from pcfix.flow.shore import write_shoreline
-from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
+from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of, write_shoreline
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps, part_report

@@ -94,31 +94,29 @@ def diagnose_in_passing(
         values = {} if likely is None else {"likely_error_m": likely}
         warning = PcfixWarning("poses.absorbed", sentence, command=command, **values)
         warnings.warn(warning, stacklevel=3)
+    words = (
+        "not checked for absorbed refraction: no tie points or GNSS positions of the file show it"
+        f" quickly; {EXPORT}"
+    )
     if decided is not None:
         did = "absorbed" if diagnosis.absorbed else "did not absorb"
         words = f"{did} the refraction, by {decided.name}{'; see the warning' * bool(sentence)}"
-    else:
-        why = f"no tie points or GNSS positions of the file show it quickly; {EXPORT}"
-        words = f"not checked for absorbed refraction: {why}"
     signs = diagnosis.as_dict()["signs"]
     return {"absorbed": diagnosis.absorbed, "words": words, "signs": signs}, warning
 
 
 def quick_ties(inputs: Inputs, crs: Any) -> TiePoints | None:
     """Return the tie points of `ties_of` if reading them takes no more than a second or two."""
-    path = None if isinstance(inputs.cameras, Cameras) else Path(inputs.cameras)
+    if isinstance(inputs.cameras, Cameras) or inputs.cameras is None:
+        return None
+    path = Path(inputs.cameras)
+    folder = path.with_suffix(".files") if path.suffix == ".psx" else path
     try:
-        return None if path is None or _size_of(path) > QUICK_BYTES else ties_of(inputs, crs)
+        files = [one for one in folder.rglob("*") if one.is_file()] if folder.is_dir() else [path]
+        is_quick = sum(one.stat().st_size for one in files) <= QUICK_BYTES
+        return ties_of(inputs, crs) if is_quick else None
     except (PcfixError, OSError):  # this check stops no correction
         return None
-
-
-def _size_of(path: Path) -> int:
-    """Return the size of a camera file with the files that belong to it."""
-    folder = path.with_suffix(".files") if path.suffix == ".psx" else path
-    if folder.is_dir():
-        return sum(one.stat().st_size for one in folder.rglob("*") if one.is_file())
-    return path.stat().st_size
 
 
 def has_datum(cameras: Cameras, name: str) -> bool:

@@ -14,8 +14,7 @@ import shapely
 from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
 from pcfix.flow.request import SURFACE, RunFolder
 from pcfix.flow.runner import Progress
-from pcfix.flow.shore import shoreline_layer
-from pcfix.flow.surfaces import points_of, view_of
+from pcfix.flow.surfaces import points_of, shoreline_layer, view_of
 from pcfix.grid.colours import hillshade, relief_colours
 from pcfix.grid.lattice import round_resolution
 from pcfix.grid.maps import contours, depth_interval

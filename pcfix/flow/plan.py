@@ -11,11 +11,11 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.adjust.block import Unknowns, plain_block, restricted, well_seen
+from pcfix.adjust.block import Block, Unknowns, plain_block, restricted, well_seen
 from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import prepare, solved_cameras
@@ -70,19 +70,6 @@ PARTS = {
               "poses: use RTK or more control points"),
 }  # fmt: skip
 """Parts of the error budget: their options, the colour in the figure, and the remedy."""
-USUAL_OVERLAP, USUAL_SIDELAP = 0.75, 0.65
-"""Of Mulsow's flights over lakes (2024)."""
-LARGE_SHARE = 0.5
-
-
-class _Bed(NamedTuple):
-    """The points of a flat bed in three or more images, and their pixels there."""
-
-    truth: FloatArray
-    apparent: FloatArray
-    views: Views
-    image_xy: FloatArray
-    cameras: Cameras
 
 
 def plan_flight(
@@ -91,12 +78,12 @@ def plan_flight(
     progress: Callable[[int, int], None] | None = None,
     **keywords: Any,
 ) -> Figures:
-    """Predict the accuracy of a planned flight, and what would improve it.
+    """Predict the accuracy of a planned flight.
 
     Parameters
     ----------
     options, progress
-        See `pcfix.correct_file`; progress is in beds and alternatives.
+        See `pcfix.correct_file`; progress is in depths.
 
     Examples
     --------
@@ -108,62 +95,44 @@ def plan_flight(
     given = taken(PlanOptions, options, keywords, "plan_flight")
     given = replace(given, index=index_of(given.index, given.index_formula)[0])
     check_summary(given)
-    deepest_m = max(given.depth)
-    # other flights, each with its changed option
-    overlap, height = 0.5 + 0.5 * given.overlap, round(0.7 * given.height, 1)
-    changes: list[dict[str, Any]] = [{"height": height}]
-    changes += [{"overlap": overlap}] if overlap <= 0.95 else []
-    changes += [{"obliques": 20.0}] if given.obliques is None else []
-    exact = given.sigma_level is not None and given.sigma_level <= 0.01
-    changes += [] if exact else [{"sigma_level": 0.01}]
-    beds, tried = list[Figures](), list[Figures]()
-
-    def step() -> None:
-        if progress is not None:
-            progress(len(beds) + len(tried), len(given.depth) + len(changes))
-
+    beds = list[Figures]()
     with threads(1):  # for so few points, threads do not pay
         for depth_m in given.depth:
             beds.append(_predicted(given, depth_m))
-            step()
-        for change in changes:
-            other = replace(given, **change)
-            images = len(lay_out(_scene(other, deepest_m)).true)
-            words = " ".join(f"--{name.replace('_', '-')} {v:g}" for name, v in change.items())
-            sigma_m = _sigma(other, _bed(other, deepest_m))[1]
-            tried.append(Figures(change=words, images=images, sigma_m=sigma_m))
-            step()
-    scene = _scene(given, deepest_m)
+            if progress is not None:
+                progress(len(beds), len(given.depth))
+    scene = _scene(given, max(given.depth))
     cameras = lay_out(scene).true  # as a drone would fly them, in strips along x from the origin
     base_m, spacing_m = scene.base_and_spacing_m
-    off_nadir = float(np.degrees(np.arctan(scene.optics.reach))) + (given.obliques or 0.0)
-    deepest = beds[given.depth.index(deepest_m)]
     plan = Figures(
         options=given.as_dict(),
         gsd_m=scene.gsd_m,  # at the water
         base_m=base_m,  # between images
         spacing_m=spacing_m,  # between strips
-        flattest_deg=off_nadir,  # largest incidence angle of the rays in the corners of the frames
         depths=beds,
-        alternatives=tried,  # standard errors of the deepest bed
         images=len(cameras),
-        advice=_advice(given, deepest, 90.0 - off_nadir),
     )
     write_summary(given, plan.as_dict(), lambda: plan_figure(plan, given, cameras))
     return plan
 
 
 def _predicted(given: PlanOptions, depth_m: float) -> Figures:
-    """Return the prediction for a flat bed of one depth."""
-    bed = _bed(given, depth_m)
-    corrected, sigma_m, adjusted_m = _sigma(given, bed)
-    parts_m = {part: _rms(_budget(given, bed, part).sigma_z_m) for part in PARTS}
+    """Return the prediction for a flat bed of one depth.
+
+    If no precision of the poses is given, they are those of an adjustment through the water.
+    """
+    bed, apparent = _bed(given, depth_m)
+    corrected, adjusted_m = _corrected(given, bed, apparent), 0.0
+    if given.sigma_centre == given.sigma_attitude == 0.0:
+        adjusted_m = _of_adjusted_poses(given, bed, apparent)
+    sigma_m = float(np.hypot(_rms(corrected.sigma_z_m), adjusted_m))
+    parts_m = {part: _rms(_corrected(given, bed, apparent, part).sigma_z_m) for part in PARTS}
     parts_m["poses"] = float(np.hypot(parts_m["poses"], adjusted_m))
-    share, left_m = _absorbed(given, bed)
+    share, left_m = _absorbed(given, bed, apparent)
     depth, tvu = np.array([depth_m]), COVERAGE_95 * sigma_m
     return Figures(
         depth_m=depth_m,
-        apparent_m=float(-bed.apparent[:, 2].mean()),  # as reconstructed with straight rays
+        apparent_m=float(-apparent[:, 2].mean()),  # as reconstructed with straight rays
         rays=float(corrected.ray_count.mean()),  # per point
         sigma_m=sigma_m,  # standard error of the corrected heights, rms over the bed
         parts_m=parts_m,  # of it; their squares add up
@@ -185,8 +154,11 @@ def _scene(given: PlanOptions, depth_m: float) -> SceneSettings:
     )  # fmt: skip
 
 
-def _bed(given: PlanOptions, depth_m: float) -> _Bed:
-    """Return the image points of a flat bed, and its apparent points by straight rays."""
+def _bed(given: PlanOptions, depth_m: float) -> tuple[Block, FloatArray]:
+    """Return points of a flat bed in three or more images, and its points by straight rays.
+
+    The block has their true places and error-free images.
+    """
     scene = _scene(given, depth_m)
     most = (MOST_BASES, MOST_SPACINGS) * np.array(scene.base_and_spacing_m)
     scene = replace(scene, area_m=tuple(np.minimum(scene.area_m, most).tolist()))
@@ -205,21 +177,24 @@ def _bed(given: PlanOptions, depth_m: float) -> _Bed:
     apparent = sight.intersected(sight.ideal)[seen]
     block = plain_block(site.true, TiePoints(sight.truth[seen], views, sight.ideal))
     block = restricted(block, well_seen(block))  # without images that hardly see the bed
-    views = Views(block.start, block.camera)
-    return _Bed(block.xyz, apparent, views, block.image_xy, block.cameras)
+    return replace(
+        block,
+        sigma_px=np.full(len(block.camera), max(given.sigma_image, 0.01)),
+        gnss_xyz=block.cameras.centres,
+        gnss_sigma_m=np.full((len(block.cameras), 3), given.gnss_sigma),
+    ), apparent
 
 
-def _budget(given: PlanOptions, bed: _Bed, part: str = "") -> Correction:
+def _corrected(given: PlanOptions, bed: Block, apparent: FloatArray, part: str = "") -> Correction:
     """Correct the bed, with standard errors of the whole budget or of one part."""
-    options = _refraction(given)
+    off: dict[str, Any] = {}
     if part:
-        off: dict[str, Any] = {
-            one.name: 0.0 for one in options_of(BudgetOptions) if one.name not in PARTS[part][0]
-        }
-        options = replace(options, **off)
+        names = {one.name for one in options_of(BudgetOptions)}
+        off = dict.fromkeys(names.difference(PARTS[part][0]), 0.0)
+    views, options = Views(bed.start, bed.camera), replace(_refraction(given), **off)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PcfixWarning)
-        return correct_points(bed.apparent, bed.cameras, 0.0, views=bed.views, options=options)
+        return correct_points(apparent, bed.cameras, 0.0, views=views, options=options)
 
 
 def _refraction(given: PlanOptions) -> RefractionOptions:
@@ -230,70 +205,43 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _sigma(given: PlanOptions, bed: _Bed) -> tuple[Correction, float, float]:
-    """Return a corrected bed, its standard error, and the part from adjusted poses.
-
-    If no precision of the poses is given, they are those of an adjustment through the water.
-    """
-    has_no_sigma = given.sigma_centre == given.sigma_attitude == 0.0
-    whole, adjusted = _budget(given, bed), _of_adjusted_poses(given, bed) if has_no_sigma else 0.0
-    return whole, float(np.hypot(_rms(whole.sigma_z_m), adjusted)), adjusted
-
-
-def _of_adjusted_poses(given: PlanOptions, bed: _Bed) -> float:
+def _of_adjusted_poses(given: PlanOptions, bed: Block, apparent: FloatArray) -> float:
     """Return what the errors of poses add after `pcfix adjust`, with a calibrated lens."""
-    problem, start = _prepared(given, bed, through_water=True)
-    members = precision_of(problem, start).members
-    if members is None:
-        return float("nan")
-    survey = Survey(WaterPlane(0.0), bed.cameras, _refraction(given).part(ScienceOptions))
-    classes = np.zeros(len(bed.truth), np.uint8)
-    sample = Points(bed.apparent, None, classes, views=bed.views)
-    found = pose_errors(sample, survey, members, None)
+    water, wet = WaterPlane(0.0), np.ones(len(bed.xyz), np.bool_)
+    index = given.refractive_index
+    block = replace(bed, water=water, refractive_index=index, wet=wet)
+    members, found = precision_of(*prepare(block, Unknowns(lens=()))).members, None
+    if members is not None:
+        survey = Survey(water, bed.cameras, _refraction(given).part(ScienceOptions))
+        classes, views = np.zeros(len(apparent), np.uint8), Views(bed.start, bed.camera)
+        found = pose_errors(Points(apparent, None, classes, views=views), survey, members, None)
     return float("nan") if found is None else found.middle_m
 
 
-def _absorbed(given: PlanOptions, bed: _Bed) -> tuple[float, float]:
+def _absorbed(given: PlanOptions, bed: Block, apparent: FloatArray) -> tuple[float, float]:
     """Return the absorbed share of the refraction, and the bias of the bed with such poses.
 
     The share is of the misfit of straight rays at the true poses; the bias, true minus corrected
     height, is of the bed corrected with the adjusted poses.
     """
-    problem, start = _prepared(given, bed, through_water=False)
+    problem, start = prepare(replace(bed, xyz=apparent), Unknowns(lens=("f",)))
     found = solve(problem, start)
     before, after = (_rms(residuals(one.state, problem.given)) for one in (start, found))
-    apparent, cameras = found.state.xyz + problem.origin, solved_cameras(problem, found)
-    moved = _budget(given, bed._replace(apparent=apparent, cameras=cameras))
+    adjusted = replace(bed, cameras=solved_cameras(problem, found))
+    moved = _corrected(given, adjusted, found.state.xyz + problem.origin)
     known = moved.corrected
-    off = bed.truth[known, 2] - moved.xyz[known, 2]
+    off = bed.xyz[known, 2] - moved.xyz[known, 2]
     share = 1.0 - after / before if before > NOTHING_PX else 0.0
     return share, float(off.mean())
-
-
-def _prepared(given: PlanOptions, bed: _Bed, *, through_water: bool) -> Any:
-    """Return the adjustment of the block, at the true poses."""
-    water = WaterPlane(0.0) if through_water else None
-    xyz = bed.truth if through_water else bed.apparent
-    ties = TiePoints(xyz, bed.views, bed.image_xy)
-    wet = np.full(len(bed.truth), through_water)
-    index = _refraction(given).refractive_index if through_water else 1.0
-    block = replace(
-        plain_block(bed.cameras, ties, water, index, wet),
-        sigma_px=np.full(len(ties.image_xy), max(given.sigma_image, 0.01)),
-        gnss_xyz=bed.cameras.centres,
-        gnss_sigma_m=np.full((len(bed.cameras), 3), given.gnss_sigma),
-    )
-    return prepare(block, Unknowns(lens=() if through_water else ("f",)))
 
 
 def plan_text(plan: Figures) -> str:
     """Return the plan as the terminal shows it."""
     given, deepest = plan.options, max(plan.depths, key=lambda one: float(one.depth_m))
-    obliques = given["obliques"]
-    tilted = "" if obliques is None else f", with obliques of {obliques:g} deg"
+    tilt = given["obliques"]
     flight = [
         ("Images", f"{plan.images:,}, every {plan.base_m:.1f} m in strips {plan.spacing_m:.1f} m"
-         f" apart{tilted}"),
+         f" apart{'' if tilt is None else f', with obliques of {tilt:g} deg'}"),
         ("GSD", f"{100.0 * plan.gsd_m:.2f} cm at the water"),
     ]  # fmt: skip
     head = "Planned {:g} m above the water over {:g} x {:g} m".format(
@@ -311,50 +259,11 @@ def plan_text(plan: Figures) -> str:
         for one in plan.depths
     ]  # fmt: skip
     title = f"Standard errors of the corrected bed in cm (refractive index {given['index']:g}):"
-    table = ["", title, *Table(title, header, errors).lines()]
-    rows = [
-        ("poses", f"after 'pcfix adjust' with GNSS of {given['gnss_sigma']:g} m and a calibrated"
-         " lens, unless --sigma-centre or --sigma-attitude are given"),
-        ("absorbed", "the share of the refraction that an ordinary bundle adjustment absorbs, at"
-         " worst: no land, no control points"),
-        ("bias", "true minus corrected height with such poses"),
-        ("Now", f"{100.0 * deepest.sigma_m:.2f} cm at a depth of {deepest.depth_m:g} m"),
-        *((one.change, f"{100.0 * one.sigma_m:.2f} cm, {one.images:,} images")
-          for one in plan.alternatives),
-    ]  # fmt: skip
-    notes = [f"  {label:<18} {text}" for label, text in rows]
-    return "\n".join([aligned(head, flight), *table, *notes, "", *plan.advice])
-
-
-def _advice(given: PlanOptions, deepest: Figures, sun_deg: float) -> list[str]:
-    """Return advice on the flight and the day, a sentence or two each.
-
-    Skarlatos & Agrafiotis 2018, section 3.3, for sun, wind, water and bed; overlaps after Mulsow.
-    """
-    advice = []
-    if given.overlap < USUAL_OVERLAP or given.sidelap < USUAL_SIDELAP:
-        advice.append(
-            f"Overlap: fly {USUAL_OVERLAP:.0%} along and {USUAL_SIDELAP:.0%} across or more. Only"
-            f" {deepest.rays:.0f} images see a point of the bed."
-        )
-    part, most_m = max(deepest.parts_m.items(), key=lambda one: one[1])
-    if most_m**2 > LARGE_SHARE * deepest.sigma_m**2:
-        advice.append(f"Most of the error at {deepest.depth_m:g} m is {PARTS[part][2]}.")
-    mirror = "Frames can show its reflection at any height of the sun."
-    if sun_deg > 0.0:
-        mirror = f"Below {sun_deg:.0f} deg, no frame shows its reflection in calm water."
-    wind = "see what --sigma-waves 1 adds"
-    if given.sigma_waves:
-        wind = "'pcfix calm' combines frames taken through waves"
-    return [
-        *advice,
-        "Poses: keep land and control points in the block, and run 'pcfix adjust'. Without them an"
-        f" ordinary bundle adjustment absorbs {deepest.absorbed:.0%} of the refraction, and the bed"
-        f" is {abs(deepest.left_m):.2f} m off.",
-        "Sun: fly under an overcast sky, or within 60 minutes of dawn or dusk (90 in winter)."
-        f" {mirror}",
-        f"Wind: wait for a calm day; {wind}. The water must be clear, the bed textured.",
-    ]
+    largest = max(deepest.parts_m, key=deepest.parts_m.get)
+    advice = f"The largest part of the error at {deepest.depth_m:g} m is {PARTS[largest][2]}."
+    return "\n".join([
+        aligned(head, flight), "", title, *Table(title, header, errors).lines(), "", advice,
+    ])  # fmt: skip
 
 
 def plan_figure(plan: Figures, given: PlanOptions, cameras: Cameras) -> Figure:

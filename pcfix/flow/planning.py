@@ -23,34 +23,29 @@ from pcfix.flow.inputs import (
     paths_in,
     read_blocks,
 )
-from pcfix.flow.shore import check_shoreline
-from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
+from pcfix.flow.surfaces import (
+    CloudView,
+    Points,
+    check_shoreline,
+    own_water_of,
+    parts_of,
+    sample_of,
+)
 from pcfix.io.las.source import CHUNK_POINTS
 from pcfix.io.views import ViewMatch
 from pcfix.label.labelling import Labelling
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, Views, WaterPlane
 from pcfix.options.correct import CorrectOptions
 from pcfix.refract import learning
-from pcfix.refract.batch import (
-    FLAT_DEG,
-    UNLISTED,
-    Batch,
-    Learned,
-    Survey,
-    require_orientation,
-    stacked,
-)
-from pcfix.refract.methods import with_rays
+from pcfix.refract.batch import UNLISTED, Batch, Learned, Survey, require_orientation, stacked
 from pcfix.refract.occlusion import Occluder, OccluderBuilder, wants_occlusion
 from pcfix.refract.patches import PATCH_WIDTH, Squares
 from pcfix.refract.reconstructions import hint_of
 from pcfix.refract.regression import DepthRegression
 from pcfix.water.checks import check_above_water, check_tilt
 from pcfix.water.index import with_index
-from pcfix.water.surface import FoundSurface, is_submerged, surface_above
+from pcfix.water.surface import FoundSurface, surface_above
 
-FLAT_SHARE, FLAT_SAMPLE = 0.01, 20_000
-"""Share of the submerged points above which it is noted, and size of the sample for it."""
 HEIGHT_M = 100.0
 """Flying height if the water below the cameras is unknown, for the width of squares."""
 BED_POINTS_A_M2 = 5.0
@@ -259,7 +254,6 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
     hint = hint_of((plan.options.software or view.software,))
     if plan.kind is None:
         survey, verdicts = learning.learn_of_sample(sample, ties, hint, near)
-        notes += _note_flat(sample, survey)
         return replace(plan, survey=survey, verdicts=verdicts, notes=tuple(notes))
     survey = learning.with_matcher(sample, ties)
     if some_unlisted:
@@ -273,24 +267,6 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
         words = ["Points missing in the view list are corrected without it.", *map(str, verdicts)]
         notes.append(PcfixWarning("views.unlisted", " ".join(words)))
     return replace(plan, survey=survey, notes=tuple(notes))
-
-
-def _note_flat(sample: Batch, survey: Survey) -> list[PcfixWarning]:
-    """Note how many points only oblique images see, and where."""
-    rows = np.flatnonzero(is_submerged(sample.xyz[:, 2], sample.surface))
-    wet = replace(sample.take(rows[:: 1 + len(rows) // FLAT_SAMPLE]), survey=survey)
-    flat = with_rays(wet).seen_flat() if len(wet) else np.zeros(0, np.bool_)
-    if flat.sum() <= FLAT_SHARE * len(flat):
-        return []
-    low, high = np.percentile(wet.xyz[flat, :2], (2.0, 98.0), axis=0)
-    keeps = survey.settings.unsure == "keep"
-    sentence = (
-        f"About {100.0 * flat.mean():.0f} % of the submerged points have only rays beyond"
-        f" {FLAT_DEG:g} degrees, nearly all between {low[0]:.0f}, {low[1]:.0f} and"
-        f" {high[0]:.0f}, {high[1]:.0f}. Their depths are the least accurate; add nadir images"
-        + (", or flag them with --unsure withhold." if keeps else ".")
-    )
-    return [PcfixWarning("cloud.obliques_only", sentence, share=float(flat.mean()))]
 
 
 def _scanned(

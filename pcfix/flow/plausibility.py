@@ -6,8 +6,10 @@ cloud; what cannot be tested is listed as not checked. None of it changes a resu
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -36,18 +38,15 @@ STEEP_COSINE = 0.9
 MOST_RESIDUAL, MOST_HEIGHT = 0.01, 0.02
 """Of tie points in the images (of the frame), and from the cloud (of the flying height)."""
 TIES = 3_000
-SHIFTS, SHIFTED_POINTS = (0.1, 0.2, 0.4, 0.8), 500
-"""Of the flying height, and the points that are tested with shifted cameras."""
 MOST_PER_PIXEL, AROUND = 10.0, 8
 """Points of a cloud for each pixel of an image; matchers make one at most, or a few."""
+MOST_APART_M = 15.0
+"""In plan, from positions of the GNSS, in the median; without corrections these are 5 m off."""
+TAKE_OFF_M, MOST_SHARE = (-15.0, 25.0), 0.1
+"""How high above the water drones take off, and the share of their height that barometers err."""
 
-
-class Result(NamedTuple):
-    """The result of one test: what fits, what does not, or what could not be tested."""
-
-    fit: str = ""
-    doubt: PcfixWarning | None = None
-    unchecked: str = ""
+Finding: TypeAlias = tuple[Literal["fits", "doubts", "unchecked"], str | PcfixWarning]
+"""What one test found out: what fits, what does not, or what could not be tested."""
 
 
 class Plausible(NamedTuple):
@@ -66,7 +65,7 @@ class Plausible(NamedTuple):
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        lists = {n: list(map(str, getattr(self, n))) for n in ("fits", "doubts", "unchecked")}
+        lists = {name: list(map(str, some)) for name, some in self._asdict().items()}
         return {"words": str(self), **lists}
 
 
@@ -74,60 +73,51 @@ class Plausible(NamedTuple):
 class CloudSample(Sums):
     """Points of a cloud, evenly spread over its order, with the water above them."""
 
-    parts: tuple[FloatArray, ...] = ()  # (n, 3) each
-    water: tuple[FloatArray, ...] = ()  # (n,)
-    rgb: tuple[FloatArray, ...] = ()  # (n, 3), if the cloud has colours
+    parts: tuple[FloatArray, ...] = ()  # (n, 7) each: x, y, z, height of the water, colours
     every: float = field(default=1.0, metadata=SAME)  # points of the cloud for each of the sample
 
     @classmethod
     def of(cls, points: Points, water_m: FloatArray, row: int, count: int) -> CloudSample:
         """Return the sample of a chunk that begins at a row of a cloud of `count` points."""
         step = max(1, count // SAMPLE_POINTS)
-        rows = np.arange(-row % step, len(points.xyz), step)
-        rgb = () if points.rgb is None else (points.rgb[rows],)
-        return cls((points.xyz[rows],), (water_m[rows],), rgb, float(step))
+        rows = slice(-row % step, None, step)
+        xyz = points.xyz[rows]
+        rgb = np.zeros_like(xyz) if points.rgb is None else points.rgb[rows]
+        return cls((np.column_stack([xyz, water_m[rows], rgb]),), float(step))
+
+    def _known(self) -> FloatArray:
+        """Return the rows with a water surface above them."""
+        rows = np.vstack([np.zeros((0, 7)), *self.parts])
+        return np.asarray(rows[np.isfinite(rows[:, 3])])
 
     @property
     def water_m(self) -> float | None:
         """The median height of the water."""
-        water = np.concatenate([np.zeros(0), *self.water])
-        water = water[np.isfinite(water)]
-        return float(np.median(water)) if len(water) else None
+        known = self._known()
+        return float(np.median(known[:, 3])) if len(known) else None
 
     @property
     def xyz(self) -> FloatArray:
         """The points, shape (n, 3)."""
-        return np.vstack([np.zeros((0, 3)), *self.parts])
+        return np.vstack([np.zeros((0, 7)), *self.parts])[:, :3]
 
     def level_doubts(self) -> tuple[PcfixWarning, ...]:
         """Return warnings if the shoreline in the cloud is at another height than the water."""
-        xyz, water = self.xyz, np.concatenate([np.zeros(0), *self.water])
-        known = np.isfinite(water)
-        if known.sum() < LEAST_POINTS:
+        known = self._known()
+        if len(known) < LEAST_POINTS:
             return ()
-        rgb = np.vstack(self.rgb)[known] if self.rgb else None
-        found, tilted = find_elsewhere(xyz[known], water[known], rgb)
-        doubts = []
-        if found is not None:
-            off, level = found.level_m, float(np.median(water[known])) + found.level_m
-            sentence = (
-                f"The cloud's shoreline is {abs(off):.2f} m {'above' if off > 0.0 else 'below'} the"
-                f" given water, at about {level:.2f} m (standard error {found.sigma_level_m:.2f} m:"
-                f" {'; '.join(found.reasons)}). Check the level and its vertical datum, or try"
-                " --water auto."
-            )
-            code = "water.shoreline_level"
-            doubts.append(PcfixWarning(code, sentence, off_m=off, level_m=level))
-        if tilted is not None:
-            sentence = (
-                f"The cloud's shoreline rises to the {tilted.to} against the given water by"
-                f" {100.0 * tilted.slope:.2g} %, from {tilted.low_m:+.2f} to {tilted.high_m:+.2f}"
-                " m. The water flows or one of the two is tilted; measure shoreline points on"
-                " all sides and give them as --water."
-            )
-            code = "water.shoreline_tilt"
-            doubts.append(PcfixWarning(code, sentence, to=tilted.to, slope=tilted.slope))
-        return tuple(doubts)
+        water = known[:, 3]
+        found = find_elsewhere(known[:, :3], water, known[:, 4:])
+        if found is None:
+            return ()
+        off, level = found.level_m, float(np.median(water)) + found.level_m
+        sentence = (
+            f"The cloud's shoreline is {abs(off):.2f} m {'above' if off > 0.0 else 'below'} the"
+            f" given water, at about {level:.2f} m (standard error {found.sigma_level_m:.2f} m:"
+            f" {'; '.join(found.reasons)}). Check the level and its vertical datum, or try"
+            " --water auto."
+        )
+        return (PcfixWarning("water.shoreline_level", sentence, off_m=off, level_m=level),)
 
 
 def plausible(
@@ -151,72 +141,60 @@ def plausible(
     if not len(cameras) or not len(cloud):
         return Plausible((), level_doubts)
     xyz = np.ascontiguousarray(cloud[:: 1 + len(cloud) // IN_FRAMES])
-    flown = flying_heights(cameras, file, water_m) if file else Result()
-    heights = _heights(cameras, cloud, ties)
-    if heights.unchecked and any(flown):
-        heights = Result()
-    results = [
+    found: dict[str, list[Any]] = {"fits": [], "doubts": [*level_doubts], "unchecked": []}
+    flown = list(_flying_heights(cameras, file, water_m)) if file else []
+    for kind, what in chain(
         *(test(cameras, xyz) for test in (_far, _frames, _directions)),
-        Result("listed points visible in their images" if listed and cameras.lenses else ""),
-        *(positions(cameras, str(file)), heights, flown, _spacing(cameras, cloud, every)),
-    ]
-    fits, doubts, unchecked = (tuple(filter(None, found)) for found in zip(*results, strict=True))
-    return Plausible(fits, (*level_doubts, *doubts), unchecked)
+        [("fits", "listed points visible in their images")] if listed and cameras.lenses else [],
+        _positions(cameras, str(file)),
+        (one for one in _heights(cameras, cloud, ties) if one[0] != "unchecked" or not flown),
+        flown,
+        _spacing(cameras, cloud, every),
+    ):
+        found[kind].append(what)
+    return Plausible(*map(tuple, found.values()))
 
 
-def _doubt(code: str, sentence: str, **values: Any) -> Result:
-    return Result(doubt=PcfixWarning(code, sentence, **values))
+def _doubt(code: str, sentence: str, **values: Any) -> Finding:
+    return "doubts", PcfixWarning(code, sentence, **values)
 
 
-def _far(cameras: Cameras, xyz: FloatArray) -> Result:
+def _far(cameras: Cameras, xyz: FloatArray) -> Iterator[Finding]:
     """Look for cameras far from the cloud."""
     low, high, place = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0), cameras.centres[:, :2]
     apart = np.hypot(*np.maximum(np.maximum(low - place, place - high), 0.0).T)
-    far = np.flatnonzero(apart > FAR_M)
-    if not len(far):
-        return Result()
-    last = far[np.argmax(apart[far])]
-    return _doubt(
-        "cameras.far",
-        f"{len(far)} of {len(cameras)} cameras are more than {FAR_M / 1000.0:g} km from the cloud,"
-        f" {cameras.labels[last]} {apart[last] / 1000.0:,.0f} km. Check their coordinate system,"
-        " or remove them.",
-        count=len(far),
-        image=cameras.labels[last],
-    )
+    count, last = int((apart > FAR_M).sum()), int(np.argmax(apart))
+    if count:
+        yield _doubt(
+            "cameras.far",
+            f"{count} of {len(cameras)} cameras are more than {FAR_M / 1000.0:g} km from the cloud,"
+            f" {cameras.labels[last]} {apart[last] / 1000.0:,.0f} km. Check their coordinate"
+            " system, or remove them.",
+            count=count, image=cameras.labels[last],
+        )  # fmt: skip
 
 
-def _frames(cameras: Cameras, xyz: FloatArray) -> Result:
-    """Test whether each point is in two frames or more, as its reconstruction needs two."""
+def _frames(cameras: Cameras, xyz: FloatArray) -> Iterator[Finding]:
+    """Test whether each point is in two frames or more, as its reconstruction needs two.
+
+    A wrong CRS, datum, unit or convention of angles moves frames off the points.
+    """
     if cameras.lenses is None or cameras.rotations is None:
-        return Result(unchecked="frames (the cameras have no lenses or no angles)")
-    # A wrong CRS, datum, unit or convention of angles moves frames off the points.
+        yield "unchecked", "frames (the cameras have no lenses or no angles)"
+        return
     unseen = float(np.mean(cameras_in_sight(xyz, cameras) < 2))
-    if unseen <= MOST_UNSEEN:
-        seen = f"{100.0 * (1.0 - unseen):.4g} % of the points in two frames or more"
-        shift_m = _detectable_shift_m(cameras, xyz)
-        if shift_m is None:
-            beyond = "a shift in plan (the frames reach far beyond the cloud)"
-            return Result(seen, unchecked=beyond)
-        return Result(f"{seen} (a shift in plan of {shift_m:.0f} m would show)")
-    return _doubt(
-        "cameras.no_overlap",
-        f"{100.0 * unseen:.1f} % of the points are in fewer than two frames. Check coordinates,"
-        " heights, angles and interior orientation of the cameras, and whether some are missing.",
-        share=unseen,
-    )
-
-
-def _detectable_shift_m(cameras: Cameras, xyz: FloatArray) -> float | None:
-    """Return the smallest shift in plan that the test of frames detects in all directions."""
-    some = np.ascontiguousarray(xyz[:: 1 + len(xyz) // SHIFTED_POINTS])
-    above = _above(cameras, xyz)
-    for share in SHIFTS:
-        steps = share * above * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
-        moved = (replace(cameras, centres=cameras.centres + step) for step in steps)
-        if all(np.mean(cameras_in_sight(some, one) < 2) > MOST_UNSEEN for one in moved):
-            return share * above
-    return None
+    if unseen > MOST_UNSEEN:
+        yield _doubt(
+            "cameras.no_overlap",
+            f"{100.0 * unseen:.1f} % of the points are in fewer than two frames. Check coordinates,"
+            " heights, angles and interior orientation of the cameras, and whether some are"
+            " missing.",
+            share=unseen,
+        )
+        return
+    yield "fits", f"{100.0 * (1.0 - unseen):.4g} % of the points in two frames or more"
+    if cameras.gnss is None:
+        yield "unchecked", "a shift in plan (no GNSS positions)"
 
 
 def _above(cameras: Cameras, xyz: FloatArray) -> float:
@@ -224,70 +202,58 @@ def _above(cameras: Cameras, xyz: FloatArray) -> float:
     return float(abs(np.median(cameras.centres[:, 2]) - np.median(xyz[:, 2])))
 
 
-def _pixel_m(cameras: Cameras, xyz: FloatArray) -> float | None:
-    """Return the size of a pixel on the ground, None if the lenses do not state it."""
-    lenses = cameras.lenses or ()
-    if not lenses or any(one.unit == "mm" for one in lenses):
-        return None
-    return _above(cameras, xyz) / float(np.median([one.focal_px for one in lenses]))
-
-
-def _spacing(cameras: Cameras, cloud: FloatArray, every: float) -> Result:
+def _spacing(cameras: Cameras, cloud: FloatArray, every: float) -> Iterator[Finding]:
     """Compare the spacing of the points with the size of the pixels."""
-    pixel = _pixel_m(cameras, cloud)
-    if pixel is None or len(cloud) <= AROUND:
-        return Result()
-    places = cloud[:, :2]
+    lenses, places = cameras.lenses or (), cloud[:, :2]
+    if not lenses or any(one.unit == "mm" for one in lenses) or len(cloud) <= AROUND:
+        return
+    pixel = _above(cameras, cloud) / float(np.median([one.focal_px for one in lenses]))
     reach = np.asarray(cKDTree(places).query(places[:: 1 + len(places) // TIES], k=AROUND + 1)[0])
     area = np.pi * float(np.median(reach[:, -1])) ** 2 / (AROUND * every)
     per_pixel = pixel**2 / area if area > 0.0 else 0.0
-    if per_pixel <= MOST_PER_PIXEL:
-        return Result()
-    return _doubt(
-        "cameras.too_high",
-        f"The cloud has {per_pixel:.0f} points for each pixel of {100.0 * pixel:.3g} cm on the"
-        " ground, more than a matcher makes. Check that the cameras belong to it, and that their"
-        " heights are in metres.",
-        points_per_pixel=per_pixel,
-    )
+    if per_pixel > MOST_PER_PIXEL:
+        yield _doubt(
+            "cameras.too_high",
+            f"The cloud has {per_pixel:.0f} points for each pixel of {100.0 * pixel:.3g} cm on the"
+            " ground, more than a matcher makes. Check that the cameras belong to it, and that"
+            " their heights are in metres.",
+            points_per_pixel=per_pixel,
+        )
 
 
-def _directions(cameras: Cameras, xyz: FloatArray) -> Result:
+def _directions(cameras: Cameras, xyz: FloatArray) -> Iterator[Finding]:
     """Compare the yaw of near-nadir images with the direction of the flight lines."""
-    no_lines = Result(unchecked="yaw (no flight lines with it)")
-    if cameras.rotations is None:
-        return no_lines
     # steps between near-nadir images that follow each other
     step = np.diff(cameras.centres[:, :2], axis=0)
-    length = np.hypot(*step.T)
-    steep = cameras.rotations[:, 2, 2] < -STEEP_COSINE
-    usual = 2.0 * np.median(length) if len(length) else 0.0
-    rows = np.flatnonzero((length > 0.0) & (length < usual) & steep[:-1] & steep[1:])
-    if len(rows) < LEAST_STEPS:
-        return no_lines
-    top = -cameras.rotations[rows, 1]  # direction of the upper edge of the image, in the world
-    heading, yaw = np.arctan2(*step[rows].T), np.arctan2(top[:, 0], top[:, 1])
-    turn = _common(heading - yaw)
+    length, turn, read = np.hypot(*step.T), None, None
+    if cameras.rotations is not None and len(length):
+        steep = cameras.rotations[:, 2, 2] < -STEEP_COSINE
+        usual = 2.0 * np.median(length)
+        rows = np.flatnonzero((length > 0.0) & (length < usual) & steep[:-1] & steep[1:])
+        if len(rows) >= LEAST_STEPS:
+            top = -cameras.rotations[rows, 1]  # direction of the upper edge, world frame
+            heading, yaw = np.arctan2(*step[rows].T), np.arctan2(top[:, 0], top[:, 1])
+            turn, read = _common(heading - yaw), _common(heading - np.degrees(yaw))
     if turn is None:
-        return Result(unchecked="yaw (it does not follow the flight lines)")
-    if abs(turn) <= MOST_TURN_DEG:
-        return Result("yaw along the flight lines")
-    read = _common(heading - np.degrees(yaw))
-    if read is not None and abs(read) <= MOST_TURN_DEG and np.ptp(yaw) <= 2.0 * np.pi:
-        return _doubt(
+        yield "unchecked", "yaw (no flight lines with it)"
+    elif abs(turn) <= MOST_TURN_DEG:
+        yield "fits", "yaw along the flight lines"
+    elif read is not None and abs(read) <= MOST_TURN_DEG:
+        yield _doubt(
             "cameras.radians",
             f"The images are turned by {abs(turn):.0f} degrees against the flight lines, unless"
             " their angles are in radians. Give the angles in degrees.",
             turn_deg=turn,
         )
-    if abs(turn) < 180.0 - MOST_TURN_DEG:  # as cameras are mounted in aircraft
-        return Result(unchecked="yaw (the images lie across the flight lines)")
-    return _doubt(
-        "cameras.yaw",
-        f"The images are turned by {abs(turn):.0f} degrees against the flight lines. Check the"
-        " convention of the angles, unless the camera was mounted like that.",
-        turn_deg=turn,
-    )
+    elif abs(turn) < 180.0 - MOST_TURN_DEG:  # as cameras are mounted in aircraft
+        yield "unchecked", "yaw (the images lie across the flight lines)"
+    else:
+        yield _doubt(
+            "cameras.yaw",
+            f"The images are turned by {abs(turn):.0f} degrees against the flight lines. Check the"
+            " convention of the angles, unless the camera was mounted like that.",
+            turn_deg=turn,
+        )
 
 
 def _common(turn: FloatArray) -> float | None:
@@ -296,26 +262,26 @@ def _common(turn: FloatArray) -> float | None:
     return float(np.degrees(np.angle(mean))) if abs(mean) >= STEADY else None
 
 
-def _heights(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Result:
+def _heights(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Iterator[Finding]:
     """Compare tie points with their image coordinates, and with the heights of the cloud."""
     if ties is None or cameras.lenses is None or cameras.rotations is None:
-        pixel = _pixel_m(cameras, cloud)
-        sized = "" if pixel is None else f", {100.0 * pixel:.3g} cm a pixel"
-        by_them = f"cameras {_above(cameras, cloud):.0f} m above the cloud{sized}"
-        return Result(unchecked=f"heights (no tie points; {by_them})")
+        above = _above(cameras, cloud)
+        yield "unchecked", f"heights (no tie points; cameras {above:.0f} m above the cloud)"
+        return
     found = _worst_residual(cameras, ties)
     if found is None:
-        return Result(unchecked="heights (no tie points in the frames)")
+        yield "unchecked", "heights (no tie points in the frames)"
+        return
     residual, image = found
     if residual > MOST_RESIDUAL:
-        return _doubt(
+        yield _doubt(
             "cameras.residuals",
             f"Tie points have residuals of {100.0 * residual:.0f} % of the frame's width in image"
             f" {image} (median). Poses, lens and points of the camera file do not belong together;"
             " export them again.",
-            share=residual,
-            image=image,
-        )
+            share=residual, image=image,
+        )  # fmt: skip
+        return
     placed = ties.xyz[np.isfinite(ties.xyz).all(axis=1)]
     placed = placed[:: 1 + len(placed) // TIES]
     tree = cKDTree(cloud[:, :2])
@@ -323,17 +289,19 @@ def _heights(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Res
     among = np.asarray(tree.query(cloud[:: 1 + len(cloud) // TIES, :2], k=2)[0])
     near = apart <= 2.0 * np.median(among[:, 1])
     if near.sum() < LEAST_STEPS:
-        return Result(unchecked="heights (no tie points on the cloud)")
+        yield "unchecked", "heights (no tie points on the cloud)"
+        return
     off = float(np.median((placed[:, 2] - cloud[row, 2])[near]))
     if abs(off) > MOST_HEIGHT * _above(cameras, cloud):
-        return _doubt(
+        yield _doubt(
             "cameras.height",
             f"The tie points are {abs(off):.1f} m {'above' if off > 0.0 else 'below'} the cloud"
             f" (median of {int(near.sum()):,}). Check the offset, the vertical datum and the unit"
             " of the heights.",
             off_m=off,
         )
-    return Result(f"tie points match their images, {abs(off):.2f} m from the cloud's heights")
+        return
+    yield "fits", f"tie points match their images, {abs(off):.2f} m from the cloud's heights"
 
 
 def _worst_residual(cameras: Cameras, ties: TiePoints) -> tuple[float, str] | None:
@@ -359,52 +327,45 @@ def _worst_residual(cameras: Cameras, ties: TiePoints) -> tuple[float, str] | No
 
 # Cameras against what was recorded in flight: GNSS positions, heights above take-off
 
-MOST_APART_M = 15.0
-"""In plan, from positions of the GNSS, in the median; without corrections these are 5 m off."""
-TAKE_OFF_M, MOST_SHARE = (-15.0, 25.0), 0.1
-"""How high above the water drones take off, and the share of their height that barometers err."""
 
-
-def positions(cameras: Cameras, name: str) -> Result:
+def _positions(cameras: Cameras, name: str) -> Iterator[Finding]:
     """Compare the places of cameras with those that their GNSS recorded."""
-    if cameras.gnss is None:
-        return Result()
     try:
-        found = adjusted_minus_gnss(cameras, name)[0][:, :2]
+        found = np.zeros((0, 2))
+        if cameras.gnss is not None:
+            found = adjusted_minus_gnss(cameras, name)[0][:, :2]
     except InputError:
-        return Result()
+        return
     apart = np.hypot(*found[np.isfinite(found).all(axis=1)].T)
-    if not len(apart):
-        return Result()
-    middle = float(np.median(apart))
-    if middle <= MOST_APART_M:
-        return Result(f"positions {middle:.1f} m in plan from their GNSS")
-    return _doubt(
-        "cameras.gnss",
-        f"The cameras are {middle:.4g} m in plan from their GNSS positions (median of"
-        f" {len(apart)}). Check their CRS and offset.",
-        off_m=middle,
-    )
+    middle = float(np.median(apart)) if len(apart) else 0.0
+    if middle > MOST_APART_M:
+        yield _doubt(
+            "cameras.gnss",
+            f"The cameras are {middle:.4g} m in plan from their GNSS positions (median of"
+            f" {len(apart)}). Check their CRS and offset.",
+            off_m=middle,
+        )
+    elif len(apart):
+        yield "fits", f"positions {middle:.1f} m in plan from their GNSS"
 
 
-def flying_heights(cameras: Cameras, file: File, water_m: float | None) -> Result:
+def _flying_heights(cameras: Cameras, file: File, water_m: float | None) -> Iterator[Finding]:
     """Compare the heights of cameras above the water with those recorded above take-off."""
     recorded = read_altitudes(file, cameras.labels)
     rows = np.flatnonzero(np.isfinite(recorded))
     if not len(rows) or water_m is None:
-        return Result()
+        return
     above = float(np.median(cameras.centres[rows, 2])) - water_m
     flown = float(np.median(recorded[rows]))
-    off, (low, high) = above - flown, TAKE_OFF_M
-    least = MOST_SHARE * abs(flown)
+    off, (low, high), least = above - flown, TAKE_OFF_M, MOST_SHARE * abs(flown)
     where = f"{abs(off):.0f} m {'above' if off > 0.0 else 'below'} the water"
     if low - least <= off <= high + least:
-        return Result(f"heights as recorded in flight, from a take-off {where}")
-    return _doubt(
+        yield "fits", f"heights as recorded in flight, from a take-off {where}"
+        return
+    yield _doubt(
         "cameras.flying_height",
         f"The cameras are {above:.0f} m above the water, and recorded {flown:.0f} m above their"
         f" take-off (median of {len(rows)}), which would be {where}. If it was not, check the"
         " vertical datum and the unit of cameras and water.",
-        above_water_m=above,
-        above_take_off_m=flown,
-    )
+        above_water_m=above, above_take_off_m=flown,
+    )  # fmt: skip

@@ -32,22 +32,18 @@ SAMPLE_POINTS, BED_POINTS = 20_000, 1000
 
 def members_of(path: File | Cameras, cameras: Cameras) -> tuple[Members | None, str]:
     """Return the members of the adjustment in the folder of its cameras, and a note if unusable."""
-    if isinstance(path, Cameras):
-        return None, ""
     try:
-        found = find_members(path)
+        found = None if isinstance(path, Cameras) else find_members(path)
     except InputError as error:
         return None, str(error)
     if found is None:
         return None, ""
     where, members = found
     aligned = members.aligned(cameras)
-    if aligned is None:
-        return None, (
-            f"{where}: belongs to other cameras, so SigmaZ does not include errors of the poses."
-            " Use the cameras that the adjustment wrote, or remove the file."
-        )
-    return aligned, ""
+    return aligned, "" if aligned is not None else (
+        f"{where}: belongs to other cameras, so SigmaZ does not include errors of the poses."
+        " Use the cameras that the adjustment wrote, or remove the file."
+    )
 
 
 def pose_errors(

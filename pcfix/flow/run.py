@@ -28,8 +28,7 @@ from pcfix.flow.inputs import Inputs
 from pcfix.flow.report import PAGE, report_run
 from pcfix.flow.request import SURFACE, Record, Request, RunFolder, read_record
 from pcfix.flow.runner import Bar, Progress, check_folder, no_bar
-from pcfix.flow.shore import check_shoreline
-from pcfix.flow.surfaces import view_of
+from pcfix.flow.surfaces import check_shoreline, view_of
 from pcfix.io import rasters, vectors
 from pcfix.io.clouds import is_cloud
 from pcfix.io.files import read_json

@@ -1,9 +1,9 @@
-"""The water surface of a cloud: read, fitted to a shoreline, or found in the cloud itself."""
+"""The water surface of a cloud: read, fitted to a shoreline, or found in it; and its shoreline."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from os import PathLike
@@ -11,11 +11,22 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import shapely
 
 from pcfix.errors import InputError, PcfixWarning, SettingError, coded
 from pcfix.flow.runner import Chunk, read_ahead
+from pcfix.grid.shoreline import NearWater, Shoreline
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.tiles import CloudFiles, open_cloud
+from pcfix.io.vectors import (
+    SHORE_RADIUS_M,
+    Layer,
+    check_layers,
+    is_vector_file,
+    read_shoreline,
+    write_layers,
+)
+from pcfix.io.water import rasters_of_images, read_water, read_water_raster
 from pcfix.label.labelling import Part
 from pcfix.model import (
     NOISE_CLASSES,
@@ -28,6 +39,7 @@ from pcfix.model import (
     WaterRaster,
     WaterSurface,
 )
+from pcfix.options.correct import LEVEL_M
 from pcfix.options.declare import File
 from pcfix.options.shared import WaterOptions
 from pcfix.water.surface import FoundSurface, OwnWater, build_fields, surface_above
@@ -36,7 +48,6 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
     from pcfix.io.views import ViewMatch
-    from pcfix.water.fit import ShoreFit
 
 
 class Points(NamedTuple):
@@ -77,6 +88,11 @@ class CloudView:
     chunks: Callable[..., Iterator[Points]]  # of the water, whose heights a dimension may have
     software: str = ""  # generating software in the header
     step_m: float = 0.0  # coordinates are rounded to it
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """West, south, east and north, metres."""
+        return (*self.low.tolist(), *self.high.tolist())
 
 
 def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -131,15 +147,16 @@ def sample_of(
             break
     if len(parts) == 1:
         return parts[0]
-    *columns, listed = zip(*parts, strict=True)
-    joined: list[Any] = [
-        None if any(v is None for v in one) else np.concatenate(one) for one in columns
+    joined = [
+        None if any(v is None for v in one) else np.concatenate(one)
+        for one in zip(*(part[:-1] for part in parts), strict=True)
     ]
-    if listed[0] is None:
-        return Points(*joined)
-    start = np.cumsum(np.concatenate([[0], *(np.diff(one.start) for one in listed)]))
-    camera = np.concatenate([one.camera for one in listed])
-    return Points._make([*joined, Views(start, camera, kind=listed[0].kind)])
+    lists = [part.views for part in parts if part.views is not None]
+    if not lists:
+        return Points._make([*joined, None])
+    start = np.cumsum(np.concatenate([[0], *(np.diff(one.start) for one in lists)]))
+    camera = np.concatenate([one.camera for one in lists])
+    return Points._make([*joined, Views(start, camera, kind=lists[0].kind)])
 
 
 def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Points:
@@ -180,9 +197,6 @@ def find_surface(
     view : CloudView or None
         Without a cloud only surfaces that do not need one.
     """
-    from pcfix.io.vectors import is_vector_file
-    from pcfix.io.water import read_water
-
     if not isinstance(water, str | PathLike | float | int):
         return FoundSurface(water)
     if str(water).strip().lower() == "auto":
@@ -191,7 +205,7 @@ def find_surface(
         return _fitted(options, water, view)
     if view is None:
         return FoundSurface(read_water(water))
-    found = read_water(water, view.crs, _bounds(view.low, view.high))
+    found = read_water(water, view.crs, view.bounds)
     if isinstance(found, WaterMesh):
         _check_near(str(water), found.vertices, view, 0.0)
     return FoundSurface(found)
@@ -233,8 +247,6 @@ def own_water_of(
     """
     if folder is None:
         return None, ()
-    from pcfix.io.water import rasters_of_images, read_water_raster
-
     if isinstance(water, WaterMesh):
         raise SettingError(
             "option.exclusive",
@@ -242,11 +254,11 @@ def own_water_of(
             " level, a plane or a raster.",
             options=["water_per_image", "water"],
         )
-    low, high, k = view.low, view.high, len(cameras)
+    west, south, east, north = view.bounds
     paths, notes = rasters_of_images(folder, cameras.labels)
-    offset = np.zeros(k) if level_offset_m is None else level_offset_m
+    offset = np.zeros(len(cameras)) if level_offset_m is None else level_offset_m
     heights, sigma = dict[int, WaterRaster](), dict[int, WaterRaster]()
-    places, differences = [], []
+    overlaps, differs = [], list[float]()
     with warnings.catch_warnings():  # those of the first raster are enough
         for image, path in paths.items():
             heights[image] = raster = read_water_raster(path, view.crs)
@@ -258,33 +270,28 @@ def own_water_of(
             rows, columns = np.nonzero(np.isfinite(raster.height_m))
             x = raster.left_m + (columns + 0.5) * raster.cell_m[0]
             y = raster.top_m - (rows + 0.5) * raster.cell_m[1]
-            places.append(((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])).any())
+            overlaps.append(((x >= west) & (x <= east) & (y >= south) & (y <= north)).any())
             if not isinstance(water, WaterDimension):
                 common = surface_above(water, np.column_stack([x, y, x])).height_m + offset[image]
-                off = np.append(raster.height_m[rows, columns] - common, np.nan)
-                differences.append(np.nanmedian(off))
+                off = raster.height_m[rows, columns] - common
+                if np.isfinite(off).any():
+                    differs.append(float(np.nanmedian(off)))
     if len(sigma) < len(heights):
         lost = len(heights) - len(sigma)
         notes += (f"{folder}: {lost} rasters have no standard errors in the folder sigma.",)
-    if np.isfinite(low).all() and not any(places):
+    if np.isfinite(west) and not any(overlaps):
         text = f"{folder}: none of its rasters overlaps the cloud. Check their CRS."
         raise InputError("water.no_overlap", text, path=folder)
-    known = np.isfinite(differences).any()
-    differs = float(np.nanmedian(differences)) if known else 0.0
-    if abs(differs) > APART_M:
+    off_m = float(np.median(differs)) if differs else 0.0
+    if abs(off_m) > APART_M:
         raise InputError(
             "water.datum",
-            f"{folder}: its water differs by {differs:+.2f} m from --water ({water}). Give both the"
+            f"{folder}: its water differs by {off_m:+.2f} m from --water ({water}). Give both the"
             " same vertical datum, and 'pcfix calm' the --level of the calm water.",
-            path=folder, difference_m=differs,
+            path=folder, difference_m=off_m,
         )  # fmt: skip
-    rest = water if isinstance(water, WaterRaster) else None
+    k, rest = len(cameras), water if isinstance(water, WaterRaster) else None
     return OwnWater(build_fields(heights, k, rest), build_fields(sigma, k)), notes
-
-
-def _bounds(low: FloatArray, high: FloatArray) -> tuple[float, float, float, float]:
-    """Return the bounds west, south, east and north of a box."""
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
 LEAST_CLASSIFIED, MOST_CLASSIFIED = 30, 2_000
@@ -310,36 +317,74 @@ def _found(view: CloudView | None) -> FoundSurface:
 
 
 def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundSurface:
-    """Return the surface fitted to shoreline points."""
-    from pcfix.io.vectors import SHORE_RADIUS_M, read_shoreline
+    """Return the surface fitted to shoreline points; those without a height get that of the cloud.
+
+    Each of the notes on the points is a warning too.
+    """
     from pcfix.water.fit import fit_water, heights_from_cloud
     from pcfix.water.river import fit_river
 
     shore = read_shoreline(path, None if view is None else view.crs, crs=options.water_crs)
     if view is not None:
         _check_near(shore.name, shore.xyz, view, max(FAR_M, *(view.high - view.low)))
-    xyz, notes = shore.xyz, list[Any](shore.notes)
+    xyz, notes = shore.xyz.copy(), list[Any](shore.notes)
     lacking = np.isnan(xyz[:, 2])
-    if lacking.any():  # they get the heights of the cloud
+    if lacking.any():
         if view is None:
             text = f"{shore.name} has points without a height. Give the cloud too."
             raise InputError("cloud.missing", text, path=shore.name)
         chunks = (one.xyz for one in view.chunks())
-        heights = heights_from_cloud(xyz[lacking, :2], chunks, SHORE_RADIUS_M)
+        xyz[lacking, 2] = heights_from_cloud(xyz[lacking, :2], chunks, SHORE_RADIUS_M)
         notes.append(
             f"{shore.name}: {int(lacking.sum()):,} points have no height and get that of the cloud"
-            f" within {SHORE_RADIUS_M:g} m; {int(np.isnan(heights).sum()):,} have none and are"
+            f" within {SHORE_RADIUS_M:g} m; {int(np.isnan(xyz[:, 2]).sum()):,} have none and are"
             " ignored."
         )
-        xyz = xyz.copy()
-        xyz[lacking, 2] = heights
-    found: ShoreFit
+    found: FoundSurface
     if options.water_model == "river":
-        corners = (xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0))
-        low, high = corners if view is None else (view.low, view.high)
-        found = fit_river(xyz, _bounds(low, high), name=shore.name, counts=shore.counts)
+        low, high = corners(*xyz[:, :2].T)
+        bounds = (*low.tolist(), *high.tolist()) if view is None else view.bounds
+        found = fit_river(xyz, bounds, name=shore.name, counts=shore.counts)
     else:
         found = fit_water(xyz, model=options.water_model, counts=shore.counts)
     for note in coded("water.points", notes):
         warnings.warn(note, stacklevel=2)
     return replace(found, notes=(*map(str, notes), *found.notes))
+
+
+def check_shoreline(path: File | None, *, overwrite: bool, inputs: Iterable[File] = ()) -> None:
+    """Check that the file can be written, before anything is computed."""
+    if path is not None:
+        check_layers(path, overwrite=overwrite, inputs=inputs)
+
+
+def write_shoreline(
+    path: File, points: NearWater, water: FoundSurface, crs: Any, *, overwrite: bool,
+    sigma_level_m: float | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Write the lines of a cloud in its CRS, and return their figures for the summary.
+
+    The standard error of the water's height is `sigma_level_m`, else that of a fit, else `LEVEL_M`.
+    """
+
+    def sigma(xy: FloatArray) -> FloatArray:
+        fitted = water.sigma_at(xy) if sigma_level_m is None else None
+        stated = LEVEL_M if sigma_level_m is None else sigma_level_m
+        return np.full(len(xy), stated) if fitted is None else fitted
+
+    layer = shoreline_layer("shoreline", points.lines(sigma))
+    write_layers(path, [layer], crs, overwrite=overwrite)
+    lengths, sigmas = layer.values["length_m"], layer.values["sigma_m"]
+    length = float(lengths.sum())
+    mean = float(np.sqrt(sigmas**2 @ lengths / length)) if length else None
+    return {"path": str(path), "lines": len(lengths), "length_m": length, "sigma_m": mean}
+
+
+def shoreline_layer(name: str, lines: Sequence[Shoreline], style: str = "") -> Layer:
+    """Return lines as a layer, with level, standard error across the line, and length."""
+    values = {
+        figure: np.array([getattr(one, figure) for one in lines], np.float64)
+        for figure in ("level_m", "sigma_m", "length_m")
+    }
+    geometries = [shapely.linestrings(one.xy) for one in lines]
+    return Layer(name, "LineString", geometries, values, style)

@@ -45,17 +45,17 @@ GREY = 0.72
 """Of points without a value, such as land where depths are shown."""
 MOST_PERCENT = 98.0
 COLOURS = {
-    "depth": (colours.DEPTH, "Depth below the water (m)",
+    "depth": (colours.DEPTH, "Depth below the water (m)", "WaterDepth", 1.0,
               "Give --water, or a cloud from 'pcfix correct'."),
-    "shift": (colours.HEIGHT, "Lowered by the correction (m)",
+    "shift": (colours.HEIGHT, "Lowered by the correction (m)", "ShiftZ", -1.0,
               "Give a cloud from 'pcfix correct'."),
-    "error": (colours.DIFFERENCE, "Height above the reference (m)",
+    "error": (colours.DIFFERENCE, "Height above the reference (m)", "", 1.0,
               "Cloud and reference do not overlap."),
-    "uncertainty": (colours.UNCERTAINTY, "Uncertainty of Z at 95 % (m)",
+    "uncertainty": (colours.UNCERTAINTY, "Uncertainty of Z at 95 % (m)", "SigmaZ", COVERAGE_95,
                     "Give a cloud from 'pcfix correct --dimensions all'."),
-    "height": (colours.HEIGHT, "Height (m)", "Its heights are not numbers."),
+    "height": (colours.HEIGHT, "Height (m)", "", 1.0, "Its heights are not numbers."),
 }  # fmt: skip
-"""Their ramp, their name, and what to do where no cloud has values."""
+"""Ramp, name, dimension and factor of the values, and what to do where no cloud has any."""
 
 
 class _Layer(NamedTuple):
@@ -106,30 +106,32 @@ def view_clouds(
         sentence = "--colour error is the height above a reference. Give --reference too."
         raise SettingError("option.missing", sentence, option="reference")
     paths = [check_input(cloud) for cloud in clouds]
-    first = view_of(paths[0])
+    first, layers = view_of(paths[0]), list[_Layer]()
+    crs_of_all: Any = first.crs
     surface = None if given.water is None else find_surface(given.water, given, first).surface
-    read = {path: _read(path, given.points) for path in paths}
-    layers, crs = [layer for some, _ in read.values() for layer in some], read[paths[0]][1]
-    for path, (_, other) in read.items():
-        check_same_crs(str(paths[0]), crs, str(path), other)
+    for path in paths:
+        some, crs = _read(path, given.points)
+        check_same_crs(first.name, crs_of_all, str(path), crs)
+        layers += some
     if given.reference is not None:
         target = read_reference(given.reference)
-        check_same_crs(str(paths[0]), crs, target.name, target.crs)
+        check_same_crs(first.name, crs_of_all, target.name, target.crs)
         step = 1 + len(target.xyz) // given.points
         layers.append(_Layer(f"reference {Path(target.name).name}", target.xyz[::step], {}))
     xyz = [one.xyz for one in layers]
     values = [_values(given.colour, one, surface, xyz[-1]) for one in layers]
     if not any(np.isfinite(one).any() for one in values):
-        sentence = f"No cloud has values for --colour {given.colour}. {COLOURS[given.colour][2]}"
+        sentence = f"No cloud has values for --colour {given.colour}. {COLOURS[given.colour][-1]}"
         raise SettingError("view.no_values", sentence, colour=given.colour)
-    scale = scale_of(given.colour, np.concatenate(values))
+    scale = _scale_of(given.colour, np.concatenate(values))
     rgb = [scale.to_rgba(np.ma.masked_invalid(one))[:, :3] for one in values]
-    # all about their common centre
-    low, high = (end([end(one, axis=0) for one in xyz], axis=0) for end in (np.min, np.max))
+    points = np.vstack(xyz)
+    low, high = points.min(axis=0), points.max(axis=0)
     lines = {"water": _grid(surface, low, high)}
     if given.cameras is not None:
         inputs = replace(given, water=0.0 if given.water is None else given.water).part(Inputs)
         lines["cameras"] = _frusta(inputs.block(first.crs)[0], float(high[2]))
+    # coordinates relative to the common centre
     ends = np.vstack([low, high, *(one.reshape(-1, 3) for one in lines.values())])
     origin = (ends.min(axis=0) + ends.max(axis=0)) / 2.0
     scene = Scene3d(
@@ -137,7 +139,7 @@ def view_clouds(
         {name: one - origin for name, one in lines.items() if len(one)},
     )  # fmt: skip
     if given.image is None:
-        show(scene, f"pcfix view: {given.colour}")
+        _show(scene, f"pcfix view: {given.colour}")
         return ""
     picture = png_of(view_figure(scene, scale, given.colour))
     write_bytes(given.image, picture, overwrite=given.overwrite)
@@ -181,11 +183,7 @@ def _values(
             k = min(CompareRules().neighbours, len(reference))
             found[near] = xyz[near, 2] - heights_at(xyz[near], reference, k)
         return found
-    name, factor = {
-        "depth": ("WaterDepth", 1.0),
-        "shift": ("ShiftZ", -1.0),
-        "uncertainty": ("SigmaZ", COVERAGE_95),
-    }[colour]
+    _, _, name, factor, _ = COLOURS[colour]
     if name in known:
         return np.where(known[name] != 0.0, factor * known[name], np.nan)
     if colour == "depth" and surface is not None and not isinstance(surface, WaterDimension):
@@ -198,15 +196,14 @@ def _frusta(cameras: Cameras, ground_m: float) -> FloatArray:
     length = FRUSTUM_SHARE * max(float(np.median(cameras.centres[:, 2])) - ground_m, 1.0)
     if cameras.rotations is None or cameras.lenses is None:
         return np.stack([cameras.centres, cameras.centres - [0.0, 0.0, length]], axis=1)
-    lines = []
-    for centre, rotation, lens in zip(
-        cameras.centres, cameras.rotations, cameras.lenses, strict=True
-    ):
-        frame = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * [lens.width, lens.height]
-        corner = centre + length * (unproject(lens, frame) @ rotation)
-        lines += [[centre, one] for one in corner]
-        lines += [[corner[i], corner[(i + 1) % 4]] for i in range(4)]
-    found = np.array(lines)
+    corners = [
+        unproject(one, np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * [one.width, one.height])
+        for one in cameras.lenses
+    ]
+    centre = np.repeat(cameras.centres[:, None], 4, axis=1)
+    corner = centre + length * np.array(corners) @ cameras.rotations
+    rays, rim = np.stack([centre, corner], axis=2), np.stack([corner, np.roll(corner, -1, 1)], 2)
+    found = np.concatenate([rays, rim], axis=1).reshape(-1, 2, 3)
     return np.asarray(found[np.isfinite(found).all(axis=(1, 2))])
 
 
@@ -225,7 +222,7 @@ def _grid(surface: WaterSurface | None, low: FloatArray, high: FloatArray) -> Fl
     return np.asarray(edges[np.isfinite(edges).all(axis=(1, 2))])
 
 
-def scale_of(what: str, values: FloatArray) -> ScalarMappable:
+def _scale_of(what: str, values: FloatArray) -> ScalarMappable:
     """Return the colour scale of values, NaN where unknown; it leaves out 2 % at the ends.
 
     Its ``to_rgba`` gives colours; those of NaN are grey.
@@ -245,7 +242,7 @@ def scale_of(what: str, values: FloatArray) -> ScalarMappable:
     return ScalarMappable(Normalize(low, high), ramp)
 
 
-def show(scene: Scene3d, title: str) -> None:
+def _show(scene: Scene3d, title: str) -> None:
     """Open open3d's viewer with a switch for each cloud, and return when it is closed."""
     on_x = sys.platform.startswith("linux")
     if on_x and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from pcfix.errors import plain, shown_once
 from pcfix.flow.runner import check_summary, write_summary
-from pcfix.flow.shore import check_shoreline, write_shoreline
-from pcfix.flow.surfaces import file_points, find_surface, sample_of, view_of
+from pcfix.flow.surfaces import check_shoreline, find_surface, sample_of, view_of, write_shoreline
 from pcfix.grid.shoreline import NearWater
 from pcfix.io.files import check_input
 from pcfix.model import FloatArray, WaterDimension
 from pcfix.options.declare import taken
 from pcfix.options.survey import WaterCheckOptions
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, draw_cloud, label_plan, new_figure
-from pcfix.report.text import Plain, Rows, RowTable, aligned, filled, shoreline_rows
+from pcfix.report.text import Plain, RowTable, aligned, filled, shoreline_rows
 from pcfix.water.auto import WaterProposal
-from pcfix.water.fit import ShoreFit, WaterFit
+from pcfix.water.fit import ShoreFit
 from pcfix.water.river import RiverFit
 from pcfix.water.surface import FoundSurface, surface_above
 
@@ -30,6 +28,7 @@ if TYPE_CHECKING:
 SAMPLE_POINTS = 200_000
 """Points of the cloud that are compared with the water, evenly spread."""
 MOST_LISTED = 10
+"""Rejected points in the summary, the largest residual first."""
 _FIT: RowTable = (
     ("Model", "{model}, {accepted} of {points} points; scatter {sigma_point_m:.3f} m", "points"),
     ("Level", "{level_m:.3f} m at {at_xy[0]:.1f}, {at_xy[1]:.1f}; standard error"
@@ -38,8 +37,6 @@ _FIT: RowTable = (
      " {downhill_deg:.0f} deg", "tilt_percent"),
     ("Length", "{length_m:.1f} m, falls {drop_m:.3f} m; standard error of the level"
      " {sigma_level_m:.3f} m", "length_m"),
-    ("Residuals", "of the accepted points: rms {rms:.3f} m, median {median:.3f} m, largest"
-     " {largest:.3f} m", "points"),
 )  # fmt: skip
 
 
@@ -71,7 +68,7 @@ def check_water(
             below = float(np.mean(sample[:, 2] < height))
     if view is not None and given.shoreline is not None:
         near = NearWater()
-        for one in file_points(Path(view.name), found.surface):
+        for one in view.chunks(found.surface):
             above = surface_above(found.surface, one.xyz, one.heights)
             near += NearWater.of(one.xyz, one.xyz[:, 2] - above.height_m)
         shoreline = write_shoreline(
@@ -110,7 +107,12 @@ def water_text(report: WaterReport) -> str:
     """Return the summary of a water surface."""
     (found, r), rows = report, list[tuple[str, str]]()
     if isinstance(found, ShoreFit):
-        rows = _fit_rows(found)
+        rows = filled(_FIT, found.as_dict())
+        off = np.where(found.accepted, 0.0, np.nan_to_num(found.residual_m))
+        listed = min(MOST_LISTED, np.count_nonzero(off))
+        for i in np.argsort(-np.abs(off), kind="stable")[:listed]:
+            x, y, z = found.points[i]
+            rows.append(("Rejected", f"{x:.2f}, {y:.2f}, {z:.2f}: {off[i]:+.3f} m"))
     elif isinstance(found, WaterProposal):
         rows = [
             ("Level", f"{found.level_m:.3f} m, standard error {found.sigma_level_m:.3f} m,"
@@ -125,90 +127,50 @@ def water_text(report: WaterReport) -> str:
     return aligned(f"{r['water']}: {r['surface']}", rows, found.notes)
 
 
-def _fit_rows(fit: ShoreFit) -> Rows:
-    """Return the rows of a fit, and its rejected points, the largest residual first."""
-    residual = fit.residual_m
-    good = np.abs(residual[fit.accepted])
-    rms, median, largest = np.sqrt(np.mean(good**2)), np.median(good), good.max()
-    spread = {"rms": rms, "median": median, "largest": largest}
-    rows = filled(_FIT, fit.as_dict() | spread)
-    rejected = np.flatnonzero(~fit.accepted & np.isfinite(residual))
-    rejected = rejected[np.argsort(-np.abs(residual[rejected]), kind="stable")]
-    for i in rejected[:MOST_LISTED]:
-        x, y, z = fit.points[i]
-        rows.append(("Rejected", f"{x:.2f}, {y:.2f}, {z:.2f}: {residual[i]:+.3f} m"))
-    more = len(rejected) - MOST_LISTED
-    return [*rows, ("", f"and {more} more")] if more > 0 else rows
-
-
 def water_figure(found: FoundSurface, cloud_xyz: FloatArray) -> Figure:
-    """Draw cloud and shoreline in plan, and below the residuals of a fit, or the evidence."""
+    """Draw cloud and shoreline in plan, and below the surface along the shoreline points."""
     figure, (plan, side) = new_figure(8.0, 7.5, nrows=2, height_ratios=[3, 2])
     title, shown = str(found.surface), cloud_xyz
     if isinstance(found, WaterProposal):
-        shown = found.ground
         title = f"Water {found.level_m:.3f} ± {found.sigma_level_m:.3f} m"
-        tilt = 100.0 * float(np.hypot(*found.tilt))
-        title += f", tilt {tilt:.2f} %" if tilt else ""
-        title += f", confidence {found.confidence:.2f}"
+        title, shown = f"{title}, confidence {found.confidence:.2f}", found.ground
     draw_cloud(figure, plan, shown, getattr(found, "level_m", None))
-    if isinstance(found, WaterProposal):
-        _draw_evidence(plan, side, found)
-    elif isinstance(found, WaterFit | RiverFit):
-        _draw_fit(plan, side, found)
+    if found.points is not None:
+        _draw_shoreline(plan, side, found, found.points)
     label_plan(plan, 20.0)
     plan.set_title(title)
     return figure
 
 
-def _draw_evidence(plan: Axes, side: Axes, found: WaterProposal) -> None:
-    """Draw the shoreline that was found in plan, and the evidence for each height."""
-    name = f"shoreline, {len(found.points):,} places"
-    plan.plot(*found.points[:, :2].T, ".", color="#c2185b", markersize=3, label=name)
-    reach = 2.0 * found.sigma_level_m
-    for name, gain in found.curves.items():
-        side.plot(found.curve_height_m, np.maximum(gain, 0.0), label=name)
-    side.axvline(found.level_m, color=WATER, label="water")
-    side.axvspan(found.level_m - reach, found.level_m + reach, color=WATER, alpha=0.3, linewidth=0)
-    shown = max(6.0, 4.0 * reach) * np.array([-1.0, 1.0]) + found.level_m
-    side.set(xlim=np.clip(shown, *found.curve_height_m[[0, -1]]), ylim=(0.0, None))
-    side.set(xlabel="Height of the water, if there (m)", ylabel="Evidence (log likelihood ratio)")
-    for axes in (plan, side):
-        axes.legend(loc="best")
-
-
-def _draw_fit(plan: Axes, side: Axes, fit: WaterFit | RiverFit) -> None:
-    """Draw the points of a fit in plan, and their heights along the river or the tilt."""
-    points = fit.points
-    if isinstance(fit, RiverFit):
-        station, label = np.asarray(fit.axis.locate(points[:, :2])[0]), "Down the flow (m)"
+def _draw_shoreline(plan: Axes, side: Axes, found: FoundSurface, points: FloatArray) -> None:
+    """Draw shoreline points in plan, and their heights along the river or their long side."""
+    if isinstance(found, RiverFit):
+        station, label = np.asarray(found.axis.locate(points[:, :2])[0]), "Down the flow (m)"
     else:
-        centred = points[:, :2] - points[:, :2].mean(axis=0)
-        axis = np.linalg.svd(centred, full_matrices=False)[2][0]  # of their longest extent
-        station = centred @ (-fit.tilt / np.hypot(*fit.tilt) if fit.tilt.any() else axis)
+        local = points[:, :2] - points[:, :2].mean(axis=0)
+        station = local @ np.linalg.svd(local, full_matrices=False)[2][0]
         station, label = station - station.min(), "Along the points (m)"
     order = np.argsort(station)
-    height = fit.height_at(points[order, :2])
-    reach = 2.0 * fit.sigma_at(points[order, :2])
+    height = found.height_at(points[order, :2])
+    reach = 2.0 * np.asarray(found.sigma_at(points[order, :2]))
     side.plot(station[order], height, color=WATER, label="surface")
     look: dict[str, Any] = {"color": WATER, "alpha": 0.3, "label": "95 %"}
     side.fill_between(station[order], height - reach, height + reach, **look)
+    accepted = found.accepted if isinstance(found, ShoreFit) else np.ones(len(points), np.bool_)
     for rows, mark, colour, name in (
-        (fit.accepted, "o", AFTER, "accepted"),
-        (~fit.accepted, "x", BEFORE, "rejected"),
+        (accepted, "o", AFTER, "accepted"),
+        (~accepted, "x", BEFORE, "rejected"),
     ):
         if rows.any():
-            plan.plot(*points[rows, :2].T, mark, color=colour, markersize=5, label=name)
-            side.plot(station[rows], points[rows, 2], mark, color=colour, markersize=5)
+            plan.plot(*points[rows, :2].T, mark, color=colour, markersize=4, label=name)
+            side.plot(station[rows], points[rows, 2], mark, color=colour, markersize=4)
     side.set(xlabel=label, ylabel="Height (m)")
     side.legend(loc="best")
     plan.legend(loc="upper right", bbox_to_anchor=(1.0, 1.0))
 
 
 def found_picture(found: FoundSurface) -> Picture:
-    """Return the evidence for a level that was found in the cloud, for the page."""
-    alt = "How the water was found: shoreline in plan, and the evidence for each height."
-    reasons = found.reasons if isinstance(found, WaterProposal) else ()
-    alt += "".join(f" {reason[:1].upper()}{reason[1:].rstrip('.')}." for reason in reasons)
+    """Return the picture of a surface that was found in the cloud, for the page."""
+    alt = "The shoreline that was found, in plan, and the heights along it."
     figure = water_figure(found, np.zeros((0, 3)))
     return Picture("water", "The water level found in the cloud", alt, figure)

@@ -89,8 +89,8 @@ def coefficients(lens: Lens) -> FloatArray:
     """Return a lens as the flat array that the kernels take, see `KIND`."""
     c = np.zeros(TAIL)
     c[KIND] = CODES[lens.projection]
-    c[TANGENTIAL : TANGENTIAL + 4] = _filled(lens.tangential, 4)[:4]
-    c[THIN_PRISM : THIN_PRISM + 4] = _filled(lens.thin_prism, 4)[:4]
+    c[TANGENTIAL : TANGENTIAL + len(lens.tangential)] = lens.tangential
+    c[THIN_PRISM : THIN_PRISM + len(lens.thin_prism)] = lens.thin_prism
     c[IN_TURN], c[INVERSE] = lens.in_turn, lens.inverse
     c[CENTRE_X : CENTRE_Y + 1] = lens.distortion_centre
     c[FOCAL_X : FOCAL_Y + 1] = lens.focal + lens.b1, lens.b2, lens.b3, lens.focal
@@ -100,8 +100,8 @@ def coefficients(lens: Lens) -> FloatArray:
     is_plain = not (lens.inverse or lens.in_turn or any(more))
     c[PLAIN] = is_plain and lens.projection == "perspective"
     # what has no fixed length stands at the end
-    radial = _filled(lens.radial, LEAST_RADIALS)
-    shape = _filled(lens.shape, LEAST_SHAPES)
+    radial = (*lens.radial, *(0.0,) * (LEAST_RADIALS - len(lens.radial)))
+    shape = (*lens.shape, *(0.0,) * (LEAST_SHAPES - len(lens.shape)))
     counts = len(radial), len(lens.denominator), len(shape)
     c[RADIALS : SHAPES + 1] = counts
     c[SHAPE] = TAIL + counts[0] + counts[1]
@@ -124,17 +124,6 @@ def lens_table(lenses: tuple[Lens, ...]) -> tuple[IntArray, FloatArray]:
     for i, numbers in enumerate(each):
         table[i, : len(numbers)] = numbers
     return row, table
-
-
-def _filled(numbers: tuple[float, ...], least: int) -> tuple[float, ...]:
-    """Return the numbers, filled up with zeros to the least length."""
-    return (*numbers, *(0.0,) * (least - len(numbers)))
-
-
-@device
-def in_plane(c: FloatArray, x: float, y: float, z: float) -> tuple[float, float]:
-    """Return the plane coordinates of a direction, before distortion; NaN where it has none."""
-    return _plane_and_gradients(c, x, y, z)[:2]
 
 
 @device
@@ -195,7 +184,7 @@ def image_and_gradients(
     Projection, distortion and interior orientation are joined by the chain rule. NaN where there is
     no image.
     """
-    px, py, (ax, ay, az, bx, by, bz) = _plane_and_gradients(c, x, y, z)
+    px, py, (ax, ay, az, bx, by, bz) = plane_and_gradients(c, x, y, z)
     px, py = px - c[CENTRE_X], py - c[CENTRE_Y]
     if c[INVERSE] != 0.0:
         dx, dy = undistorted(c, px, py)
@@ -231,7 +220,7 @@ def image_in_world(
 
 
 @device
-def _plane_and_gradients(
+def plane_and_gradients(
     c: FloatArray, x: float, y: float, z: float
 ) -> tuple[float, float, Gradients]:
     """Return the plane coordinates of a direction before distortion, and their gradients.

@@ -67,15 +67,6 @@ def _at_face(window: PortShape, depth: float, start: Vector, s: Vector) -> tuple
 
 
 @device
-def _behind(s: Vector, normal: Vector, r: float) -> Vector:
-    """Return the unit direction behind a face, whose normal goes with the light.
-
-    r is the refractive index before the face over that behind it. NaN for total reflection.
-    """
-    return refracted(scaled(-1.0, s), 1.0, scaled(-1.0, normal), dot(normal, s), r)
-
-
-@device
 def ray_through(window: PortShape, n: float, direction: Vector) -> tuple[Vector, Vector]:
     """Return where a ray from the projection centre leaves the port, and its unit direction there.
 
@@ -83,10 +74,12 @@ def ray_through(window: PortShape, n: float, direction: Vector) -> tuple[Vector,
     air, at least 1. NaN is returned if the ray misses the port.
     """
     s, thickness, glass = unit(direction), window[3], window[4]
+    # `refracted` takes the ray backwards and the normal against the light
     inner, normal = _at_face(window, 0.0, (0.0, 0.0, 0.0), s)
-    inside = _behind(s, normal, 1.0 / glass)
+    inside = refracted(scaled(-1.0, s), 1.0, scaled(-1.0, normal), dot(normal, s), 1.0 / glass)
     outer, normal = _at_face(window, thickness, inner, inside)
-    return outer, _behind(inside, normal, glass / n)
+    back, inward = scaled(-1.0, inside), scaled(-1.0, normal)
+    return outer, refracted(back, 1.0, inward, dot(normal, inside), glass / n)
 
 
 @device

@@ -43,7 +43,11 @@ class FlatPort:
         object.__setattr__(self, "normal", (x, y, z))
 
     def __str__(self) -> str:
-        return spec_of(self)
+        """Return a text for `port_of`, to 0.1 um."""
+        glass = f"thickness={self.thickness_m:.7g},glass={self.glass_index:.7g}"
+        nx, ny, _ = self.normal
+        tilt = f",nx={nx:.9g},ny={ny:.9g}" if nx or ny else ""
+        return f"flat:distance={self.distance_m:.7f},{glass}{tilt}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,21 +74,13 @@ class DomePort:
         )  # fmt: skip
 
     def __str__(self) -> str:
-        return spec_of(self)
+        """Return a text for `port_of`, to 0.1 um."""
+        glass = f"thickness={self.thickness_m:.7g},glass={self.glass_index:.7g}"
+        x, y, z = self.centre_m
+        return f"dome:radius={self.radius_m:.7g},{glass},x={x:.7f},y={y:.7f},z={z:.7f}"
 
 
 Port: TypeAlias = FlatPort | DomePort
-
-
-def spec_of(port: Port) -> str:
-    """Return a port as a text for `port_of`, to 0.1 um."""
-    glass = f"thickness={port.thickness_m:.7g},glass={port.glass_index:.7g}"
-    if isinstance(port, FlatPort):
-        nx, ny, _ = port.normal
-        tilt = f",nx={nx:.9g},ny={ny:.9g}" if nx or ny else ""
-        return f"flat:distance={port.distance_m:.7f},{glass}{tilt}"
-    x, y, z = port.centre_m
-    return f"dome:radius={port.radius_m:.7g},{glass},x={x:.7f},y={y:.7f},z={z:.7f}"
 
 
 _NUMBERS = {

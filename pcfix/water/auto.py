@@ -17,7 +17,6 @@ cheap.
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -50,8 +49,6 @@ class WaterProposal(FoundSurface):
     confidence: float  # 0 to 1, by how much the evidence exceeds what is refused
     evidence: dict[str, float]  # figures by name
     reasons: tuple[str, ...]  # the same in sentences
-    curve_height_m: FloatArray  # (h,), world heights; of a tilted surface, above `centre_xy`
-    curves: dict[str, FloatArray]  # (h,), gain (log likelihood ratio) of each cue at each height
     ground: FloatArray  # (c, 3), the cloud thinned to cells, metres, world frame
 
     def sigma_at(self, xy: FloatArray) -> FloatArray:
@@ -100,31 +97,31 @@ level. They are higher than for `find_water`, to avoid false alarms."""
 
 def find_elsewhere(
     xyz: FloatArray, water_m: FloatArray, rgb: npt.NDArray[Any] | None
-) -> tuple[WaterProposal | None, Tilted | None]:
-    """Return water that a cloud shows elsewhere than the given water surface, and its tilt if any.
+) -> WaterProposal | None:
+    """Return water that a cloud shows at another height than the given water surface.
 
     `water_m`, shape (n,), is the height of the given surface above each point. The heights found
     are above it; None if the cloud shows the water there, or nothing. The full search of
     `find_water` runs only if another height gains most.
     """
     samples = sample_cloud(np.column_stack([xyz[:, :2], xyz[:, 2] - water_m]), rgb)
-    found, tilted = None, None
-    with suppress(GeometryError):  # flat ground, or too little evidence
+    try:
         coarse = _scanned(samples)
-        tilted, gain = _find_tilt(coarse), _gains(coarse, NO_TILT)
-        here = gain[np.abs(coarse.heights_m + samples.origin[2]) <= DIFFERENT_M].max(initial=0.0)
-        if gain.max() >= LEAST_AGREED and here <= MOST_RIVAL_AGREED * gain.max():
-            found = _judged(coarse)
-    if found is None:
-        return None, tilted
+        gain, heights = _gains(coarse, NO_TILT), coarse.heights_m + samples.origin[2]
+        here = gain[np.abs(heights) <= DIFFERENT_M].max(initial=0.0)
+        if gain.max() < LEAST_AGREED or here > MOST_RIVAL_AGREED * gain.max():
+            return None
+        found = _judged(coarse)
+    except GeometryError:  # flat ground, or too little evidence
+        return None
     differs = abs(found.level_m) > max(DIFFERENT_M, DIFFERENT_SIGMAS * found.sigma_level_m)
     sure = found.evidence["total gain"] >= LEAST_AGAINST or (
         found.confidence >= SURE_AGAINST and f"{SLOPE.name} amplitude" in found.evidence
     )
-    return found if differs and sure else None, tilted
+    return found if differs and sure else None
 
 
-LARGEST_TILT, USUAL_TILT = 0.006, 0.002
+LARGEST_TILT = 0.006
 TILT_STEP_M, MOST_TILT_STEPS = 0.15, 9
 TILT_GAIN = 6.0
 COARSE_M, FINE_M, MOST_HEIGHTS = 0.04, 0.01, 800
@@ -148,7 +145,7 @@ class Peak(NamedTuple):
 
     level_m: float
     tilt: FloatArray
-    score: float  # total gain of its cues, reduced for unusual tilts
+    score: float  # total gain of its cues
 
     def below(self, samples: Samples) -> FloatArray:
         """Return the depth of the smooth ground of the cells below the surface, shape (m,)."""
@@ -203,26 +200,24 @@ def _best(scan: Scan, tilts: FloatArray) -> Peak:
     """Return the best height and tilt among tilts of shape (k, 2)."""
     found = []
     for tilt in tilts:
-        total, total_tilt = _gains(scan, tilt), scan.tilt + tilt
-        row = int(np.argmax(total))
-        unusual = 0.5 * float(total_tilt @ total_tilt) / USUAL_TILT**2
-        found.append(Peak(float(scan.heights_m[row]), total_tilt, float(total[row]) - unusual))
+        gain = _gains(scan, tilt)
+        row = int(np.argmax(gain))
+        found.append(Peak(float(scan.heights_m[row]), scan.tilt + tilt, float(gain[row])))
     return max(found, key=lambda peak: peak.score)
 
 
-def _tilts_along(step: FloatArray, steps: int) -> FloatArray:
-    """Return multiples of a tilt, the level one first, shape (2 steps + 1, 2)."""
-    up_and_down = np.arange(-steps, steps + 1)
-    return up_and_down[np.argsort(np.abs(up_and_down), kind="stable")][:, None] * step
+def _along(step: FloatArray, steps: int) -> FloatArray:
+    """Return multiples of a tilt, zero first, shape (2 steps + 1, 2)."""
+    return np.outer(sorted(range(-steps, steps + 1), key=abs), step)
 
 
 def _refine(samples: Samples, start: Peak, step: FloatArray) -> tuple[Peak, Scan]:
     """Search near a surface in fine steps of height and of tilt; a step of zero keeps it level."""
-    peak = start
+    peak, steps = start, 2 if step.any() else 0
     reach = np.arange(-FINE_REACH_M, FINE_REACH_M + FINE_M / 2.0, FINE_M)
-    for halvings in range(1, 4 if step.any() else 2):
+    for size in (0.5, 0.25, 0.125)[: 3 if steps else 1]:
         scan = _scan_at(samples, peak.level_m + reach, peak.tilt)
-        peak = _best(scan, _tilts_along(step / 2.0**halvings, 2 if step.any() else 0))
+        peak = _best(scan, _along(size * step, steps))
     return peak, _scan_at(samples, peak.level_m + reach, peak.tilt)
 
 
@@ -240,7 +235,7 @@ def _choose(coarse: Scan) -> tuple[Peak, Scan]:
     axis = np.linalg.svd(shore - shore.mean(axis=0), full_matrices=False)[2][0]
     extent = float(np.ptp(samples.xyz[:, :2], axis=0).max())
     step = max(TILT_STEP_M / extent, LARGEST_TILT / MOST_TILT_STEPS)
-    tilted = _best(coarse, _tilts_along(step * axis, math.ceil(LARGEST_TILT / step)))
+    tilted = _best(coarse, _along(step * axis, math.ceil(LARGEST_TILT / step)))
     if tilted.score > start.score:
         plane, near_plane = _refine(samples, tilted, step * axis)
         along = abs(float(plane.tilt @ axis))
@@ -272,10 +267,10 @@ def _judged(coarse: Scan) -> WaterProposal:
     """Return the best surface; GeometryError ``water.not_found`` if its evidence is not enough."""
     samples, origin = coarse.samples, coarse.samples.origin
     peak, near = _choose(coarse)
-    sigma_m = _sigma_level(near)
+    sigma_m, middle = _sigma_level(near), len(near.heights_m) // 2
     total, evidence, sentences, strong = 0.0, dict[str, float](), list[str](), list[str]()
     for sums in near.cues:
-        cue, middle = sums.cue, len(near.heights_m) // 2
+        cue = sums.cue
         gain, size, sigma = (float(figure[middle]) for figure in gain_of(sums))
         evidence[f"{cue.name} gain"] = gain
         total += max(gain, 0.0)
@@ -303,33 +298,29 @@ def _judged(coarse: Scan) -> WaterProposal:
     if strong == [SLOPE.name]:
         lift = evidence["slope amplitude"]
     shore = samples.xyz[peak.shore(samples)]
-    reason = ""
-    if not LEAST_SHARE <= wet <= 1.0 - LEAST_SHARE or len(shore) == 0:
-        reason, why = "no_shoreline", "nearly all of the cloud is on one side of it"
-    elif not LIFTS[0] <= lift <= LIFTS[1]:  # a break that refraction does not make
-        reason = "bank"
-        why = f"slopes change there by a factor of {1.0 + lift:.2f}, refraction gives about 1.36"
-    elif total < least:
-        reason, why = "weak", f"its evidence is {total:.0f}, and {least:.0f} is needed"
-    elif rival > most_rival * total:
-        reason = "contradictory"
-        why = f"its evidence is {total:.0f}, and {rival_m:.2f} m has {rival:.0f}, nearly as much"
-    elif sigma_m > MOST_SIGMA_M:
-        reason, why = "inconsistent", f"parts of the cloud differ by {sigma_m:.2f} m"
-    if reason:
-        height = peak.level_m + float(samples.xyz[:, :2].mean(axis=0) @ peak.tilt + origin[2])
-        raise GeometryError(
-            "water.not_found",
-            f"No water surface was found. The best candidate is {height:.2f} m, but {why}."
-            f" {INSTEAD}",
-            reason=reason, evidence=evidence,
-        )  # fmt: skip
+    is_one_sided = not LEAST_SHARE <= wet <= 1.0 - LEAST_SHARE or len(shore) == 0
+    for reason, is_refused, why in (
+        ("no_shoreline", is_one_sided, "nearly all of the cloud is on one side of it"),
+        ("bank", not LIFTS[0] <= lift <= LIFTS[1],
+         f"slopes change there by a factor of {1.0 + lift:.2f}, refraction gives about 1.36"),
+        ("weak", total < least, f"its evidence is {total:.0f}, and {least:.0f} is needed"),
+        ("contradictory", rival > most_rival * total,
+         f"its evidence is {total:.0f}, and {rival_m:.2f} m has {rival:.0f}, nearly as much"),
+        ("inconsistent", sigma_m > MOST_SIGMA_M, f"parts of the cloud differ by {sigma_m:.2f} m"),
+    ):  # fmt: skip
+        if is_refused:
+            height = peak.level_m + float(samples.xyz[:, :2].mean(axis=0) @ peak.tilt + origin[2])
+            raise GeometryError(
+                "water.not_found",
+                f"No water surface was found. The best candidate is {height:.2f} m, but {why}."
+                f" {INSTEAD}",
+                reason=reason, evidence=evidence,
+            )  # fmt: skip
     shore = shore[:: math.ceil(len(shore) / MOST_SHORELINE)] + origin
     centre = shore[:, :2].mean(axis=0)
-    rise = float((centre - origin[:2]) @ peak.tilt + origin[2])
-    level, (b, c) = peak.level_m + rise, peak.tilt.tolist()
+    level = peak.level_m + float((centre - origin[:2]) @ peak.tilt + origin[2])
     return WaterProposal(
-        surface=WaterPlane(level - float(centre @ peak.tilt), b, c),
+        surface=WaterPlane(level - float(centre @ peak.tilt), *peak.tilt.tolist()),
         points=shore,
         sigma_level_m=sigma_m,
         centre_xy=centre,
@@ -338,52 +329,8 @@ def _judged(coarse: Scan) -> WaterProposal:
         confidence=float(min(1.0 - rival / total, 1.0 - math.exp(-total / (2.0 * least)))),
         evidence=evidence,
         reasons=tuple(sentences),
-        curve_height_m=coarse.heights_m + rise,
-        curves={sums.cue.name: gain_of(sums.shifted(peak.tilt))[0] for sums in coarse.cues},
         ground=samples.xyz + origin,
     )
-
-
-TILTS = (0.0025, 0.005, 0.0075, 0.01, 0.015, 0.02)
-REACH_M, LEAST_APART_M = 2.0, 0.3
-"""Largest distance from the given water in the middle of the cloud; least one from end to end."""
-LEAST_GAIN, MOST_LEFT, ABOUT_AS_GOOD = 100.0, 0.4, 0.9
-"""Least evidence of a tilted waterline; the largest share of it for the level one; and the share
-from which another tilt is as likely, as the tilt across a straight shore is unknown."""
-_WINDS = ("west", "south-west", "south", "south-east", "east", "north-east", "north", "north-west")
-
-
-class Tilted(NamedTuple):
-    """A waterline that is tilted against the given water."""
-
-    to: str  # the direction in which it rises
-    slope: float  # rise per metre
-    low_m: float  # lowest and highest place in the cloud, above the given water
-    high_m: float
-
-
-def _find_tilt(coarse: Scan) -> Tilted | None:
-    """Return the tilt of a waterline, if any; heights of `coarse` are above the given water."""
-    samples = coarse.samples
-    middle = np.median(samples.xyz[:, :2], axis=0)
-    angles = np.pi + np.arange(len(_WINDS)) * np.pi / 4.0
-    directions = np.column_stack([np.cos(angles), np.sin(angles)])
-    peaks = list[Peak]()
-    for tilt in (NO_TILT, *(slope * one for slope in TILTS for one in directions)):
-        at_middle = coarse.heights_m + samples.origin[2] + middle @ tilt
-        gain = np.where(np.abs(at_middle) <= REACH_M, _gains(coarse, tilt), 0.0)
-        row = int(np.argmax(gain))
-        peaks.append(Peak(float(coarse.heights_m[row]), tilt, float(gain[row])))
-    level, *peaks = peaks
-    least = ABOUT_AS_GOOD * max(one.score for one in peaks)
-    best = next(i for i, one in enumerate(peaks) if one.score >= least)  # the least tilt
-    peak, wind = peaks[best], _WINDS[best % len(_WINDS)]
-    if peak.score < LEAST_GAIN or level.score > MOST_LEFT * peak.score:
-        return None
-    heights = samples.xyz[peak.shore(samples), :2] @ peak.tilt + peak.level_m + samples.origin[2]
-    if len(heights) < 2 or np.ptp(heights) < LEAST_APART_M:
-        return None
-    return Tilted(wind, float(np.hypot(*peak.tilt)), float(heights.min()), float(heights.max()))
 
 
 LEAST_SIDE = 8.0  # least sum of weights of the cells of a tile above a height, and below
@@ -516,7 +463,7 @@ def tile_moments(
     return sums, count
 
 
-LEAST_TILE_CELLS, LEAST_TILE_RELIEF_M = 40, 0.1
+LEAST_TILE_CELLS = 40
 
 
 def cue_moments(
@@ -547,8 +494,6 @@ def cue_moments(
             # the smooth ground passes the height of the break: with the heights themselves, noise
             # would be on both sides of the equation and hide the break
             at = smooth @ np.linalg.lstsq(smooth, y, rcond=None)[0]
-            if np.ptp(at) < LEAST_TILE_RELIEF_M:
-                continue
         tile_sums, tile_count = tile_moments(smooth, y, at, heights_m, cue)
         if tile_count.any():
             found.append((tile_sums, tile_count, xy[rows].mean(axis=0)))
@@ -581,16 +526,21 @@ def sample_cloud(xyz: FloatArray, rgb: npt.NDArray[Any] | None) -> Samples:
 
     Colours, shape (n, 3), are in any unit from zero up; equal ones count as none.
     """
+    from scipy import ndimage  # slow to import
+
     origin = xyz.min(axis=0)
     local = xyz - origin
-    cell_m = _cell_m(local)
-    cell = square_tiles(local, cell_m)
-    _, of_point, count = np.unique(cell, return_inverse=True, return_counts=True)
+    # cells of about `POINTS_PER_CELL`, at most `MOST_CELLS`; clouds seldom fill their bounding box
+    wanted = min(len(local) / POINTS_PER_CELL, MOST_CELLS)
+    cell_m = float(np.sqrt(max(np.prod(np.ptp(local[:, :2], axis=0)), 1e-6) / wanted))
+    for _ in range(_TRIES):
+        cell_m *= np.sqrt(len(np.unique(square_tiles(local, cell_m))) / wanted)
+    _, of_point, count = np.unique(
+        square_tiles(local, cell_m), return_inverse=True, return_counts=True
+    )
     of_point = of_point.reshape(-1)
     mean = [np.bincount(of_point, local[:, i]) / count for i in (0, 1)]
-    ordered = local[np.lexsort((local[:, 2], of_point)), 2]
-    first = np.cumsum(count) - count
-    median = (ordered[first + (count - 1) // 2] + ordered[first + count // 2]) / 2.0
+    median = ndimage.median(local[:, 2], of_point, np.arange(len(count)))
     ground = np.column_stack([*mean, median])
     colour = np.empty((0, 3))
     if rgb is not None and (rgb != rgb[:1]).any():
@@ -599,16 +549,6 @@ def sample_cloud(xyz: FloatArray, rgb: npt.NDArray[Any] | None) -> Samples:
         logs = np.log(light + 0.004 * white)  # a small part of white keeps black finite
         colour = np.column_stack([np.bincount(of_point, column) / count for column in logs.T])
     return Samples(ground, _smoothed(ground), colour, cell_m, origin)
-
-
-def _cell_m(local: FloatArray) -> float:
-    """Return the side of cells of about `POINTS_PER_CELL`, at most `MOST_CELLS` of them."""
-    wanted = min(len(local) / POINTS_PER_CELL, MOST_CELLS)
-    side = float(np.sqrt(max(np.prod(np.ptp(local[:, :2], axis=0)), 1e-6) / wanted))
-    for _ in range(_TRIES):  # clouds seldom fill their bounding box
-        held = len(np.unique(square_tiles(local, side)))
-        side *= np.sqrt(held / wanted)
-    return side
 
 
 def square_tiles(local: FloatArray, side_m: float) -> IntArray:
@@ -625,8 +565,5 @@ def _smoothed(ground: FloatArray) -> FloatArray:
     _, near = cKDTree(ground[:, :2]).query(ground[:, :2], k=k + 1)
     around = ground[np.asarray(near)[:, 1:]] - ground[:, None]
     design = np.concatenate([np.ones((*around.shape[:2], 1)), around[..., :2]], axis=2)
-    normal = np.einsum("mki,mkj->mij", design, design)
-    scale = np.trace(normal, axis1=1, axis2=2)[:, None, None]
-    right = np.einsum("mki,mk->mi", design, around[..., 2])
-    plane = np.linalg.solve(normal + 1e-9 * scale * np.eye(3), right[..., None])[..., 0]
-    return np.asarray(ground[:, 2] + plane[:, 0])
+    plane = np.linalg.pinv(design) @ around[..., 2:]
+    return np.asarray(ground[:, 2] + plane[:, 0, 0])

@@ -71,10 +71,6 @@ class WaterFit(ShoreFit):
     """Of `level_m` and `tilt`, shape (3, 3): zero for what the model does not have, NaN without
     redundancy. It does not include errors that all points share, as of a wrong datum."""
 
-    def height_at(self, xy: FloatArray) -> FloatArray:
-        """Return the height (m) of the surface at places (m, 2)."""
-        return np.asarray(self.level_m + (xy - self.centre_xy) @ self.tilt)
-
     def sigma_at(self, xy: FloatArray) -> FloatArray:
         """Return the standard error (m) of that height."""
         row = np.column_stack([np.ones(len(xy)), xy - self.centre_xy])
@@ -118,16 +114,25 @@ def fit_water(
         text = f"None of {len(xyz)} shoreline points has a height. Give heights, or the cloud."
         raise GeometryError("water.too_few_points", text, points=0, least=1)
     worth = np.ones(len(known)) if counts is None else np.asarray(counts, np.float64)[known]
-    shore = _shore(xyz[known], worth)
+    origin = xyz[known, :2].mean(axis=0)
+    local = xyz[known, :2] - origin
+    variance, vectors = np.linalg.eigh(local.T @ local / len(known))
+    spread = np.sqrt(np.maximum(variance[::-1], 0.0))
+    # level, and rise over one spread along and across the points: unknowns of similar size
+    units = vectors[:, ::-1] / np.maximum(spread, _SAME_PLACE_M)
+    design = np.column_stack([np.ones(len(known)), local @ units])
+    shore = _Shore(design, xyz[known, 2], worth, *spread.tolist())
     if model == "auto":
         model, found, notes = _choose(shore)
     else:
         found, notes = _regression(shore, model), []
-    accepted = found.weight > 0.0
-    centre = shore.xyz[accepted, :2].mean(axis=0)
-    moved = np.eye(3)
-    moved[0, 1:] = centre - shore.centre
-    level, *tilt = (moved @ found.beta).tolist()
+    accepted, p = found.weight > 0.0, len(found.beta)
+    centre = xyz[known[accepted], :2].mean(axis=0)
+    # level at the centre of the accepted points, and slopes in x and y
+    to_world = np.zeros((3, p))
+    to_world[0, 0], to_world[1:, 1:] = 1.0, units[:, : p - 1]
+    to_world[0] += (centre - origin) @ to_world[1:]
+    level, *tilt = (to_world @ found.beta).tolist()
     missing = len(xyz) - len(known)
     if missing:
         notes.append(f"{missing} points have no height and are ignored.")
@@ -153,7 +158,7 @@ def fit_water(
         centre_xy=centre,
         level_m=level,
         tilt=np.array(tilt),
-        covariance=moved @ found.covariance @ moved.T,
+        covariance=to_world @ found.covariance @ to_world.T,
         residual_m=residual,
         weight=weight,
         sigma_m=found.sigma_m,
@@ -171,44 +176,34 @@ def fit_water(
 
 
 class _Shore(NamedTuple):
-    """Shoreline points with heights, and their principal axes in plan."""
+    """Shoreline points with heights, in their principal axes."""
 
-    xyz: FloatArray
-    worth: FloatArray  # independent observations that each is worth
-    centre: FloatArray
-    axes: FloatArray  # unit vectors along and across, rows
-    spread_m: FloatArray  # rms distance from the centre along and across
-
-
-def _shore(xyz: FloatArray, worth: FloatArray) -> _Shore:
-    """Find the principal axes of points."""
-    centre = xyz[:, :2].mean(axis=0)
-    local = xyz[:, :2] - centre
-    variance, vectors = np.linalg.eigh(local.T @ local / len(xyz))
-    return _Shore(xyz, worth, centre, vectors.T[::-1], np.sqrt(np.maximum(variance[::-1], 0.0)))
+    design: FloatArray  # (n, 3), 1, and the place along and across the points, in spreads
+    z: FloatArray  # (n,), metres
+    worth: FloatArray  # (n,), independent observations that each is worth
+    along_m: float  # spread: rms distance from the centre along and across the points
+    across_m: float
 
 
 def _choose(shore: _Shore) -> tuple[Model, Regression, list[str]]:
     """Return the model with significant tilts only, its fit, and why."""
-    (along, across), count = shore.spread_m, len(shore.xyz)
-    if count <= _FEWEST_FOR_PLANE or along < _SAME_PLACE_M:
-        note = f"{count} points are too few or too close together for a tilt: a level is fitted."
-        return "level", _regression(shore, "level"), [note]
+    along, across = shore.along_m, shore.across_m
+    if len(shore.z) <= _FEWEST_FOR_PLANE or along < _SAME_PLACE_M:
+        few = f"{len(shore.z)} points are too few or too close together for a tilt"
+        return "level", _regression(shore, "level"), [f"{few}: a level is fitted."]
     model: Model = "along" if across < LINE_RATIO * along else "plane"
     found = _regression(shore, model)
-    chance = _chance_of_tilt(shore, found, _UNKNOWNS[model])
+    chance = _chance_of_tilt(shore, found)
     if not chance < SIGNIFICANCE:
         note = f"The tilt of the points is not significant (p = {chance:.2f}): a level is fitted."
         return "level", _regression(shore, "level"), [note]
     notes = [f"The tilt of the points is significant (p = {chance:.2g})."]
-    axis, covariance = shore.axes[1], found.covariance[1:, 1:]
-    is_level_across = (axis @ found.beta[1:]) ** 2 < 4.0 * (axis @ covariance @ axis)  # 2 sigma
     if model == "along":
         notes.append(
             f"The points are nearly on one line (rms {across:.1f} m across, {along:.1f} m along):"
             " the surface is level across it."
         )
-    elif across < LONG_RATIO * along and is_level_across:
+    elif across < LONG_RATIO * along and found.beta[2] ** 2 < 4.0 * found.covariance[2, 2]:
         notes.append(
             "There is no tilt across the direction of the points: the surface is level across it."
         )
@@ -217,8 +212,8 @@ def _choose(shore: _Shore) -> tuple[Model, Regression, list[str]]:
 
 
 def _regression(shore: _Shore, model: Model) -> Regression:
-    """Fit level and tilt about the centre of the points; zero for what the model does not have."""
-    p, n, (along, across) = _UNKNOWNS[model], len(shore.xyz), shore.spread_m
+    """Fit the unknowns of a model: level, and rise along and across the points."""
+    p, n, along, across = _UNKNOWNS[model], len(shore.z), shore.along_m, shore.across_m
     on_line = (p > 1 and along < _SAME_PLACE_M) or (p > 2 and across < _ON_LINE * along)
     if n < p or on_line:
         raise GeometryError(
@@ -228,28 +223,22 @@ def _regression(shore: _Shore, model: Model) -> Regression:
             f" {across:.2g} m across). Fit a level, or a tilt along them.",
             points=n, least=p,
         )  # fmt: skip
-    # in units of the spread, so that all columns are of similar size
-    units = (shore.axes[: p - 1] / shore.spread_m[: p - 1, None]).T
-    local = shore.xyz[:, :2] - shore.centre
-    found = robust_regression(np.column_stack([np.ones(n), local @ units]), shore.xyz[:, 2])
-    to_world = np.zeros((3, p))
-    to_world[0, 0], to_world[1:, 1:] = 1.0, units
-    grown = shared(found.weight, shore.worth, p) * found.covariance
-    return found._replace(beta=to_world @ found.beta, covariance=to_world @ grown @ to_world.T)
+    found = robust_regression(shore.design[:, :p], shore.z)
+    grown = shared(found.weight, shore.worth, p)
+    return found._replace(covariance=grown * found.covariance)
 
 
-def _chance_of_tilt(shore: _Shore, fit: Regression, unknowns: int) -> float:
+def _chance_of_tilt(shore: _Shore, fit: Regression) -> float:
     """Return the p-value of a tilt, if the surface is level (Wald's test, F distribution)."""
     from scipy.stats import f
 
-    tilts, spare = unknowns - 1, float(shore.worth[fit.weight > 0.0].sum()) - unknowns
+    rise, covariance = fit.beta[1:], fit.covariance[1:, 1:]
+    spare = float(shore.worth[fit.weight > 0.0].sum()) - len(fit.beta)
     if spare <= 0.0:
         return 1.0
     if fit.sigma_m < _NO_SCATTER_M:
-        return float(np.abs(shore.axes @ fit.beta[1:] * shore.spread_m).max() < _NO_SCATTER_M)
-    axes = shore.axes[:tilts]
-    tilt, covariance = axes @ fit.beta[1:], axes @ fit.covariance[1:, 1:] @ axes.T
-    return float(f.sf(tilt @ np.linalg.solve(covariance, tilt) / tilts, tilts, spare))
+        return float(np.abs(rise).max() < _NO_SCATTER_M)
+    return float(f.sf(rise @ np.linalg.solve(covariance, rise) / len(rise), len(rise), spare))
 
 
 TUKEY = 4.685061  # Tukey's constant for 95 % efficiency

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar, get_args
 
@@ -120,54 +119,42 @@ def with_index(options: Options) -> Options:
     They have an index, or salinity, temperature or wavelength. Raises SettingError
     ``option.exclusive`` if both are given.
     """
-    own = {name: getattr(options, name) for name in Water._fields if hasattr(options, name)}
+    own = {name: getattr(options, name, None) for name in Water._fields}
     given = {name: value for name, value in own.items() if value is not None}
-    index = options.index
-    if given:
-        if index is not None:
-            raise SettingError(
-                "option.exclusive",
-                "index excludes salinity, temperature and wavelength. Give one or the others.",
-                options=["index", *given],
-            )
-        index = ",".join(map(repr, Water(**given)))
-    number, origin = index_of(index, options.index_formula)
-    silent: dict[str, Any] = dict.fromkeys(own)
+    if given and options.index is not None:
+        raise SettingError(
+            "option.exclusive",
+            "index excludes salinity, temperature and wavelength. Give one or the others.",
+            options=["index", *given],
+        )
+    water = Water(**given) if given else None
+    number, origin = index_of(options.index, options.index_formula, water)
+    silent: dict[str, Any] = dict.fromkeys(given)
     return replace(options, index=number, index_from=origin or options.index_from, **silent)
 
 
-def index_of(given: float | str | None, formula: IndexFormula = "skarlatos") -> tuple[float, str]:
+def index_of(
+    given: float | str | None, formula: IndexFormula = "skarlatos", water: Water | None = None
+) -> tuple[float, str]:
     """Return a refractive index and a description of its water, empty if only a number is given.
 
-    It is given as a number, by default `DEFAULT_REFRACTIVE_INDEX`; as ``fresh`` or ``sea``; or as
-    ``S,T`` or ``S,T,W``: salinity in PSU, temperature in degrees Celsius and wavelength in
-    micrometres. Raises SettingError ``option.index`` if it is none of these.
+    It is that of `water`, or given as a number, by default `DEFAULT_REFRACTIVE_INDEX`, or as
+    ``fresh`` or ``sea``. Raises SettingError ``option.index`` if it is none of these.
     """
-    if given is None:
-        return DEFAULT_REFRACTIVE_INDEX, ""
-    text = str(given).strip().lower()
-    water = WATERS.get(text)
-    if re.fullmatch(r"1,\d+", text):
-        raise SettingError(
-            "option.index",
-            f"index '{given}' has a decimal comma. Write {text.replace(',', '.')}, or"
-            f" {text.replace(',', '.0,')} for water of 1 PSU at {text[2:]} degrees.",
-            value=given,
-        )
-    try:
-        if water is None and "," in text:
-            water = Water(*(float(word) for word in text.split(",")))
-        if water is None:
+    text = str(DEFAULT_REFRACTIVE_INDEX if given is None else given).strip().lower()
+    named = WATERS.get(text)
+    water = water or named
+    if water is None:
+        try:
             return float(text), ""
-    except (ValueError, TypeError):
-        raise SettingError(
-            "option.index",
-            f"index '{given}' is not known. Give a number, {', '.join(WATERS)}, or salinity,"
-            " temperature and wavelength as 35,15,0.53.",
-            value=given,
-        ) from None
-    name = f"{text}: " if text in WATERS else ""
+        except ValueError:
+            raise SettingError(
+                "option.index",
+                f"index '{given}' is not known. Give a number such as 1.34, {' or '.join(WATERS)}.",
+                value=given,
+            ) from None
     by = "" if formula == "skarlatos" else f", by {formula}"
     return refractive_index(*water, formula=formula), (
-        f"{name}{water.salinity:g} PSU, {water.temperature:g} C, {water.wavelength:g} um{by}"
+        f"{f'{text}: ' if named else ''}{water.salinity:g} PSU, {water.temperature:g} C,"
+        f" {water.wavelength:g} um{by}"
     )

@@ -169,21 +169,17 @@ def flow_axis(xy: FloatArray) -> Axis:
     net = np.unique(places, axis=0)
     nodes = _smoothed(net, *_stations(net))
     for _ in range(_ROUNDS):
-        station, width = _located(nodes, places)
+        station, away = Axis(nodes, 0.0).locate(places)
         gap = float(np.quantile(np.diff(np.sort(station)), 0.9))  # one in ten is wider
-        bandwidth = max(width, gap, 1e-3)
+        bandwidth = max(2.0 * float(np.sqrt(np.mean(away**2))), gap, 1e-3)
         nodes = _smoothed(places, station, bandwidth)
+    _, away = Axis(nodes, 0.0).locate(places)
     # longer at both ends, so that the outermost points have feet on the line
     outward = nodes[[0, -1]] - nodes[[1, -2]]
     outward /= np.maximum(np.hypot(*outward.T), 1e-9)[:, None]
     first, last = nodes[[0, -1]] + 2.0 * bandwidth * outward
-    return Axis(np.vstack([first, nodes, last]) + origin, _located(nodes, places)[1])
-
-
-def _located(nodes: FloatArray, places: FloatArray) -> tuple[FloatArray, float]:
-    """Return the distance of places along a line, and twice their rms distance from it."""
-    station, away = Axis(nodes, 0.0).locate(places)
-    return station, 2.0 * float(np.sqrt(np.mean(away**2)))
+    width = 2.0 * float(np.sqrt(np.mean(away**2)))
+    return Axis(np.vstack([first, nodes, last]) + origin, width)
 
 
 def _stations(xy: FloatArray) -> tuple[FloatArray, float]:

@@ -43,6 +43,10 @@ class FoundSurface:
         """Return the figures of a fit as plain values; None without a fit."""
         return None
 
+    def height_at(self, xy: FloatArray) -> FloatArray:
+        """Return the height (m) of the surface at places (m, 2); NaN where it is unknown."""
+        return surface_above(self.surface, np.column_stack([xy, xy[:, :1]])).height_m
+
     def sigma_at(self, xy: FloatArray) -> FloatArray | None:
         """Return the standard error (m) of the height at places (m, 2), if there is a fit."""
         return None
