@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, ViewKind
+from pcfix.model import FloatArray, IntArray, Outcome, ViewKind
 from pcfix.options.correct import Dimensions, ScienceOptions
 from pcfix.refract import patches
 from pcfix.refract.batch import FLAT_DEG, Batch, ModelUncertainty
@@ -63,6 +63,11 @@ class Reconstruction(NamedTuple):
     changes: dict[str, Any]  # the options that correct such a cloud
     kind: ViewKind | None = None  # of its view list, if there is one
 
+    @property
+    def is_single(self) -> bool:
+        """Whether it is single maps, which predict little but the scatter of neighbours."""
+        return self.words in (_SINGLE, _NEAREST)
+
     def settings(self, given: ScienceOptions) -> ScienceOptions:
         """Return the options that correct such a cloud."""
         of_factor = self.changes.get("method", given.method) == "factor"
@@ -105,11 +110,6 @@ LIMITS = (
     ),
 )
 """The rays that may have been used in the reconstruction, for the methods of `ALIKE`."""
-STRONG = 0.25
-"""Largest share of the discontinuities that a limit may leave. On simulated tracks with obliques,
-where a limit doubles the errors, it leaves 0.28; where it more than halves them, on a rendered
-block with obliques, 0.15 to 0.2; on a real river, whose depths it makes plausible, 0.02 to 0.12."""
-
 SOFTWARE: dict[str, tuple[str, ...]] = {
     "openmvs": (_MAPS,), "odm": (_MAPS,), "opendronemap": (_MAPS,), "opensfm": (_MAPS,),
     "colmap": (_MAPS,), "realitycapture": (_MAPS,), "realityscan": (_MAPS,),
@@ -142,9 +142,9 @@ def hint_of(names: tuple[str, ...]) -> Hint | None:
 class Verdict(NamedTuple):
     """The reconstruction type of a cloud, and the evidence.
 
-    `share` and `runner_up_share` are the shares of the discontinuities, by which the two types
-    differ, that are left in the bed of each: 0 where right. `candidates` are the shares that other
-    types leave, against the chosen one. `straight` is that share between the chosen type and
+    `share` is the share of the discontinuities, by which the chosen type and the runner-up differ,
+    that is left in the bed of the chosen one: 0 where right. `candidates` are the shares that the
+    other types leave, against the chosen one. `straight` is the share between the chosen type and
     straight rays, near 1 if the poses have absorbed the refraction, and its standard error.
     """
 
@@ -152,8 +152,8 @@ class Verdict(NamedTuple):
     runner_up: Reconstruction  # the next best; if the user set the type, the best of all others
     errors: float  # standard errors by which the evidence is for the chosen type
     share: float
-    runner_up_share: float
-    sigma: float  # standard error of both
+    sigma: float  # standard error of the share
+    candidates: dict[str, float]
     deeper_m: float  # mean depth of the runner-up's bed below the chosen one
     patches: int  # 0 without evidence
     confidence: float  # probability that the type is right, and none of the others
@@ -163,7 +163,6 @@ class Verdict(NamedTuple):
     remarks: tuple[str, ...] = ()  # what makes the evidence weak
     of: str = ""  # the points it is about; empty for all
     straight: tuple[float, float] | None = None
-    candidates: tuple[tuple[str, float], ...] = ()
 
     @property
     def is_fused(self) -> bool:
@@ -176,11 +175,6 @@ class Verdict(NamedTuple):
         return self.errors > SURE
 
     @property
-    def is_strong(self) -> bool:
-        """Whether the type leaves hardly any discontinuities, at two standard errors from half."""
-        return self.patches > 0 and self.share <= min(STRONG, 0.5 - 2.0 * self.sigma)
-
-    @property
     def is_against(self) -> bool:
         """Whether the other type fits significantly better."""
         return self.errors < -SURE
@@ -190,7 +184,7 @@ class Verdict(NamedTuple):
         differs = self.is_against and abs(self.deeper_m) > self.model_uncertainty.formal_m
         unsure = differs if self.is_given else not self.is_sure
         # of single maps the shares say little
-        by_shares = not _is_single((self.chosen, self.runner_up)).any()
+        by_shares = not (self.chosen.is_single or self.runner_up.is_single)
         poor = by_shares and not self.is_sure and self.share > FITS
         absurd = self.share < min(MOST_BEYOND, -SURE * self.sigma)
         none_fits = not self.is_given and self.patches > 0 and (poor or absurd)
@@ -203,19 +197,16 @@ class Verdict(NamedTuple):
             "sure": self.is_sure,
             "confidence": round(self.confidence, 4),
             "share": round(self.share, 3),
-            "candidates": {name: round(share, 3) for name, share in self.candidates},
+            "candidates": {name: round(share, 3) for name, share in self.candidates.items()},
             "runner_up": self.runner_up.words,
-            "runner_up_share": round(self.runner_up_share, 3),
-            "sigma": round(self.sigma, 3),
             "runner_up_deeper_m": round(self.deeper_m, 4),
             "patches": self.patches,
-            "by": self.by,
             "scatter_m": round(self.model_uncertainty.scatter_m, 4),
             "doubt_per_depth": round(self.model_uncertainty.per_depth, 4),
         }
 
     def __str__(self) -> str:
-        way = "lower" if self.deeper_m >= 0.0 else "higher"
+        way, other = "lower" if self.deeper_m >= 0.0 else "higher", self.runner_up.words
         points = self.of[:1].upper() + self.of[1:] or "Cloud"
         how = "set by the user"
         if not self.is_given:
@@ -223,15 +214,15 @@ class Verdict(NamedTuple):
             how = f"detected{by}, confidence {100.0 * self.confidence:.0f} %"
         fit = ", which fits better" if self.is_given and self.is_against else ""
         text = (
-            f"{points}: {self.chosen.words} ({how}). Next best: {self.runner_up.words}{fit}; the"
-            f" bed would be {abs(self.deeper_m):.3f} m {way}."
+            f"{points}: {self.chosen.words} ({how}). Next best: {other}{fit}; the bed would be"
+            f" {abs(self.deeper_m):.3f} m {way}."
         )
         if not self.patches or self.share > 0.5:
             return text
-        left, other = (100.0 * min(max(x, 0.0), 1.0) for x in (self.share, self.runner_up_share))
+        left, more = np.clip([self.share, self.candidates[other]], 0.0, 1.0)
         return (
-            f"{text} Discontinuities between image footprints left in the bed: {left:.0f} %, with"
-            f" {self.runner_up.words} {other:.0f} % ({self.patches} patches)."
+            f"{text} Discontinuities between image footprints left in the bed: {100.0 * left:.0f}"
+            f" %, with {other} {100.0 * more:.0f} % ({self.patches} patches)."
         )
 
 
@@ -336,8 +327,10 @@ def weigh(
         runner_up=beds.types[other],
         errors=float(beds.errors[best, other]) if beds.patches else 0.0,
         share=float(beds.share[best, other]),
-        runner_up_share=float(beds.share[other, best]),
         sigma=float(beds.sigma[best, other]),
+        candidates={
+            one.words: float(beds.share[i, best]) for i, one in enumerate(beds.types) if i != best
+        },
         deeper_m=deeper_m,
         patches=beds.patches,
         confidence=min(confidence, MOST_CONFIDENCE),
@@ -346,9 +339,6 @@ def weigh(
         is_given=given is not None,
         remarks=remarks,
         straight=straight,
-        candidates=tuple(
-            (one.words, float(beds.share[i, best])) for i, one in enumerate(beds.types) if i != best
-        ),
     )
 
 
@@ -384,14 +374,6 @@ def _beds(
     return _Beds(types, z, place, len(place), share, sigma, errors)
 
 
-def _is_single(types: tuple[Reconstruction, ...]) -> BoolArray:
-    """Return which types are single maps.
-
-    They predict little but the scatter of neighbours, or discontinuities at few places.
-    """
-    return np.array([one.words in (_SINGLE, _NEAREST) for one in types])
-
-
 def _log_likelihood(part: Batch, place: IntArray, one: Reconstruction, z: FloatArray) -> FloatArray:
     """Return the log likelihood of each patch for a type, per point."""
     candidates = Candidates(z[:, None], np.ones((len(z), 1)))
@@ -408,7 +390,8 @@ def _log_likelihood(part: Batch, place: IntArray, one: Reconstruction, z: FloatA
 def _with_prior(beds: _Beds, is_dense: bool, hint: Hint | None) -> tuple[_Beds, str]:
     """Add what is known of the types by density and software; return what decided, if these did."""
     words = [one.words for one in beds.types]
-    is_single, tracks = _is_single(beds.types), np.array([one == _TRACKS for one in words])
+    is_single = np.array([one.is_single for one in beds.types])
+    tracks = np.array([one == _TRACKS for one in words])
     prior = (
         PRIOR_TRACKS[0] * tracks
         if is_dense
@@ -457,20 +440,21 @@ def _model_uncertainty(part: Batch, beds: _Beds, at: int, among: list[int]) -> M
     """
     depth = np.maximum(part.surface.height_m - beds.z[at], 1e-3)[beds.place]
     deep = depth > LEAST_DEPTH_M
-    is_single = _is_single(beds.types)
 
     def left(a: int, b: int, most: float) -> float:
-        apart = np.abs((beds.z[a] - beds.z[b])[beds.place]) / depth
-        share = _open_share(float(beds.errors[a, b]))
-        if not is_single[[a, b]].any():
-            share = max(
-                share, min(max(float(beds.share[a, b]), 0.0) + float(beds.sigma[a, b]), 1.0)
-            )
-        if not np.isfinite(apart[deep]).any():
+        apart = (np.abs((beds.z[a] - beds.z[b])[beds.place]) / depth)[deep]
+        # by the probability of the other type
+        wrong = 0.5 * math.erfc(beds.errors[a, b] / math.sqrt(2.0))
+        share = float(np.interp(wrong, OPEN, (0.0, 1.0)))
+        # single maps predict discontinuities at few places only
+        if not (beds.types[a].is_single or beds.types[b].is_single):
+            by_steps = max(float(beds.share[a, b]), 0.0) + float(beds.sigma[a, b])
+            share = max(share, min(by_steps, 1.0))
+        if not np.isfinite(apart).any():
             return 0.0
         # its 95 % interval covers 95 % of the differences
-        rms = float(np.sqrt(np.nanmean(apart[deep] ** 2)))
-        spread = max(rms, float(np.nanquantile(apart[deep], 0.95)) / 1.96)
+        rms = float(np.sqrt(np.nanmean(apart**2)))
+        spread = max(rms, float(np.nanquantile(apart, 0.95)) / 1.96)
         return (share if share <= most else 1.0) * spread
 
     best, _ = beds.rank(among)
@@ -481,11 +465,6 @@ def _model_uncertainty(part: Batch, beds: _Beds, at: int, among: list[int]) -> M
     budget = correct(_as(part, beds.types[at], "all"))
     formal = float(np.median(budget.sigma_z_m))
     return ModelUncertainty(math.sqrt(max(scatter**2 - formal**2, 0.0)), open_m, formal)
-
-
-def _open_share(errors: float) -> float:
-    """Return how much of the difference to another type counts, by its probability."""
-    return float(np.interp(0.5 * math.erfc(errors / math.sqrt(2.0)), OPEN, (0.0, 1.0)))
 
 
 def _as(part: Batch, one: Reconstruction, dimensions: Dimensions = "none") -> Batch:
