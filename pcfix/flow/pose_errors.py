@@ -20,7 +20,7 @@ from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, Outcome
 from pcfix.options.declare import File
 from pcfix.refract.batch import Batch, OriginalModel, Survey
 from pcfix.refract.methods import correct
-from pcfix.refract.pose_errors import PoseErrors, pose_errors_of
+from pcfix.refract.uncertainty import PoseErrors, pose_errors_of
 from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:

@@ -26,8 +26,8 @@ from pcfix.water.surface import OwnWater, SurfaceAbove
 if TYPE_CHECKING:
     from pcfix.refract.matcher import Bed, Matcher
     from pcfix.refract.occlusion import Occluder
-    from pcfix.refract.pose_errors import PoseErrors
     from pcfix.refract.regression import DepthRegression
+    from pcfix.refract.uncertainty import PoseErrors
 
 NO_CAMERA, ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 PARALLEL, CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
@@ -44,7 +44,7 @@ UNLISTED, MAIN = -1, -2
 
 
 class Learned(NamedTuple):
-    """What was learned from the whole cloud; None where it was not."""
+    """What was estimated from the cloud as a whole; None where it was not."""
 
     regression: DepthRegression | None = None  # for the method of that name
     occluder: Occluder | None = None  # the surface of the cloud
@@ -53,7 +53,7 @@ class Learned(NamedTuple):
     model_uncertainty: ModelUncertainty | None = None
     land: Survey | None = None  # for land transferred to adjusted cameras, if it differs
     poses: PoseErrors | None = None  # errors of Z from the adjusted poses
-    limit_deg: float | None = None  # largest incidence angle of the rays that made the points
+    limit_deg: float | None = None  # largest incidence angle of the rays of the points
 
 
 class ModelUncertainty(NamedTuple):
@@ -65,7 +65,7 @@ class ModelUncertainty(NamedTuple):
 
 
 class OriginalModel(NamedTuple):
-    """The model from which m points came, if the cameras were adjusted since."""
+    """The model of m points before their cameras were adjusted."""
 
     xyz: FloatArray  # (m, 3), original apparent points, metres, world frame
     cameras: Cameras  # in the order of the adjusted ones, with angles and lenses
@@ -358,23 +358,12 @@ def images_of(original_model: OriginalModel | None, now: Cameras) -> Images:
 
 
 @device
-def to_original(images: Images, c: int, a: Vector) -> Vector:
-    """Convert a direction in which adjusted camera c sees something to the original camera.
+def in_other(one: Optics | None, other: Optics | None, c: int, a: Vector) -> Vector:
+    """Convert a direction in which camera c sees something to another pose and lens of the image.
 
-    Both in the world frame, of any length; NaN where there is no image.
+    Both are in the world frame, of any length, and belong to the same place in the image; NaN where
+    there is no image.
     """
-    return _between(images.adjusted, images.original, c, a)
-
-
-@device
-def to_adjusted(images: Images, c: int, a: Vector) -> Vector:
-    """Convert a direction of original camera c to the adjusted camera."""
-    return _between(images.original, images.adjusted, c, a)
-
-
-@device
-def _between(one: Optics | None, other: Optics | None, c: int, a: Vector) -> Vector:
-    """Return the direction of the same place in the image for another pose and lens."""
     if one is None or other is None:
         return a
     u, v = image_of(one.lenses[one.row[c]], *times(one.rotations[c], a))

@@ -60,8 +60,7 @@ from pcfix.refract.batch import (
     Images,
     Intersection,
     images_of,
-    to_adjusted,
-    to_original,
+    in_other,
 )
 from pcfix.refract.likelihood import Candidates
 from pcfix.refract.matcher import LEAST_NEAR, NEAR, Matcher
@@ -173,7 +172,7 @@ class Groups(NamedTuple):
     rise: FloatArray  # (k,), how far up the bed is if the group of a seed made the point, metres
     size: FloatArray  # (k,), the number of maps in the group
     own: FloatArray  # (k,), the depth of each map before it is averaged
-    count: FloatArray  # (k,), how many maps are averaged into each
+    number: FloatArray  # (k,), how many maps are averaged into each
 
 
 def invert_depth_maps(batch: Batch) -> Intersection:
@@ -418,7 +417,7 @@ def _aim(out: FloatArray, c: int, count: int, tile: Tile, block: Block) -> None:
         up, way = minus(centre, p), minus(original, three(tile.points, _ORIGINAL * TILE + j))
         above = normal[2] * (tile.points[3 * TILE + j] - (p[2] - points.offset[c]))
         # the ray of the original image in the adjusted camera, from where it passes the point
-        d = to_adjusted(images, c, scaled(-1.0, way))
+        d = in_other(images.original, images.adjusted, c, scaled(-1.0, way))
         e = scaled(dot(up, d) / dot(d, d), d)
         a = minus(up, e)
         above -= dot(normal, a)
@@ -457,7 +456,8 @@ def _compare(partner: FloatArray, c: int, other: int, count: int, tile: Tile, bl
         k, _, _, _, s = light_near(three(room, _Q * TILE + j), up, normal, above, n)
         # a camera under the water sees nothing
         k = k if dot(normal, up) > above else np.nan
-        put(room, _W * TILE + j, to_original(images, other, minus(scaled(k, s), normal)))
+        w = in_other(images.adjusted, images.original, other, minus(scaled(k, s), normal))
+        put(room, _W * TILE + j, w)
     # frames hold places relative to the camera, here w
     sees = room[_SEES * TILE : _SEES * TILE + count]
     mark(sees, room[_W * TILE :], TILE, matcher.inner, other, (0.0, 0.0, 0.0))
@@ -650,7 +650,7 @@ def _average(q: int, groups: Groups) -> None:
         change += groups.slope[a] if agrees else 0.0
         count += 1.0 if agrees else 0.0
     each = 1.0 / count
-    groups.depth[q], groups.change[q], groups.count[q] = total * each, change * each, count
+    groups.depth[q], groups.change[q], groups.number[q] = total * each, change * each, count
 
 
 @device(forceinline=True)
@@ -688,7 +688,7 @@ def _share_out(seed: int, groups: Groups, listed: bool) -> None:
             continue
         for a in groups.averaged[q]:
             if a >= 0 and abs(groups.own[a] - groups.own[q]) < AVERAGED_WITHIN:
-                groups.weight[a] += groups.share[q] / groups.count[q]
+                groups.weight[a] += groups.share[q] / groups.number[q]
 
 
 @device

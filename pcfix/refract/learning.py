@@ -69,9 +69,13 @@ def resolved(
 
 
 def wants_sample(survey: Survey, views: ViewKind | None) -> bool:
-    """Return whether a sample of the whole cloud is needed."""
-    known = survey.settings.depth_factor != "auto"
-    return wants_matcher(survey, views) or _wants_limit(survey.settings, views) or not known
+    """Return whether a sample of the whole cloud is needed, with a kind of view list or none."""
+    settings = survey.settings
+    if settings.depth_factor == "auto" or _wants_comparison(survey):
+        return True
+    if views is None:
+        return _wants_matcher(survey) or _wants_limit(settings)
+    return views in ("depth-maps", "pair-images") and settings.method == "consistent"
 
 
 def with_factor(batch: Batch) -> tuple[Batch, StereoFactor | None]:
@@ -96,9 +100,9 @@ where a limit doubles the errors, it leaves 0.28; where it more than halves them
 block with obliques, 0.15 to 0.2; on a real river, whose depths it makes plausible, 0.02 to 0.12."""
 
 
-def _wants_limit(settings: ScienceOptions, views: ViewKind | None) -> bool:
+def _wants_limit(settings: ScienceOptions) -> bool:
     """Whether the largest incidence angle is to be estimated from the cloud."""
-    return views is None and settings.max_angle == "auto" and settings.method in ALIKE
+    return settings.max_angle == "auto" and settings.method in ALIKE
 
 
 def _wants_comparison(survey: Survey) -> bool:
@@ -107,18 +111,15 @@ def _wants_comparison(survey: Survey) -> bool:
     That needs one water surface.
     """
     settings, cameras = survey.settings, survey.cameras
-    told = settings.dimensions == "all" and settings.method != "regression"
-    full = cameras.lenses is not None and cameras.rotations is not None
-    return told and full and survey.own_water is None
+    wanted = settings.dimensions == "all" and settings.method != "regression"
+    oriented = cameras.lenses is not None and cameras.rotations is not None
+    return wanted and oriented and survey.own_water is None
 
 
-def wants_matcher(survey: Survey, views: ViewKind | None) -> bool:
-    """Return whether the partners of the images are needed, for a kind of view list or none."""
-    settings, compared = survey.settings, _wants_comparison(survey)
-    if views is None:
-        return settings.models_matcher or settings.method == "auto" or compared
-    dense = views in ("depth-maps", "pair-images")
-    return compared or (dense and settings.method == "consistent")
+def _wants_matcher(survey: Survey) -> bool:
+    """Whether the partners of the images are needed, without a view list."""
+    settings = survey.settings
+    return settings.models_matcher or settings.method == "auto" or _wants_comparison(survey)
 
 
 def learn_of_sample(
@@ -126,45 +127,35 @@ def learn_of_sample(
 ) -> tuple[Survey, tuple[Verdict, ...]]:
     """Resolve ``auto`` and estimate the partners of the images and the bed, as needed.
 
-    The batch are points of the whole cloud, evenly spread, with land; their view lists have a kind.
+    The batch are points of the whole cloud, evenly spread, with land and without view lists.
     `ties` are tie points of the original model; by default the points show which images overlap.
     `hint` is the type that the software is known for, `near` are submerged points with their
     neighbours for the detection of the type, if those of the batch are too far apart. Returns the
     survey without ``auto`` and the verdicts.
     """
-    if batch.views is None and batch.survey.settings.method == "auto":
+    survey = batch.survey
+    if survey.settings.method == "auto":
         found = _learn_of_sources(batch, ties, hint, near)
         if found is not None:
             return found
-    survey = batch.survey
-    kind = None if batch.views is None else batch.views.kind
-    if wants_matcher(survey, kind):
+    if _wants_matcher(survey):
         survey = with_matcher(batch, ties)
     sample = replace(submerged_of(batch), survey=survey)
-    if batch.views is not None:
-        verdict = weigh_lists(sample, is_open=False)
-        survey = with_verdict(survey, verdict)
-        return survey, () if verdict is None else (verdict,)
     of_type = sample if near is None else replace(near, survey=survey)
     survey, verdicts = _weighed(of_type, hint)
     settings, learned = survey.settings, survey.learned._replace(land=None)
     if batch.original_model is not None:
         # land has the reconstruction type of the cloud, also where a formula corrects the bed
-        made = survey
+        land = on_land(survey)
         for one in verdicts:
             if one.is_given and one.is_against:
-                made = replace(made, settings=one.runner_up.settings(made.settings))
-        land = on_land(made)
-        if not made.settings.models_matcher:
+                land = replace(land, settings=one.runner_up.settings(land.settings))
+        if not land.settings.models_matcher:
             land = replace(land, learned=land.learned._replace(matcher=None))
         learned = learned._replace(land=land)
     if not settings.models_matcher:
         learned = learned._replace(matcher=None)
-    elif (
-        settings.method == "consistent"
-        and settings.matcher in ("depth-maps", "single-map")
-        and len(sample)
-    ):
+    elif settings.chooses_maps and len(sample):
         learned = learned._replace(bed=_learn_bed(replace(sample, survey=survey)))
     return replace(survey, learned=learned), verdicts
 
@@ -193,9 +184,9 @@ def _learn_of_sources(
     for one in large.tolist():
         part = _of_source(batch, one)
         own = None if near is None else _of_source(near, one)
-        surveys[one], told = learn_of_sample(part, ties, hint, own)
+        surveys[one], found = learn_of_sample(part, ties, hint, own)
         of = f"point source {one} ({100.0 * len(part) / len(batch):.0f} % of the points)"
-        verdicts += [verdict._replace(of=of) for verdict in told]
+        verdicts += [verdict._replace(of=of) for verdict in found]
     if len({verdict.chosen.words for verdict in verdicts if verdict.is_sure}) < 2:
         return None
     most = int(large[-1])
@@ -217,7 +208,7 @@ def _weighed(sample: Batch, hint: Hint | None) -> tuple[Survey, tuple[Verdict, .
         survey = with_verdict(survey, verdicts[0], reconstructions[0])
         if len(reconstructions) > 1:
             return survey, tuple(filter(None, verdicts))
-    if _wants_limit(survey.settings, None):
+    if _wants_limit(survey.settings):
         # which rays were used in the reconstruction does not depend on the formula: test by snell
         sample = replace(sample, survey=survey)
         limit = weigh(sample, LIMITS)
@@ -249,16 +240,20 @@ def with_verdict(
     return replace(survey, settings=verdict.chosen.settings(survey.settings), learned=learned)
 
 
+LEAST_PLACES, PLACES_AN_IMAGE = 4000, 10  # that show which images overlap
+
+
 def with_matcher(batch: Batch, ties: TiePoints | None) -> Survey:
     """Return the survey with the predicted partners of the images."""
-    from pcfix.refract.matcher import matcher_of, matcher_of_ties, places_for
+    from pcfix.refract.matcher import matcher_of, matcher_of_ties
 
     survey = batch.survey
     places, matched = batch.original_model or (batch.xyz, survey.cameras)
     if ties is not None:
         matcher = matcher_of_ties(matched, ties)
     else:
-        step = max(1, len(batch) // places_for(matched))
+        enough = max(LEAST_PLACES, PLACES_AN_IMAGE * len(matched))
+        step = max(1, len(batch) // enough)
         matcher = matcher_of(matched, np.ascontiguousarray(places[::step]))
     return replace(survey, learned=survey.learned._replace(matcher=matcher))
 

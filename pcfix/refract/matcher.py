@@ -33,7 +33,6 @@ REPEATED_DEG = 45.0
 
 TOLERANCE_PX2 = 0.1
 CELLS = 16
-LEAST_PLACES, PLACES_AN_IMAGE = 4000, 10
 WIDTH_M, NEAR_WIDTH_M = 0.2, 0.06
 LEAST_AREA = 0.05
 LEAST_COMMON = 3
@@ -98,11 +97,6 @@ def matcher_of_ties(cameras: Cameras, ties: TiePoints) -> Matcher:
     ends = np.searchsorted(camera[order], np.arange(1, len(cameras)))
     saw = (np.unique(mine) for mine in np.split(owner[order], ends))
     return _matcher(cameras, places, _seen(cameras, places, saw), tracked=True)
-
-
-def places_for(cameras: Cameras) -> int:
-    """Return how many places of the scene are enough for a block."""
-    return max(LEAST_PLACES, PLACES_AN_IMAGE * len(cameras))
 
 
 def _matcher(cameras: Cameras, places: FloatArray, seen: _Seen, *, tracked: bool) -> Matcher:

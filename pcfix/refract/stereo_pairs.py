@@ -61,8 +61,8 @@ from pcfix.refract.batch import (
     Images,
     Intersection,
     images_of,
+    in_other,
     require_orientation,
-    to_original,
     warn_of_unsolved,
 )
 from pcfix.refract.choice import Rig, Rule, cameras_of_pairs, rig_of, rule_of
@@ -349,7 +349,7 @@ def _see(
         p, normal = three(tile, j), three(tile, 4 * TILE + j)
         above = normal[2] * (tile[3 * TILE + j] - p[2] + offset)
         k, _, _, _, s = light_near(three(now, j), minus(centre, p), normal, above, points.n)
-        w = to_original(images, c, minus(scaled(k, s), normal))
+        w = in_other(images.adjusted, optics, c, minus(scaled(k, s), normal))
         e = minus(original, three(tile, 7 * TILE + j))
         size2, ahead = dot(e, e), -dot(axis, e)
         # behind a perspective camera the depth along the axis has no meaning

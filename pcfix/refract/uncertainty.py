@@ -64,7 +64,8 @@ Neglected is the turn of M, and of J, times the residual, which is of second ord
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TypeAlias
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -88,12 +89,9 @@ from pcfix.options.correct import LEVEL_M
 from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Chosen, Intersection, Survey
 from pcfix.refract.choice import Rig, rig_of
-from pcfix.refract.rays import refracted
+from pcfix.refract.rays import MIN_DETERMINANT, refracted
 from pcfix.refract.tiling import TILE, add_three, inverse_of, nine, product_of, put, slots, three
 from pcfix.water.surface import Field, height_at
-
-MIN_DETERMINANT = 1e-6
-"""As of `pcfix.refract.rays.nearest_point`, of half the trace cubed: k^3 for k rays in space."""
 
 MODEL_GSD = 0.8
 """Standard error of the model of depth maps, common to a block: the bias of blocks with known truth
@@ -149,8 +147,10 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
 def with_uncertainty(found: Intersection, batch: Batch) -> Intersection:
     """Return a result with its covariances and standard errors of Z, if the settings ask for them.
 
-    To the errors of the budget are added those of the model of depth maps, of the reconstruction
-    type, of mismatches and of adjusted poses, where these were estimated.
+    The variance of Z is that of the budget or of a regression, and where they were estimated those
+    of the model of depth maps, of mismatches and the reconstruction type, and of adjusted poses:
+
+        Var Z = [Cov Q]_zz + ambiguity^2 + (k GSD)^2 + scatter^2 + (per_depth depth)^2 + poses^2
     """
     survey, covariance, ambiguity = batch.survey, found.covariance_m2, found.ambiguity_m
     found = found._replace(ambiguity_m=None)
@@ -162,24 +162,67 @@ def with_uncertainty(found: Intersection, batch: Batch) -> Intersection:
         if survey.settings.method == "regression" and line is not None:
             covariance[:, [_XZ, _YZ]] = 0.0
             covariance[:, _ZZ] = line.sigma_m(surface.height_m - batch.xyz[:, 2]) ** 2
-    if not moved.all():
-        covariance[~moved] = 0.0
-    variance = covariance[moved, _ZZ]
+    covariance[~moved] = 0.0
+    variance, level = covariance[moved, _ZZ], surface.height_m[moved]
     if ambiguity is not None:  # of depth maps
-        cameras = survey.cameras
-        focal_px = float(np.median([lens.focal_px for lens in cameras.lenses or ()]))
-        gsd_m = (np.median(cameras.centres[:, 2]) - surface.height_m[moved]) / focal_px
-        is_single = survey.settings.matcher != "depth-maps"
-        model_gsd = MODEL_SINGLE_GSD if is_single else MODEL_GSD
-        variance += ambiguity[moved] ** 2 + (model_gsd * gsd_m) ** 2
+        focal_px = float(np.median([lens.focal_px for lens in survey.cameras.lenses or ()]))
+        gsd_m = (np.median(survey.cameras.centres[:, 2]) - level) / focal_px
+        is_fused = survey.settings.matcher == "depth-maps"
+        variance += ambiguity[moved] ** 2
+        variance += ((MODEL_GSD if is_fused else MODEL_SINGLE_GSD) * gsd_m) ** 2
     if learned.model_uncertainty is not None:
-        model, z = learned.model_uncertainty, batch.xyz[:, 2] + found.shift_m[:, 2]
-        depth = (surface.height_m - z)[moved]
-        variance += model.scatter_m**2 + (model.per_depth * depth) ** 2
+        model, z = learned.model_uncertainty, (batch.xyz[:, 2] + found.shift_m[:, 2])[moved]
+        variance += model.scatter_m**2 + (model.per_depth * (level - z)) ** 2
     if learned.poses is not None:
         variance += learned.poses.at(batch.xyz[moved, :2]) ** 2
     covariance[moved, _ZZ] = variance
     return found._replace(sigma_z_m=np.sqrt(covariance[:, _ZZ]), covariance_m2=covariance)
+
+
+POINTS_A_CELL, FEWEST = 12, 4
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """Standard errors of Z by the poses, on a grid in plan."""
+
+    low: FloatArray  # (2,), south-west corner, metres
+    cell_m: float
+    sigma_m: FloatArray  # (columns, rows), in the middle of the cells
+    middle_m: float  # root mean square over the bed
+
+    def at(self, xy: FloatArray) -> FloatArray:
+        """Return the standard errors at places, shape (n, 2)."""
+        from scipy.ndimage import map_coordinates
+
+        place = (xy - self.low) / self.cell_m - 0.5
+        return np.asarray(map_coordinates(self.sigma_m, place.T, order=1, mode="nearest"))
+
+
+def pose_errors_of(xy: FloatArray, variance_m2: FloatArray) -> PoseErrors:
+    """Return the errors over a bed from variances at n places of it, shapes (n, 2) and (n,).
+
+    A cell has the median of its points: a few of them jump, as a camera comes into their reach or
+    leaves it. One of too few points has that of the nearest which has enough.
+    """
+    from scipy.ndimage import distance_transform_edt
+    from scipy.stats import binned_statistic_2d
+
+    low = xy.min(axis=0)
+    size = np.maximum(np.ptp(xy, axis=0), 1e-3)
+    cell_m = float(np.sqrt(size.prod() * POINTS_A_CELL / len(xy)))
+    shape = np.ceil(size / cell_m).astype(int)
+    place = np.minimum(((xy - low) / cell_m).astype(int), shape - 1)
+    bins: Any = [np.arange(count + 1) for count in shape]
+    x, y = place.T
+    variance = binned_statistic_2d(x, y, variance_m2, "median", bins).statistic
+    count = binned_statistic_2d(x, y, variance_m2, "count", bins).statistic
+    variance[count < min(FEWEST, count.max())] = np.nan
+    unknown = np.isnan(variance)
+    nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+    variance = variance[tuple(nearest)]
+    middle_m = float(np.sqrt(np.average(variance[place[:, 0], place[:, 1]])))
+    return PoseErrors(low, cell_m, np.sqrt(variance), middle_m)
 
 
 def level_sigma_of(batch: Batch) -> FloatArray:
@@ -506,6 +549,7 @@ def finish_tile(
     for j in range(rows.size):
         m, k = nine(sums, BY_Q * TILE + j), sums[RAYS * TILE + j]
         det, b = inverse_of(m)
+        # half the trace: k for k rays in space, as in `nearest_point`
         half = 0.5 * (m[0] + m[4] + m[8])
         solved = (k >= 2.0) & (det >= MIN_DETERMINANT * half * half * half)
         by_noise = b
