@@ -537,12 +537,14 @@ def _weigh(
                 if groups.slope[seed] == groups.slope[seed]:
                     likely[i, seed] = bed + groups.rise[seed]
             continue
+        # the only group of a list, else that whose bed is nearest to the surroundings
         seed = 0
         if not block.listed:
             wanted = block.around[i] - tile.points[2 * TILE + j] - bed
             seed, result[i, AMBIGUITY] = _best_seed(groups, cameras, wanted, j, tile, block)
         groups.weight[:k] = 0.0
         if seed >= 0:
+            # which maps agree for the bed of this group
             _move(groups, k, groups.rise[seed])
             _share_out(seed, groups, block.listed)
         for q in range(k):
@@ -770,10 +772,12 @@ def _finish(result: FloatArray, maps: Maps, tile: Tile) -> None:
         for k in range(len(weights)):
             look, w = tile.looks[k], weights[k, j]
             if w > 0.0 and look[BY_HEIGHT * TILE + j] == look[BY_HEIGHT * TILE + j]:
+                # Q on the ray of this image, at the height of the bed after the step
                 u = look[_PLACE * TILE + j] + step * look[_PLACE_BY_HEIGHT * TILE + j]
                 v = look[(_PLACE + 1) * TILE + j] + step * look[(_PLACE_BY_HEIGHT + 1) * TILE + j]
                 total, count, square = total + w, count + 1, square + w * (u * u + v * v)
                 x, y = x + w * u, y + w * v
+        # without a map that sees the bed the point stays where it is
         row[OUTCOME] = ONE_CAMERA if maps.start[j + 1] > maps.start[j] else NO_CAMERA
         per_weight = 1.0 / total
         x, y, square = x * per_weight, y * per_weight, square * per_weight

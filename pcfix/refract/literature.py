@@ -118,6 +118,7 @@ def _solve(
         # the depth under the water of each camera; 0 above it
         d = np.maximum(points.height[i] - points.xyz[i, 2] + points.offset[cameras], 0.0)
         rays = _crossings(e, d, np.hypot(e[:, 0], e[:, 1]) / e[:, 2], points.n)
+        # how far the true point is aside of the apparent one, and below it
         x, y, down_m, solved = 0.0, 0.0, 0.0, True
         if method == _MEAN:
             down_m = rays[0].sum() / max(k, 1)
@@ -229,6 +230,7 @@ def _equal_x(e: FloatArray, rays: Crossings) -> tuple[float, bool]:
             if base == 0.0:
                 continue
             q, q_other = (u[a] * x + v[a] * y) / base, (u[b] * x + v[b] * y) / base
+            # least squares over the pairs: q (z - below) is the same for both rays
             parallax = q - q_other
             products += parallax * (q * below[a] - q_other * below[b])
             squares += parallax * parallax

@@ -228,9 +228,7 @@ class Verdict(NamedTuple):
 
 def reconstructions_of(batch: Batch) -> tuple[Reconstruction, ...]:
     """Return the possible types of the points, of every kind of view list if it may be any."""
-    cameras, views = batch.survey.cameras, batch.views
-    if cameras.lenses is None or cameras.rotations is None:
-        return (BARE,)
+    views = batch.views
     if views is None:
         given, auto = batch.survey.settings.camera_set, batch.survey.settings.method == "auto"
         return tuple(

@@ -198,6 +198,7 @@ def _search(
         for _ in range(STEPS):
             if not _step(rows, rays, places, values, now, tile, near, pairs, block):
                 break
+        # a search that is done, or came near enough, replaces the intersection
         for j in range(rows.size):
             found, one = result[rows[j]], block.search[rows[j]]
             if found[_OUTCOME] == CORRECTED and one[_BEST] <= CLOSE_M:
@@ -223,6 +224,7 @@ def _pairs_of(
         candidates[j] = (points.start[i + 1] - points.start[i]) * step
         if listed.size:
             candidates[j] = (listed[i + 1] - listed[i]) // 2
+    # the number of each pair of rays, in the order in which the points have them
     number, total, most = np.full((k, k), ABSENT), 0, candidates.max()
     rays = np.empty((min(k * k, rows.size * most), 2), np.int64)
     own = np.empty((3, rows.size, most), np.int64)
@@ -240,6 +242,7 @@ def _pairs_of(
             if a < 0 or b < 0 or a == b or row[a] < 0 or row[b] < 0:
                 continue
             ray_a, ray_b = row[a], row[b]
+            # both cameras must be among those of the point
             if not (marks[ray_a, j] > 0.0 and marks[ray_b, j] > 0.0):
                 continue
             if not _is_wide(a, b, j, tile, points):
@@ -282,6 +285,7 @@ def _start(
         i, one = rows[j], block.search[rows[j]]
         first, last = points.start[i], points.start[i + 1]
         if pairs.wide[j] == 0:
+            # no pair has a base, or there is none
             few = ONE_CAMERA if last > first else NO_CAMERA
             result[i, _OUTCOME] = PARALLEL if pairs.narrow[j] else few
             continue

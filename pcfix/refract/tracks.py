@@ -75,6 +75,7 @@ def search_tile(
                     _set_rays(rays[k], tile, marks[k], rig, near[k], optics, plain_lens(lens))
                 else:
                     _set_rays(rays[k], tile, marks[k], rig, near[k], optics, None)
+        # g and its derivative at the places so far, camera by camera
         room[_G * TILE : _STEP2 * TILE] = 0.0
         for k in range(near.size):
             c, lens = near[k], optics.lenses[optics.row[near[k]]]

@@ -516,6 +516,7 @@ def add_errors(
     """
     for k in range(len(marks)):
         c = near[k]
+        # numba compiles a version of each function for in_space = None and True
         sight = Sight(
             row_of(rig.centres, c), rig.offset[c], row_of(rig.axes, c), rig.focal_px[c] ** 2, bend
         )
