@@ -35,9 +35,7 @@ beds. Neighbouring points come from different groups, and only the true bed is a
 of all. So the height that most points around can have come from, the bed of the surroundings
 (`pcfix.refract.matcher`), identifies the group of each point.
 
-**Speed.** A point needs some 80 light paths for each bed that is tried. A tile of points is
-processed image by image and partner by partner, so that the inner loops run over the points and are
-vectorised.
+A point needs some 80 light paths for each bed that is tried.
 """
 
 from __future__ import annotations

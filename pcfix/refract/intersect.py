@@ -35,7 +35,6 @@ from pcfix.refract.batch import (
     Intersection,
     Optics,
     optics_of,
-    require_orientation,
     warn_of_unsolved,
 )
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of, shapes_of
@@ -70,7 +69,6 @@ def consistent(batch: Batch) -> Intersection:
     Points without a solution, under waves that focus the light, get that of ``snell``, with a
     warning.
     """
-    require_orientation(batch.survey.cameras, "Method consistent", "use method snell")
     return _intersected(batch, optics_of(batch.survey.cameras))
 
 

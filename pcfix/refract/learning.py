@@ -14,11 +14,9 @@ from pcfix.refract.batch import ALIKE, FLAT_DEG, Batch, Survey, require_orientat
 from pcfix.refract.methods import batches, on_land, with_rays
 from pcfix.refract.patches import FEWEST_WITHOUT_LIST, gsd_m
 from pcfix.refract.reconstructions import (
-    BARE,
     IN_FRAME,
     LIMITS,
     Hint,
-    Reconstruction,
     Verdict,
     reconstructions_of,
     type_given,
@@ -56,7 +54,8 @@ def resolved(
         camera_set = "all" if settings.camera_set == "auto" else settings.camera_set
         settings = replace(settings, method=method, camera_set=camera_set)
     elif method == "auto" and bare:
-        settings = BARE.settings(settings)
+        # tracks, as dense matchers cannot be modelled
+        settings = replace(settings, method="snell", camera_set="all", depth_factor=None)
     elif method == "auto" and views is not None:
         settings = replace(settings, method="consistent")
     if settings.camera_set == "mvs":
@@ -203,10 +202,12 @@ def _weighed(sample: Batch, hint: Hint | None) -> tuple[Survey, tuple[Verdict, .
     """Resolve ``auto`` and set the model uncertainty, for submerged points without lists."""
     survey, verdicts = sample.survey, list[Verdict | None]()
     if survey.settings.method == "auto":
-        reconstructions = reconstructions_of(sample)
-        verdicts.append(weigh(sample, reconstructions, hint=hint))
-        survey = with_verdict(survey, verdicts[0], reconstructions[0])
-        if len(reconstructions) > 1:
+        types = reconstructions_of(sample)
+        verdicts.append(weigh(sample, types, hint=hint))
+        # without evidence the first type is assumed
+        survey = replace(survey, settings=types[0].settings(survey.settings))
+        survey = with_verdict(survey, verdicts[0])
+        if len(types) > 1:
             return survey, tuple(filter(None, verdicts))
     if _wants_limit(survey.settings):
         # which rays were used in the reconstruction does not depend on the formula: test by snell
@@ -229,13 +230,10 @@ def _weighed(sample: Batch, hint: Hint | None) -> tuple[Survey, tuple[Verdict, .
     return survey, tuple(filter(None, verdicts))
 
 
-def with_verdict(
-    survey: Survey, verdict: Verdict | None, else_as: Reconstruction | None = None
-) -> Survey:
+def with_verdict(survey: Survey, verdict: Verdict | None) -> Survey:
     """Return a survey with the options and the model uncertainty of a verdict."""
     if verdict is None:
-        given = survey.settings
-        return survey if else_as is None else replace(survey, settings=else_as.settings(given))
+        return survey
     learned = survey.learned._replace(model_uncertainty=verdict.model_uncertainty)
     return replace(survey, settings=verdict.chosen.settings(survey.settings), learned=learned)
 

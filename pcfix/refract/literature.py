@@ -25,7 +25,7 @@ import numpy as np
 from pcfix.errors import GeometryError, SettingError
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.model import BoolArray, Cameras, FloatArray, Outcome
-from pcfix.refract.batch import Batch, Chosen, Intersection, require_orientation
+from pcfix.refract.batch import Batch, Chosen, Intersection
 from pcfix.refract.rays import MIN_DETERMINANT
 
 TOLERANCE = 1e-9
@@ -334,7 +334,7 @@ class StereoFactor:
 
 
 def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
-    """Return the depth factor of the stereo pairs of a block over water of a level.
+    """Return the depth factor of the stereo pairs of a block, with angles and lenses, over water.
 
     Raises GeometryError if fewer than two images look down, or neighbours do not overlap.
 
@@ -365,7 +365,6 @@ def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
     """
     from scipy.spatial import cKDTree
 
-    require_orientation(cameras, "depth-factor auto")
     rotations, lenses = np.asarray(cameras.rotations), cameras.lenses or ()
     flat = np.array([lens.projection == "perspective" for lens in lenses])
     rows = np.flatnonzero(flat & (-rotations[:, 2, 2] >= np.cos(np.radians(NADIR_DEG))))

@@ -70,9 +70,8 @@ class Reconstruction(NamedTuple):
 
     def settings(self, given: ScienceOptions) -> ScienceOptions:
         """Return the options that correct such a cloud."""
-        of_factor = self.changes.get("method", given.method) == "factor"
-        gone: dict[str, Any] = {} if of_factor else {"depth_factor": None}
-        return replace(given, **gone, **self.changes)
+        factor = given.depth_factor if self.changes["method"] == "factor" else None
+        return replace(given, depth_factor=factor, **self.changes)
 
 
 _TRACKS, _MAPS, _PAIRS = "tracks", "depth maps", "stereo pairs"
@@ -99,9 +98,6 @@ LISTED = (
     Reconstruction(_MAPS, {"method": "consistent"}, "depth-maps"),
     Reconstruction(_PAIRS, {"method": "consistent"}, "pair-images"),
 )
-BARE = Reconstruction(_TRACKS, {"method": "snell", "camera_set": "all"})
-"""The only type without lenses or angles."""
-
 LIMITS = (
     Reconstruction("all rays", {"method": "snell"}),
     Reconstruction(
@@ -110,6 +106,7 @@ LIMITS = (
     ),
 )
 """The rays that may have been used in the reconstruction, for the methods of `ALIKE`."""
+
 SOFTWARE: dict[str, tuple[str, ...]] = {
     "openmvs": (_MAPS,), "odm": (_MAPS,), "opendronemap": (_MAPS,), "opensfm": (_MAPS,),
     "colmap": (_MAPS,), "realitycapture": (_MAPS,), "realityscan": (_MAPS,),
@@ -130,13 +127,11 @@ class Hint(NamedTuple):
     source: str
 
 
-def hint_of(names: tuple[str, ...]) -> Hint | None:
-    """Return the types that software is known for, by the first name that is known."""
-    for name in names:
-        for word in re.findall(r"[a-z]+", name.lower()):
-            if word in SOFTWARE:
-                return Hint(SOFTWARE[word], name.strip())
-    return None
+def hint_of(software: str) -> Hint | None:
+    """Return the types that software is known for, by the first word of its name that is known."""
+    words = (word for word in re.findall(r"[a-z]+", software.lower()) if word in SOFTWARE)
+    known = next(words, None)
+    return None if known is None else Hint(SOFTWARE[known], software.strip())
 
 
 class Verdict(NamedTuple):

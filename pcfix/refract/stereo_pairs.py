@@ -23,8 +23,7 @@ functions is continuous, with kinks where it changes from one pair to another. B
 starts at `snell`'s solution with the derivative diag(1, 1, apparent by true depth), and goes back
 to half such a step wherever it does not come nearer.
 
-A tile of points is processed camera by camera and pair by pair, so that the inner loops run over
-the points and are vectorised. Points that need more than a few steps form new tiles.
+Points that need more than a few steps form new tiles.
 """
 
 from __future__ import annotations
@@ -62,10 +61,9 @@ from pcfix.refract.batch import (
     Intersection,
     images_of,
     in_other,
-    require_orientation,
     warn_of_unsolved,
 )
-from pcfix.refract.choice import Rig, Rule, cameras_of_pairs, rig_of, rule_of
+from pcfix.refract.choice import Rig, Rule, rig_of, rule_of
 from pcfix.refract.intersect import add_camera
 from pcfix.refract.rays import MIN_DETERMINANT, light_near, nearest_point, ray_distance
 from pcfix.refract.tiling import TILE, nine, put, slots, three
@@ -116,26 +114,23 @@ class Pairs(NamedTuple):
 def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     """Return the true points from which the median of stereo pairs would be the apparent ones.
 
-    The views of the batch are pairs, or the cameras that may be in one; then `pairs`, of the kind
-    pairs, count if both cameras are among the views. By default the pairs are those of images that
-    the matcher matched, each once. The surface above each point is taken as a plane.
+    The views of the batch are the cameras that may be in a pair. `pairs` are view lists of the kind
+    pairs; by default the pairs are those of images that the matcher matched, each once. The surface
+    above each point is taken as a plane.
 
     `ray_count` and `incidence_deg` are of the cameras that are in a pair; `ray_miss_m` is the
     distance from their refracted rays through the apparent point, as for `snell`. A point with
     cameras but without a pair is `ONE_CAMERA`, one with narrow pairs only `PARALLEL_RAYS`. Points
     without a solution get that of `snell`, with a warning.
     """
-    require_orientation(batch.survey.cameras, "Method consistent", "use method snell")
-    if batch.rays.kind == "pairs":
-        pairs, batch = batch.rays, replace(batch, views=cameras_of_pairs(batch.rays))
-    survey, matcher = batch.survey, batch.survey.learned.matcher
-    if pairs is None and matcher is None:
-        raise ValueError("pairs or a model of the matcher are needed")
-    start, camera, partners = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 0), int)
+    survey, matcher, none = batch.survey, batch.survey.learned.matcher, np.zeros(0, np.int64)
+    start, camera, partners = none, none, np.zeros((0, 0), np.int64)
     if pairs is not None:
         start, camera = np.asarray(pairs.start, np.int64), np.asarray(pairs.camera, np.int64)
     elif matcher is not None:
         partners = _each_once(matcher.matched)
+    else:
+        raise ValueError("pairs or a model of the matcher are needed")
     images, rule = images_of(batch.original_model, survey.cameras), rule_of(survey)
     search, derivative = np.zeros((len(batch), _WIDTH_OF_SEARCH)), np.zeros((len(batch), 3, 3))
     block = Block(

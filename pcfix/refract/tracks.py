@@ -22,8 +22,7 @@ thousands. P is seen in the direction -e_i, and w_i is scaled to one along the n
 is known to about a thousandth. From `snell`'s solution each step with the inverse of the sum gains
 about three digits, and two or three steps are enough.
 
-A tile of points is processed camera by camera, as in `pcfix.refract.intersect`: the inner loops
-run over the points and are vectorised, for the usual lens and a plane of water.
+The inner loops over the points of a tile are vectorised for the usual lens and a plane of water.
 """
 
 from __future__ import annotations

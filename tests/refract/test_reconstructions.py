@@ -70,8 +70,8 @@ def test_software_is_a_prior():
     xyz, water = scene.xyz[rows], scene.water
     batch = Batch(xyz, surface_above(water, xyz), Survey(water, scene.cameras, AUTO))
     _, (free,) = learn_of_sample(batch)
-    _, (against,) = learn_of_sample(batch, hint=hint_of(("openmvs",)))
-    _, (agreeing,) = learn_of_sample(batch, hint=hint_of(("SURE 5.0",)))
+    _, (against,) = learn_of_sample(batch, hint=hint_of("openmvs"))
+    _, (agreeing,) = learn_of_sample(batch, hint=hint_of("SURE 5.0"))
     assert free.chosen is against.chosen is agreeing.chosen is IN_FRAME[3]
     assert against.errors <= free.errors <= agreeing.errors
 
