@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from pcfix.refract.matcher import Bed, Matcher
     from pcfix.refract.occlusion import Occluder
     from pcfix.refract.regression import DepthRegression
-    from pcfix.refract.uncertainty import PoseErrors
 
 NO_CAMERA, ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 PARALLEL, CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
@@ -62,6 +61,23 @@ class ModelUncertainty(NamedTuple):
     scatter_m: float  # of neighbours about a smooth bed, beyond the budget: mismatches
     per_depth: float  # standard deviation by depth, from the unknown reconstruction type
     formal_m: float = 0.0  # median standard error of the budget itself
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """Standard errors of Z by the poses, on a grid in plan."""
+
+    low: FloatArray  # (2,), south-west corner, metres
+    cell_m: float
+    sigma_m: FloatArray  # (columns, rows), in the middle of the cells
+    middle_m: float  # root mean square over the bed
+
+    def at(self, xy: FloatArray) -> FloatArray:
+        """Return the standard errors at places, shape (n, 2)."""
+        from scipy.ndimage import map_coordinates
+
+        place = (xy - self.low) / self.cell_m - 0.5
+        return np.asarray(map_coordinates(self.sigma_m, place.T, order=1, mode="nearest"))
 
 
 class OriginalModel(NamedTuple):
