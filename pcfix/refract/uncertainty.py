@@ -53,7 +53,7 @@ in space    M    1           0                r / kappa
 in images   W    1 / (1-m)   -beta / (1-m)    (1 - b rho^2) / H
 ==========  ===  ==========  ===============  ==========================
 
-so that, with D p for any p = (p - (N.p) e / H) taken across,
+With D p = D (p - (N.p) e / H) for any p, as P may also move up, the sums have the terms
 
     S T = c A + g (b d + (v - r / kappa) N)'
     S D = (1 - m) c A + g (((1 - m) b + beta) d - ((1 - m) (1 - H v) + beta rho^2) N / H)'
