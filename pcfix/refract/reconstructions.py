@@ -20,7 +20,7 @@ from pcfix.refract import patches
 from pcfix.refract.batch import FLAT_DEG, Batch, ModelUncertainty
 from pcfix.refract.likelihood import MODEL_ERROR, Candidates, log_likelihood, standard_errors
 from pcfix.refract.methods import correct, with_rays
-from pcfix.refract.patches import SMOOTH_GSD, Patches, scatter_m, shares
+from pcfix.refract.patches import SMOOTH_GSD, scatter_m, shares
 
 SURE = 2.3264
 """Standard errors of a significant difference: 99 %."""
@@ -289,14 +289,16 @@ def weigh(
     sample = patches.patches_of(batch, at_borders=at_borders) if len(types) > 1 else None
     if sample is None:
         return None
-    part = batch.take(sample.rows)
+    rows, place = sample
+    part = batch.take(rows)
     survey = replace(part.survey, level_offset_m=None)
     part = replace(part, survey=survey, level_sigma_m=None)
-    is_dense = sample.place.shape[1] == patches.PATCH_POINTS[0]
-    beds = _beds(part, replace(batch, survey=part.survey), sample, types)
+    is_dense = place.shape[1] == patches.PATCH_POINTS[0]
+    around = patches.others_around(replace(batch, survey=part.survey), rows)
+    beds = _beds(part, around, place, types)
     if beds is None or (given is not None and given not in beds.types):
         return None
-    remarks, among, by = _remarks(part, sample.place), list(range(len(beds.types))), ""
+    remarks, among, by = _remarks(part, place), list(range(len(beds.types))), ""
     if remarks:
         beds = beds._replace(errors=beds.errors / WEAK)
     if given is None:
@@ -336,20 +338,20 @@ def weigh(
 
 
 def _beds(
-    part: Batch, batch: Batch, sample: Patches, types: tuple[Reconstruction, ...]
+    part: Batch, around: Batch, place: IntArray, types: tuple[Reconstruction, ...]
 ) -> _Beds | None:
     """Correct the points of the patches for each type; None if fewer than two can."""
-    around = patches.others_around(batch, sample.rows)
     z = np.array([_heights(part, around, one) for one in types])
     covered = np.isfinite(z).sum(axis=1)
     kept = np.flatnonzero(covered >= COVERED * covered.max())
     if len(kept) < 2 or not covered.max():
         return None
     z, types = z[kept], tuple(types[i] for i in kept)
-    place = sample.place[np.isfinite(z[:, sample.place]).all(axis=(0, 2))]
-    if len(place) < LEAST_PATCHES:
+    known = place[np.isfinite(z[:, place]).all(axis=(0, 2))]
+    if len(known) < LEAST_PATCHES:
         half, none = np.full((len(z), len(z)), 0.5), np.zeros((len(z), len(z)))
-        return _Beds(types, z, sample.place, 0, half, half, none)
+        return _Beds(types, z, place, 0, half, half, none)
+    place = known
     share, sigma = shares(part, place, z)
     errors = (0.5 - share) / np.maximum(sigma, 1e-9)
     if part.views is None and LIMITS[0] not in types:
