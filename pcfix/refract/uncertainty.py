@@ -332,12 +332,9 @@ def _weight(ray: Ray, sight: Sight) -> Symmetric:
 
 
 @device(forceinline=True)
-def _effect(ray: Ray, w: Symmetric, in_space: bool | None) -> Effect:
-    """Return the effect of a displacement of a ray.
-
-    numba compiles a version for residuals in space, and one for None: in images.
-    """
-    if in_space is None:
+def _effect(ray: Ray, w: Symmetric, in_images: bool) -> Effect:
+    """Return the effect of a displacement of a ray, on residuals in images or in space."""
+    if in_images:
         # one division for two: c, and S d = W d / (1 - m + beta rho^2), where W d = -H W N
         outer = ray.away + ray.beta * ray.rho2
         share = 1.0 / (ray.away * outer)
@@ -372,16 +369,16 @@ def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: V
 
 @device
 def _add_common(
-    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, in_space: bool | None
+    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, in_images: bool
 ) -> None:
     """Add one camera's rays to the sums of a tile's points: what moves Q, P, level and index."""
     for j in range(marks.size):
         ray = _ray_of(room, tile, marks, j, sight)
         w, normal, lean, away = _weight(ray, sight), ray.normal, ray.lean, ray.away
-        a, g, c, b, v = _effect(ray, w, in_space)
+        a, g, c, b, v = _effect(ray, w, in_images)
         # S T
         _add_nine(room, BY_Q * TILE + j, c, a, g, beyond(scaled(b, ray.d), v - lean, normal))
-        if in_space is not None:
+        if not in_images:
             # S D; in images it is W
             up = (away * (1.0 - ray.height * v) + ray.beta * ray.rho2) * ray.inv_h
             q = beyond(scaled(away * b + ray.beta, ray.d), -up, normal)
@@ -397,7 +394,7 @@ def _add_common(
 
 @device
 def _add_tilt(
-    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, in_space: bool | None
+    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, in_images: bool
 ) -> None:
     """Add how the slope of the water moves each of one camera's rays: S delta by tau.
 
@@ -405,7 +402,7 @@ def _add_tilt(
     """
     for j in range(marks.size):
         ray = _ray_of(room, tile, marks, j, sight)
-        a, g, c, b, _ = _effect(ray, _weight(ray, sight), in_space)
+        a, g, c, b, _ = _effect(ray, _weight(ray, sight), in_images)
         turn, inv_k = -ray.y * (1.0 - ray.height * ray.lean), 1.0 / ray.kappa
         along = ray.y * ray.bend * ray.bend * ray.lean * ray.height * inv_k * inv_k
         along += (ray.h * ray.inv_h - ray.y * ray.lean) * ray.lean - ray.h * ray.inv_h * ray.inv_h
@@ -426,7 +423,7 @@ def _add_noise(
     for j in range(marks.size):
         ray = _ray_of(room, tile, marks, j, sight)
         w = _weight(ray, sight)
-        _, g, c, b, v = _effect(ray, w, None)
+        _, g, c, b, v = _effect(ray, w, True)
         # S delta = across (c W tau + along (d.tau) g), with tau across N, where c W N = -v g
         across = budget.waves * ray.y * (1.0 - ray.height * ray.lean)
         along = b + ray.lean * ray.lean
@@ -469,18 +466,12 @@ def add_errors(
     """
     for k in range(len(marks)):
         c = near[k]
-        # numba compiles a version of each function for in_space = None and True
         sight = Sight(
             row_of(rig.centres, c), rig.offset[c], row_of(rig.axes, c), rig.focal_px[c] ** 2, bend
         )
-        if budget.in_images:
-            _add_common(room, tile, marks[k], sight, None)
-        else:
-            _add_common(room, tile, marks[k], sight, True)
-        if budget.tilt > 0.0 and budget.in_images:
-            _add_tilt(room, tile, marks[k], sight, None)
-        elif budget.tilt > 0.0:
-            _add_tilt(room, tile, marks[k], sight, True)
+        _add_common(room, tile, marks[k], sight, budget.in_images)
+        if budget.tilt > 0.0:
+            _add_tilt(room, tile, marks[k], sight, budget.in_images)
         if budget.by_ray:
             _add_noise(room, tile, marks[k], sight, budget)
 
