@@ -251,7 +251,7 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
             " had been corrected before. Give the cloud as the matcher wrote it."
         )
         notes.append(PcfixWarning("cloud.corrected_before", sentence, ratio=ratio))
-    hint = hint_of((plan.options.software or view.software,))
+    hint = hint_of(plan.options.software or view.software)
     if plan.kind is None:
         survey, verdicts = learning.learn_of_sample(sample, ties, hint, near)
         return replace(plan, survey=survey, verdicts=verdicts, notes=tuple(notes))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,9 +18,8 @@ from pcfix.flow.surfaces import Points
 from pcfix.io.members import find_members
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, Outcome
 from pcfix.options.declare import File
-from pcfix.refract.batch import Batch, OriginalModel, Survey
+from pcfix.refract.batch import Batch, OriginalModel, PoseErrors, Survey
 from pcfix.refract.methods import correct
-from pcfix.refract.pose_errors import PoseErrors, pose_errors_of
 from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:
@@ -65,6 +64,35 @@ def pose_errors(
     variance_m2 = variances(sample.take(rows), survey, members, transfer)
     known = np.isfinite(variance_m2)
     return pose_errors_of(step.xyz[rows[known], :2], variance_m2[known]) if known.any() else None
+
+
+POINTS_A_CELL, FEWEST = 12, 4
+
+
+def pose_errors_of(xy: FloatArray, variance_m2: FloatArray) -> PoseErrors:
+    """Return the errors over a bed from variances at n places of it, shapes (n, 2) and (n,).
+
+    A cell has the median of its points: a few of them jump, as a camera comes into their reach or
+    leaves it. One of too few points has that of the nearest which has enough.
+    """
+    from scipy.ndimage import distance_transform_edt
+    from scipy.stats import binned_statistic_2d
+
+    low = xy.min(axis=0)
+    size = np.maximum(np.ptp(xy, axis=0), 1e-3)
+    cell_m = float(np.sqrt(size.prod() * POINTS_A_CELL / len(xy)))
+    shape = np.ceil(size / cell_m).astype(int)
+    place = np.minimum(((xy - low) / cell_m).astype(int), shape - 1)
+    bins: Any = [np.arange(count + 1) for count in shape]
+    x, y = place.T
+    variance = binned_statistic_2d(x, y, variance_m2, "median", bins).statistic
+    count = binned_statistic_2d(x, y, variance_m2, "count", bins).statistic
+    variance[count < min(FEWEST, count.max())] = np.nan
+    unknown = np.isnan(variance)
+    nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+    variance = variance[tuple(nearest)]
+    middle_m = float(np.sqrt(np.average(variance[place[:, 0], place[:, 1]])))
+    return PoseErrors(low, cell_m, np.sqrt(variance), middle_m)
 
 
 def variances(

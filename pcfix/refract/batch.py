@@ -26,7 +26,6 @@ from pcfix.water.surface import OwnWater, SurfaceAbove
 if TYPE_CHECKING:
     from pcfix.refract.matcher import Bed, Matcher
     from pcfix.refract.occlusion import Occluder
-    from pcfix.refract.pose_errors import PoseErrors
     from pcfix.refract.regression import DepthRegression
 
 NO_CAMERA, ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
@@ -44,7 +43,7 @@ UNLISTED, MAIN = -1, -2
 
 
 class Learned(NamedTuple):
-    """What was learned from the whole cloud; None where it was not."""
+    """What was estimated from the cloud as a whole; None where it was not."""
 
     regression: DepthRegression | None = None  # for the method of that name
     occluder: Occluder | None = None  # the surface of the cloud
@@ -53,7 +52,7 @@ class Learned(NamedTuple):
     model_uncertainty: ModelUncertainty | None = None
     land: Survey | None = None  # for land transferred to adjusted cameras, if it differs
     poses: PoseErrors | None = None  # errors of Z from the adjusted poses
-    limit_deg: float | None = None  # largest incidence angle of the rays that made the points
+    limit_deg: float | None = None  # largest incidence angle of the rays of the points
 
 
 class ModelUncertainty(NamedTuple):
@@ -64,8 +63,25 @@ class ModelUncertainty(NamedTuple):
     formal_m: float = 0.0  # median standard error of the budget itself
 
 
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """Standard errors of Z by the poses, on a grid in plan."""
+
+    low: FloatArray  # (2,), south-west corner, metres
+    cell_m: float
+    sigma_m: FloatArray  # (columns, rows), in the middle of the cells
+    middle_m: float  # root mean square over the bed
+
+    def at(self, xy: FloatArray) -> FloatArray:
+        """Return the standard errors at places, shape (n, 2)."""
+        from scipy.ndimage import map_coordinates
+
+        place = (xy - self.low) / self.cell_m - 0.5
+        return np.asarray(map_coordinates(self.sigma_m, place.T, order=1, mode="nearest"))
+
+
 class OriginalModel(NamedTuple):
-    """The model from which m points came, if the cameras were adjusted since."""
+    """The model of m points before their cameras were adjusted."""
 
     xyz: FloatArray  # (m, 3), original apparent points, metres, world frame
     cameras: Cameras  # in the order of the adjusted ones, with angles and lenses
@@ -358,23 +374,12 @@ def images_of(original_model: OriginalModel | None, now: Cameras) -> Images:
 
 
 @device
-def to_original(images: Images, c: int, a: Vector) -> Vector:
-    """Convert a direction in which adjusted camera c sees something to the original camera.
+def in_other(one: Optics | None, other: Optics | None, c: int, a: Vector) -> Vector:
+    """Convert a direction in which camera c sees something to another pose and lens of the image.
 
-    Both in the world frame, of any length; NaN where there is no image.
+    Both are in the world frame, of any length, and belong to the same place in the image; NaN where
+    there is no image.
     """
-    return _between(images.adjusted, images.original, c, a)
-
-
-@device
-def to_adjusted(images: Images, c: int, a: Vector) -> Vector:
-    """Convert a direction of original camera c to the adjusted camera."""
-    return _between(images.original, images.adjusted, c, a)
-
-
-@device
-def _between(one: Optics | None, other: Optics | None, c: int, a: Vector) -> Vector:
-    """Return the direction of the same place in the image for another pose and lens."""
     if one is None or other is None:
         return a
     u, v = image_of(one.lenses[one.row[c]], *times(one.rotations[c], a))

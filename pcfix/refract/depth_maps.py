@@ -25,8 +25,9 @@ neighbours that agree. What they showed is used up, and later seeds fuse what is
 of a place come from a few groups of images, and each group has the bed at another apparent height:
 a metre apart under deep water, where there are obliques.
 
-*With a view list* the fused maps are known. Each counts by its weight, that of the list or one by
-its squared distance. The maps that were averaged into it before share that weight.
+*With a view list* the fused maps are known: the list is the only group. Each map counts by its
+weight, that of the list or one by its squared distance. The maps that were averaged into it before
+share that weight.
 
 *Without a list* the model fuses, for each image that sees the point, the maps that would agree with
 it as the seed, and computes the height of the bed if that group had made the point: the likely
@@ -34,9 +35,7 @@ beds. Neighbouring points come from different groups, and only the true bed is a
 of all. So the height that most points around can have come from, the bed of the surroundings
 (`pcfix.refract.matcher`), identifies the group of each point.
 
-**Speed.** A point needs some 80 light paths for each bed that is tried. A tile of points is
-processed image by image and partner by partner, so that the inner loops run over the points and are
-vectorised.
+A point needs some 80 light paths for each bed that is tried.
 """
 
 from __future__ import annotations
@@ -59,8 +58,7 @@ from pcfix.refract.batch import (
     Images,
     Intersection,
     images_of,
-    to_adjusted,
-    to_original,
+    in_other,
 )
 from pcfix.refract.likelihood import Candidates
 from pcfix.refract.matcher import LEAST_NEAR, NEAR, Matcher
@@ -89,7 +87,8 @@ AGREE = 0.01  # depths that differ by less, relative, are fused
 SHALLOW, DEEP = 0.3, 3.5
 """Range of the bed of the surroundings, in likely heights; outliers have it elsewhere."""
 
-_ROUNDS, _BEDS = 4, 3
+_ROUNDS, _ROUNDS_OF_LIST, _BEDS_OF_LIST = 1, 2, 3
+"""How often the averaged maps are chosen again for the bed of a group; beds that are tried."""
 FAR = 0.1  # of the way to the bed: farther off, the averaged depths are chosen again
 
 SINGLE = ("single-map", "nearest-map")
@@ -107,9 +106,9 @@ DEPTH, BY_HEIGHT, _PLACE, _PLACE_BY_HEIGHT, LOOK = slots(1, 1, 2, 2)
 # Of the points: the height of the bed. Of one map: the ray u and the distance of its projection
 # centre, Q, what the change of the depth with the bed depends on (3). Of one partner: the direction
 # w, whether it sees Q; the only depth, how many partners see Q, the least cost, and the sums of the
-# mean, which is in the last in the end.
+# mean.
 (
-    BED, _RAY, _LENGTH, _Q, _AWAY, _WATER, _STEEP, _W, _SEES, _SOLE, _SEEN, _LEAST, _TOTAL, BEST,
+    BED, _RAY, _LENGTH, _Q, _AWAY, _WATER, _STEEP, _W, _SEES, _SOLE, _SEEN, _LEAST, _TOTAL, _SUM,
     ROOM,
 ) = slots(1, 3, 1, 3, 1, 1, 1, 3, 1, 1, 1, 1, 1, 1)  # fmt: skip
 # Of a partner: the depth beyond P along the ray (m), its squared residual (px^2), and half the
@@ -127,6 +126,9 @@ class Block(NamedTuple):
     images: Images
     matcher: Matcher
     offset_m: float  # how much higher the water stood, mean over all images
+    listed: bool  # whether view lists name the maps that were fused
+    weight: FloatArray  # of the entries of the lists; empty for one by the squared distance
+    around: FloatArray  # (m,), height of the bed of the surroundings, NaN where it is unknown
 
 
 class Tile(NamedTuple):
@@ -142,6 +144,35 @@ class Tile(NamedTuple):
     row: IntArray  # (k,), of each image in `looks`
 
 
+class Maps(NamedTuple):
+    """The depth maps of the m points of a tile, for kernels."""
+
+    rows: IntArray  # (m,), the rows of the points
+    start: IntArray  # the maps of point j are camera[start[j] : start[j + 1]]
+    camera: IntArray
+    near: IntArray  # (k,), the images of all these maps
+    marks: FloatArray  # (k, m), whether the points have these maps
+    weights: FloatArray  # (k, m), what each map counts for each point
+
+
+class Groups(NamedTuple):
+    """Which of the k depth maps of a point were averaged and fused with which, for kernels."""
+
+    averaged: IntArray  # (k, 9), each map and its partners by their places; -1 after the last
+    fused: IntArray  # (k, 13), the group of each seed likewise; (1, k) with view lists
+    place: IntArray  # (k,), of each image among those of the point, or `ABSENT`
+    t: FloatArray  # (k,), the depth of a bed in each map; see `DEPTH`
+    slope: FloatArray  # (k,), its change with the height of the bed, 1/m; NaN without a depth
+    weight: FloatArray  # (k,), of each map, with what is averaged into it
+    share: FloatArray  # (k,), the weight of each map by itself
+    depth: FloatArray  # (k,), the averaged depth of each map, relative
+    change: FloatArray  # (k,), its change with the height of the bed, 1/m
+    rise: FloatArray  # (k,), how far up the bed is if the group of a seed made the point, metres
+    size: FloatArray  # (k,), the number of maps in the group
+    own: FloatArray  # (k,), the depth of each map before it is averaged
+    number: FloatArray  # (k,), how many maps are averaged into each
+
+
 def invert_depth_maps(batch: Batch) -> Intersection:
     """Return the true points from which fused depth maps would have made the apparent ones.
 
@@ -151,22 +182,12 @@ def invert_depth_maps(batch: Batch) -> Intersection:
     above each point is taken as a plane. The rays of the result are the maps with a weight or, of
     a single map, its image and the visible ones that it can have been matched with: at most `NEAR`.
     """
-    rays, bed = batch.rays, batch.survey.learned.bed
-    listed = rays.kind == "depth-maps"
-    if listed:
-        given = np.zeros(0) if rays.weight is None else rays.weight.astype(np.float64)
-    else:
-        given = np.full(len(batch), np.nan) if bed is None else bed.height_at(batch.xyz[:, :2])
-    result = np.zeros((len(batch), COLUMNS))
-    none: FloatArray = np.zeros((0, 0), np.float32)
-    _invert_all(batch, listed, given, result, none)
+    result = _invert_all(batch)
     few = np.flatnonzero(result[:, OUTCOME] == ONE_CAMERA)
-    is_single = batch.survey.settings.matcher in SINGLE and not listed
+    is_single = batch.survey.settings.matcher in SINGLE and batch.rays.kind != "depth-maps"
     if is_single and len(few):
         # no image shows the point with `LEAST_NEAR` others: at the edge of the block
-        again = np.zeros((len(few), COLUMNS))
-        _invert_all(batch.take(few), listed, given[few], again, none, least=1)
-        result[few] = again
+        result[few] = _invert_all(batch.take(few), least=1)
     outcome = result[:, OUTCOME].astype(np.uint8)
     found = batch.result(result[:, :3], outcome=outcome, ray_miss_m=result[:, _DISTANCE])
     moved = outcome == CORRECTED
@@ -183,7 +204,7 @@ def likely_beds(batch: Batch) -> FloatArray:
     Relative to each apparent point, metres, float32, shape (m, most views); NaN if there is none.
     """
     likely = np.full((len(batch.xyz), max(1, batch.counts.max(initial=0))), np.nan, np.float32)
-    _invert_all(batch, False, np.zeros(0), np.zeros((0, 0)), likely)
+    _invert_all(batch, likely)
     return likely
 
 
@@ -207,80 +228,39 @@ def candidates_of(batch: Batch) -> Candidates:
 
 
 def _invert_all(
-    batch: Batch, listed: bool, given: FloatArray, result: FloatArray, likely: FloatArray,
-    least: int = LEAST_NEAR,
-) -> None:  # fmt: skip
-    matcher, given_matcher = batch.survey.learned.matcher, batch.survey.settings.matcher
+    batch: Batch, likely: FloatArray | None = None, least: int = LEAST_NEAR
+) -> FloatArray:
+    """Return the columns of the result, or fill in the likely beds."""
+    survey, rays, bed = batch.survey, batch.rays, batch.survey.learned.bed
+    matcher, given_matcher = survey.learned.matcher, survey.settings.matcher
     if matcher is None:
         raise ValueError("a model of the matcher is needed")
+    listed = rays.kind == "depth-maps" and likely is None
     if given_matcher in SINGLE:
-        least = 1 if listed else least
-        matcher = matcher.of_single_maps(least, nearest=given_matcher == "nearest-map")
-    images = images_of(batch.original_model, batch.survey.cameras)
-    points = batch.chosen()
-    block = Block(points, images, matcher, float(points.offset.mean()))
+        nearest = given_matcher == "nearest-map"
+        matcher = matcher.of_single_maps(1 if listed else least, nearest=nearest)
+    points, weight, around = batch.chosen(), np.zeros(0), np.full(len(batch), np.nan)
+    if listed and rays.weight is not None:
+        weight = rays.weight.astype(np.float64)
+    if bed is not None and not listed and likely is None:
+        around = bed.height_at(batch.xyz[:, :2])
+    images, offset_m = images_of(batch.original_model, survey.cameras), float(points.offset.mean())
+    block = Block(points, images, matcher, offset_m, listed, weight, around)
+    result = np.zeros((len(batch), COLUMNS))
     in_tiles(
-        _invert_tiles, tiling.tiles_of(batch), tiling.spatial_order(batch.xyz), block, listed,
-        given, result, likely, points=len(batch),
+        _invert_tiles, tiling.tiles_of(batch), tiling.spatial_order(batch.xyz), block, result,
+        np.zeros((0, 0), np.float32) if likely is None else likely, points=len(batch),
     )  # fmt: skip
+    return result
 
 
 @kernel(allocates=True)
 def _invert_tiles(
-    span: Span, order: IntArray, block: Block, listed: bool, given: FloatArray,
-    result: FloatArray, likely: FloatArray,
-) -> None:  # fmt: skip
-    """Invert the fusion of the points of some tiles or, where `likely` has rows, fill these in.
-
-    With lists `given` are the weights of their entries, if there are any; without, the heights of
-    the bed of the surroundings.
-    """
-    points, matcher = block.points, block.matcher
-    k, most = matcher.matched.shape
-    tile = room_of_tile(k, most)
-    groups = Groups(
-        np.full((k, matcher.averaged.shape[1] + 1), ABSENT),
-        np.full((k, matcher.fused.shape[1] + 1), ABSENT),
-        np.full(k, ABSENT), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k),
-        np.empty(k), np.empty(k), np.empty(k), np.empty(k),
-    )  # fmt: skip
-    for t in range(*span):
-        rows = order[t * TILE : (t + 1) * TILE]
-        start_tile(tile, rows, given[:0] if listed or len(likely) else given, block)
-        # the maps of each point, and the images near the tile with what each counts for each point
-        start, camera, each = points.start, points.camera, rows
-        if listed:
-            start, camera = _with_neighbours(rows, groups.place, tile, block)
-            each = np.arange(rows.size)
-        near, weights = tiling.marks_of_lists(start, camera, each, k)
-        for q in range(near.size):
-            tile.row[near[q]] = q
-        maps = Maps(rows, each, start, camera, near, weights)
-        if listed:
-            _weigh_listed(maps, given, groups, tile, block)
-        else:
-            look(tile, near, weights, block)
-            _weigh_groups(maps, given, result, likely, groups, tile, block)
-        if not len(likely):
-            _settle(tile, near, weights, block)
-            _finish(result, maps, tile)
-
-
-class Maps(NamedTuple):
-    """The depth maps of the points of a tile, for kernels."""
-
-    rows: IntArray  # (m,), the rows of the points
-    each: IntArray  # (m,), the maps of a point are camera[start[each[j]] : start[each[j] + 1]]
-    start: IntArray
-    camera: IntArray
-    near: IntArray  # (k,), the images of all these maps
-    weights: FloatArray  # (k, m), what each map counts for each point
-
-
-@device(allocates=True)
-def room_of_tile(k: int, partners: int) -> Tile:
-    """Return arrays for a tile of points and k images with so many partners at most."""
-    return Tile(
+    span: Span, order: IntArray, block: Block, result: FloatArray, likely: FloatArray
+) -> None:
+    """Invert the fusion of the points of some tiles or, where `likely` has rows, fill these in."""
+    k, partners = block.matcher.matched.shape
+    tile = Tile(
         np.empty(_POINT * TILE),
         np.empty(ROOM * TILE),
         np.empty((partners, PARTNER * TILE)),
@@ -290,26 +270,91 @@ def room_of_tile(k: int, partners: int) -> Tile:
         np.empty(TILE, np.bool_),
         np.full(k, ABSENT),
     )
+    # a view list is one group, of up to all maps
+    seeds, most = (1, k) if block.listed else (k, block.matcher.fused.shape[1] + 1)
+    groups = Groups(
+        np.full((k, block.matcher.averaged.shape[1] + 1), ABSENT), np.full((seeds, most), ABSENT),
+        np.full(k, ABSENT), np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k),
+        np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k),
+    )  # fmt: skip
+    for t in range(*span):
+        rows = order[t * TILE : (t + 1) * TILE]
+        tiling.gather(tile.points, rows, block.points)
+        _start(tile, rows, block)
+        # the maps of each point, and the images near the tile
+        start, camera = _maps_of(rows, groups.place, tile, block)
+        near, marks = tiling.marks_of_lists(start, camera, np.arange(rows.size), k)
+        maps = Maps(rows, start, camera, near, marks, np.zeros(marks.shape))
+        for q in range(near.size):
+            tile.row[near[q]] = q
+        _look(tile, near, marks, block)
+        _weigh(maps, result, likely, groups, tile, block)
+        if len(likely):
+            continue
+        for _ in range(_BEDS_OF_LIST - 1 if block.listed else 0):
+            # which depths agree depends on the bed, and the bed on which agree
+            if not _move_on(tile, maps.weights, 0.0, FAR):
+                break
+            _look(tile, near, marks, block)
+            _weigh(maps, result, likely, groups, tile, block)
+        for _ in range(MAX_LOOKS):
+            if not _move_on(tile, maps.weights, CLOSE_M, 0.0):
+                break
+            _look(tile, near, maps.weights, block)
+        _finish(result, maps, tile)
 
 
-@device(allocates=True)
-def start_tile(tile: Tile, rows: IntArray, around: FloatArray, block: Block) -> None:
-    """Fill in the points of a tile, with a likely bed or, where it is known, that around them."""
-    points, room = block.points, tile.room
-    tiling.gather(tile.points, rows, points)
+@device
+def _start(tile: Tile, rows: IntArray, block: Block) -> None:
+    """Set a likely bed below each point of a tile or, where it is known, that of the surroundings.
+
+    A point of apparent depth h has its bed about (n - 1) h below itself.
+    """
+    points, around = block.points, block.around
     for j in range(rows.size):
         normal, z = three(tile.points, 4 * TILE + j), tile.points[2 * TILE + j]
         above = normal[2] * (tile.points[3 * TILE + j] - z)
         put(tile.points, _ORIGINAL * TILE + j, row_of(points.original_xyz, rows[j]))
         depth = max(above + normal[2] * block.offset_m, LEAST_DEPTH_M) / normal[2]
         bed = -LIKELY * depth * (points.n - 1.0)
-        if around.size and around[rows[j]] == around[rows[j]]:
+        if around[rows[j]] == around[rows[j]]:
             bed = max(min(around[rows[j]] - z, SHALLOW * bed), DEEP * bed)
-        room[BED * TILE + j], tile.going[j] = bed, True
+        tile.room[BED * TILE + j], tile.going[j] = bed, True
+
+
+@device(allocates=True)
+def _maps_of(
+    rows: IntArray, place: IntArray, tile: Tile, block: Block
+) -> tuple[IntArray, IntArray]:
+    """Return the images of each point: where those of the next one start, and the images.
+
+    To the images of a view list are added their partners whose frames hold the point, as their
+    maps were averaged into those of the list.
+    """
+    points, matcher = block.points, block.matcher
+    most = 0
+    for i in rows:
+        most += points.start[i + 1] - points.start[i]
+    start = np.zeros(rows.size + 1, np.int64)
+    found, count = np.empty(most * (matcher.averaged.shape[1] + 1), np.int64), 0
+    for j in range(rows.size):
+        place[:] = ABSENT
+        p = three(tile.points, _ORIGINAL * TILE + j)
+        for c in points.camera[points.start[rows[j]] : points.start[rows[j] + 1]]:
+            if place[c] < 0:
+                place[c], found[count], count = 0, c, count + 1
+            for a in matcher.averaged[c]:
+                # a partner that was not looked at yet
+                if block.listed and a >= 0 and place[a] == ABSENT:
+                    place[a] = _OUTSIDE
+                    if holds(matcher.inner, a, minus(row_of(block.images.centres, a), p)):
+                        place[a], found[count], count = 0, a, count + 1
+        start[j + 1] = count
+    return start, found[:count]
 
 
 @device
-def look(tile: Tile, near: IntArray, weights: FloatArray, block: Block) -> None:
+def _look(tile: Tile, near: IntArray, weights: FloatArray, block: Block) -> None:
     """Compute the depths of the beds of a tile in the maps of images; see `LOOK`.
 
     Of those maps, one row of the weights each, that count for a point whose bed is searched.
@@ -319,32 +364,43 @@ def look(tile: Tile, near: IntArray, weights: FloatArray, block: Block) -> None:
         for j in range(weights.shape[1]):
             counts |= (weights[k, j] > 0.0) & tile.going[j]
         if counts:
-            _look(tile.looks[k], near[k], weights.shape[1], tile, block)
+            _look_in(tile.looks[k], near[k], weights.shape[1], tile, block)
 
 
 @device
-def _look(out: FloatArray, c: int, count: int, tile: Tile, block: Block) -> None:
-    """Compute the depths of the beds of all points of a tile in one depth map.
+def _look_in(out: FloatArray, c: int, count: int, tile: Tile, block: Block) -> None:
+    """Compute the depths of the beds of all points of a tile in the depth map of image c.
 
-    Their change with the height is approximate. NaN where no partner of image c sees the bed.
+    The weighted mean over the pairs of partners; of a single partner its own depth; NaN where none
+    sees the bed. The change with the height is approximate.
     """
-    room, partners, matched = tile.room, 0, block.matcher.matched[c]
+    room, partners, pairs = tile.room, 0, 0
     _aim(out, c, count, tile, block)
-    for partner in matched:
+    room[_SOLE * TILE : ROOM * TILE] = 0.0
+    room[_LEAST * TILE : _TOTAL * TILE] = np.inf
+    for partner in block.matcher.matched[c]:
         if partner >= 0:
             _compare(tile.partners[partners], c, partner, count, tile, block)
             partners += 1
-    best_pairs(room, tile.partners[:partners], tile.pairs, count, block.matcher.tolerance_px2)
+    for p in range(partners):
+        for q in range(p + 1, partners):
+            _agree_best(tile.pairs[pairs], tile.partners[p], tile.partners[q], room, count)
+            pairs += 1
+    # the costs count relative to the least of all pairs
+    for p in range(pairs):
+        _add_pair(room, tile.pairs[p], count, block.matcher.tolerance_px2)
     for j in range(count):
+        seen, sole = room[_SEEN * TILE + j], room[_SOLE * TILE + j]
+        mean = room[_SUM * TILE + j] / room[_TOTAL * TILE + j]
+        t = mean if seen > 1.0 else sole
         # the change of the depth with the bed is nearly that of the whole water column
-        t, depth = room[BEST * TILE + j], room[_WATER * TILE + j]
-        per_depth = room[_STEEP * TILE + j]
+        depth, per_depth = room[_WATER * TILE + j], room[_STEEP * TILE + j]
         change = (t + room[_AWAY * TILE + j]) / depth
         change = change if depth > LEAST_DEPTH_M else per_depth / block.points.n
         change = min(max(change, LEAST_CHANGE * per_depth), MOST_CHANGE * per_depth)
         per_length = 1.0 / room[_LENGTH * TILE + j]
         out[DEPTH * TILE + j] = t * per_length
-        found = t == t and room[_SEEN * TILE + j] >= block.matcher.least
+        found = t == t and seen >= block.matcher.least
         out[BY_HEIGHT * TILE + j] = -change * per_length if found else np.nan
 
 
@@ -359,7 +415,7 @@ def _aim(out: FloatArray, c: int, count: int, tile: Tile, block: Block) -> None:
         up, way = minus(centre, p), minus(original, three(tile.points, _ORIGINAL * TILE + j))
         above = normal[2] * (tile.points[3 * TILE + j] - (p[2] - points.offset[c]))
         # the ray of the original image in the adjusted camera, from where it passes the point
-        d = to_adjusted(images, c, scaled(-1.0, way))
+        d = in_other(images.original, images.adjusted, c, scaled(-1.0, way))
         e = scaled(dot(up, d) / dot(d, d), d)
         a = minus(up, e)
         above -= dot(normal, a)
@@ -398,7 +454,8 @@ def _compare(partner: FloatArray, c: int, other: int, count: int, tile: Tile, bl
         k, _, _, _, s = light_near(three(room, _Q * TILE + j), up, normal, above, n)
         # a camera under the water sees nothing
         k = k if dot(normal, up) > above else np.nan
-        put(room, _W * TILE + j, to_original(images, other, minus(scaled(k, s), normal)))
+        w = in_other(images.adjusted, images.original, other, minus(scaled(k, s), normal))
+        put(room, _W * TILE + j, w)
     # frames hold places relative to the camera, here w
     sees = room[_SEES * TILE : _SEES * TILE + count]
     mark(sees, room[_W * TILE :], TILE, matcher.inner, other, (0.0, 0.0, 0.0))
@@ -419,39 +476,8 @@ def _compare(partner: FloatArray, c: int, other: int, count: int, tile: Tile, bl
         partner[_AT * TILE + j] = t if sees[j] > 0.0 else 0.0
         partner[_SQUARES * TILE + j] = scale2 * dot(miss, miss) if sees[j] > 0.0 else np.inf
         partner[_CURVATURE * TILE + j] = scale2 * sine2 if sees[j] > 0.0 else 1.0
-
-
-@device
-def best_pairs(
-    room: FloatArray, partners: FloatArray, pairs: FloatArray, count: int, tolerance: float
-) -> None:
-    """Set the depths at which two images agree best, as weighted means over the pairs.
-
-    NaN without a partner that sees the bed; of a single one its own depth.
-    """
-    room[_SOLE * TILE : ROOM * TILE] = 0.0
-    room[_LEAST * TILE : _TOTAL * TILE] = np.inf
-    at = 0
-    for p in range(len(partners)):
-        _count_partner(room, partners[p], count)
-        for q in range(p + 1, len(partners)):
-            _agree_best(pairs[at], partners[p], partners[q], room, count)
-            at += 1
-    for p in range(at):
-        _add_pair(room, pairs[p], count, tolerance)
-    for j in range(count):
-        seen = room[_SEEN * TILE + j]
-        mean = room[BEST * TILE + j] / room[_TOTAL * TILE + j]
-        sole = room[_SOLE * TILE + j] if seen > 0.0 else np.nan
-        room[BEST * TILE + j] = mean if seen > 1.0 else sole
-
-
-@device
-def _count_partner(room: FloatArray, partner: FloatArray, count: int) -> None:
-    """Count a partner that sees the bed, and note its depth."""
-    for j in range(count):
-        sees = partner[_SQUARES * TILE + j] < np.inf
-        room[_SEEN * TILE + j] += 1.0 if sees else 0.0
+        # how many partners see the bed, and its depth if only one does
+        room[_SEEN * TILE + j] += sees[j]
         room[_SOLE * TILE + j] += partner[_AT * TILE + j]
 
 
@@ -484,151 +510,59 @@ def _add_pair(room: FloatArray, pair: FloatArray, count: int, tolerance: float) 
         w *= w
         w = w if worse < NOTHING else 0.0
         room[_TOTAL * TILE + j] += w
-        room[BEST * TILE + j] += w * pair[_PAIR_AT * TILE + j]
+        room[_SUM * TILE + j] += w * pair[_PAIR_AT * TILE + j]
 
 
 @device
-def _set_steps(tile: Tile, weights: FloatArray) -> None:
-    """Set how far up the bed of each point is at which the weighted mean of the depths is zero."""
-    for j in range(weights.shape[1]):
-        total, change = 0.0, 0.0
-        for k in range(len(weights)):
-            slope = tile.looks[k, BY_HEIGHT * TILE + j]
-            if weights[k, j] > 0.0 and slope == slope:
-                total += weights[k, j] * tile.looks[k, DEPTH * TILE + j]
-                change += weights[k, j] * slope
-        tile.step[j] = -total / change
-
-
-@device
-def _settle(tile: Tile, near: IntArray, weights: FloatArray, block: Block) -> None:
-    """Find the height of the bed at which the fused depths give the apparent point.
-
-    Starts from the looks at hand and repeats until the steps are small.
-    """
-    _set_steps(tile, weights)
-    for _ in range(MAX_LOOKS):
-        searched = False
-        for j in range(weights.shape[1]):
-            # NaN where no image with a weight sees the bed
-            tile.going[j] = np.isfinite(tile.step[j]) and abs(tile.step[j]) > CLOSE_M
-            if tile.going[j]:
-                tile.room[BED * TILE + j] += tile.step[j]
-                searched = True
-        if not searched:
-            break
-        look(tile, near, weights, block)
-        _set_steps(tile, weights)
-
-
-@device
-def _finish(result: FloatArray, maps: Maps, tile: Tile) -> None:
-    """Write the rows: the weighted mean of the Q, moved by the rest of the step."""
-    weights = maps.weights
-    for j in range(weights.shape[1]):
-        row, at, step = result[maps.rows[j]], maps.each[j], tile.step[j]
-        total, x, y, square, count = 0.0, 0.0, 0.0, 0.0, 0
-        for k in range(len(weights)):
-            look, w = tile.looks[k], weights[k, j]
-            if w > 0.0 and look[BY_HEIGHT * TILE + j] == look[BY_HEIGHT * TILE + j]:
-                u = look[_PLACE * TILE + j] + step * look[_PLACE_BY_HEIGHT * TILE + j]
-                v = look[(_PLACE + 1) * TILE + j] + step * look[(_PLACE_BY_HEIGHT + 1) * TILE + j]
-                total, count, square = total + w, count + 1, square + w * (u * u + v * v)
-                x, y = x + w * u, y + w * v
-        row[OUTCOME] = ONE_CAMERA if maps.start[at + 1] > maps.start[at] else NO_CAMERA
-        per_weight = 1.0 / total
-        x, y, square = x * per_weight, y * per_weight, square * per_weight
-        if np.isfinite(step) and np.isfinite(square):
-            row[0], row[1], row[2] = x, y, tile.room[BED * TILE + j] + step
-            row[_DISTANCE] = np.sqrt(max(square - x * x - y * y, 0.0))
-            row[OUTCOME], row[_COUNT] = CORRECTED, count
-
-
-class Groups(NamedTuple):
-    """Which of the k depth maps of a point were averaged and fused with which, for kernels."""
-
-    averaged: IntArray  # (k, 9), each map and its partners by their places; -1 after the last
-    fused: IntArray  # (k, 13), likewise
-    place: IntArray  # (k,), of each image among those of the point, or `ABSENT`
-    t: FloatArray  # (k,), the depth of a bed in each map; see `DEPTH`
-    slope: FloatArray  # (k,), its change with the height of the bed, 1/m; NaN without a depth
-    weight: FloatArray  # (k,), of each map, with what is averaged into it
-    share: FloatArray  # (k,), the weight of each map by itself
-    depth: FloatArray  # (k,), the averaged depth of each map, relative
-    change: FloatArray  # (k,), its change with the height of the bed, 1/m
-    rise: FloatArray  # (k,), how far up the bed is if the group of a seed made the point, metres
-    size: FloatArray  # (k,), the number of maps in the group
-    own: FloatArray  # (k,), the depth of each map before it is averaged
-
-
-@device
-def _weigh_groups(
-    maps: Maps, around: FloatArray, result: FloatArray, likely: FloatArray, groups: Groups,
-    tile: Tile, block: Block,
-) -> None:  # fmt: skip
-    """Set the weights of the maps of the group that made each point, or its likely beds.
-
-    `around` are the heights of the bed of the surroundings.
-    """
+def _weigh(
+    maps: Maps, result: FloatArray, likely: FloatArray, groups: Groups, tile: Tile, block: Block
+) -> None:
+    """Set the weights of the maps of the group that made each point, or its likely beds."""
     before = maps.camera[:0]
     for j in range(maps.rows.size):
-        i, at, bed = maps.rows[j], maps.each[j], tile.room[BED * TILE + j]
-        cameras = maps.camera[maps.start[at] : maps.start[at + 1]]
+        if not tile.going[j]:
+            continue
+        i, bed = maps.rows[j], tile.room[BED * TILE + j]
+        cameras = maps.camera[maps.start[j] : maps.start[j + 1]]
         # points with the same cameras share their groups
         if not are_same(cameras, before):
-            _group(groups, cameras, block.matcher)
-        before = cameras
-        k = cameras.size
-        _set_lines(groups, cameras, j, tile)
-        for q in range(k):
-            # the pixel on the ground grows with the distance
-            groups.share[q] = _per_square(cameras[q], j, tile, block)
-        _set_rises(groups, k)
+            _group(groups, cameras, block)
+        before, k = cameras, cameras.size
+        _set_lines(groups, cameras, i, j, tile, block)
+        _set_rises(groups, k, block.listed)
         if len(likely):
             for seed in range(k):
                 if groups.slope[seed] == groups.slope[seed]:
                     likely[i, seed] = bed + groups.rise[seed]
             continue
-        wanted = around[i] - tile.points[2 * TILE + j] - bed
-        seed, result[i, AMBIGUITY] = _best_seed(groups, cameras, wanted, j, tile, block)
+        # the only group of a list, else that whose bed is nearest to the surroundings
+        seed = 0
+        if not block.listed:
+            wanted = block.around[i] - tile.points[2 * TILE + j] - bed
+            seed, result[i, AMBIGUITY] = _best_seed(groups, cameras, wanted, j, tile, block)
         groups.weight[:k] = 0.0
         if seed >= 0:
-            # a map that agrees shares its weight with the maps it was averaged with
+            # which maps agree for the bed of this group
             _move(groups, k, groups.rise[seed])
-            _average_around(seed, groups)
-            for q in groups.fused[seed]:
-                if q >= 0 and abs(groups.depth[q] - groups.depth[seed]) < AGREE:
-                    _share(q, groups.share[q], groups)
+            _share_out(seed, groups, block.listed)
         for q in range(k):
             maps.weights[tile.row[cameras[q]], j] = groups.weight[q]
 
 
 @device
-def _per_square(c: int, j: int, tile: Tile, block: Block) -> float:
-    """Return the weight of the map of image c: one by the squared distance of the point."""
-    p = three(tile.points, _ORIGINAL * TILE + j)
-    up = minus(row_of(block.images.centres, c), p)
-    return 1.0 / dot(up, up)
-
-
-@device
-def _set_lines(groups: Groups, maps: IntArray, j: int, tile: Tile) -> None:
-    """Set the depths in the maps of a point, and their changes, about the bed of the last look."""
-    for q in range(maps.size):
-        k = tile.row[maps[q]]
-        groups.t[q] = tile.looks[k, DEPTH * TILE + j]
-        groups.slope[q] = tile.looks[k, BY_HEIGHT * TILE + j]
-
-
-@device
-def _group(groups: Groups, maps: IntArray, matcher: Matcher) -> None:
-    """Find the places of the depth maps of a point."""
+def _group(groups: Groups, maps: IntArray, block: Block) -> None:
+    """Find the places of the depth maps of a point, and of those averaged and fused with each."""
     groups.place[:] = ABSENT
     for q in range(maps.size):
         groups.place[maps[q]] = q
     for q in range(maps.size):
-        _place(groups.averaged[q], q, matcher.averaged[maps[q]], groups.place)
-        _place(groups.fused[q], q, matcher.fused[maps[q]], groups.place)
+        _place(groups.averaged[q], q, block.matcher.averaged[maps[q]], groups.place)
+        if block.listed:
+            groups.fused[0, q] = q
+        else:
+            _place(groups.fused[q], q, block.matcher.fused[maps[q]], groups.place)
+    if block.listed:
+        groups.fused[0, maps.size :] = ABSENT
 
 
 @device
@@ -643,14 +577,118 @@ def _place(members: IntArray, q: int, others: IntArray, place: IntArray) -> None
 
 
 @device
-def _share(q: int, share: float, groups: Groups) -> None:
-    """Add the weight of a depth map evenly to the maps that were averaged into it."""
-    count = 0.0
+def _set_lines(groups: Groups, maps: IntArray, i: int, j: int, tile: Tile, block: Block) -> None:
+    """Set the depths in the maps of a point and their changes, about the bed of the last look.
+
+    Also what each map counts: nothing for those that are only averaged into maps of a list.
+    """
+    points, p = block.points, three(tile.points, _ORIGINAL * TILE + j)
+    for q in range(maps.size):
+        k = tile.row[maps[q]]
+        groups.t[q] = tile.looks[k, DEPTH * TILE + j]
+        groups.slope[q] = tile.looks[k, BY_HEIGHT * TILE + j]
+        groups.share[q] = 0.0
+    for at in range(points.start[i], points.start[i + 1]):
+        # the pixel on the ground grows with the distance
+        up = minus(row_of(block.images.centres, points.camera[at]), p)
+        share = block.weight[at] if block.weight.size else 1.0 / dot(up, up)
+        groups.share[groups.place[points.camera[at]]] += share
+
+
+@device
+def _set_rises(groups: Groups, k: int, listed: bool) -> None:
+    """Find the rise and the size of the group of each seed, of k maps.
+
+    Which maps agree is decided for the bed of the lines, and again for that of each group.
+    """
+    seeds, spread = min(k, len(groups.fused)), _move(groups, k, 0.0)
+    for q in range(k):
+        _average(q, groups)
+    for seed in range(seeds):
+        groups.rise[seed], groups.size[seed] = _fuse(seed, groups, listed)
+    for seed in range(seeds):
+        for _ in range(_ROUNDS_OF_LIST if listed else _ROUNDS):
+            # where all depths agree, for both beds, so do the groups
+            if max(spread, _move(groups, k, groups.rise[seed])) < AGREE:
+                break
+            _average_around(seed, groups)
+            step, groups.size[seed] = _fuse(seed, groups, listed)
+            groups.rise[seed] += step
+
+
+@device
+def _move(groups: Groups, k: int, rise: float) -> float:
+    """Set the depths of k maps for a bed higher by `rise`; return their range."""
+    low, high = np.inf, -np.inf
+    for q in range(k):
+        own = groups.t[q] + groups.slope[q] * rise
+        # NaN is neither lower nor higher
+        low, high = own if own < low else low, own if own > high else high
+        groups.own[q] = own
+    return high - low
+
+
+@device
+def _average_around(seed: int, groups: Groups) -> None:
+    """Average the depths that may be fused with that of a seed."""
+    for q in groups.fused[seed]:
+        if q < 0:
+            break
+        _average(q, groups)
+
+
+@device(forceinline=True)
+def _average(q: int, groups: Groups) -> None:
+    """Average a depth with those of its partners that agree."""
+    own, total, change, count = groups.own[q], 0.0, 0.0, 0.0
     for a in groups.averaged[q]:
-        count += a >= 0 and abs(groups.own[a] - groups.own[q]) < AVERAGED_WITHIN
-    for a in groups.averaged[q]:
-        if a >= 0 and abs(groups.own[a] - groups.own[q]) < AVERAGED_WITHIN:
-            groups.weight[a] += share / count
+        if a < 0:
+            break
+        # no branch, which the processor would predict wrongly half the time
+        agrees = abs(groups.own[a] - own) < AVERAGED_WITHIN
+        total += groups.own[a] if agrees else 0.0
+        change += groups.slope[a] if agrees else 0.0
+        count += 1.0 if agrees else 0.0
+    each = 1.0 / count
+    groups.depth[q], groups.change[q], groups.number[q] = total * each, change * each, count
+
+
+@device(forceinline=True)
+def _limits(seed: int, groups: Groups, listed: bool) -> tuple[float, float]:
+    """Return the depth of a seed, and by how much the depths fused with it may differ from it.
+
+    All depths of a list are fused, but none that is NaN.
+    """
+    return (0.0, np.inf) if listed else (groups.depth[seed], AGREE)
+
+
+@device(forceinline=True)
+def _fuse(seed: int, groups: Groups, listed: bool) -> tuple[float, float]:
+    """Return how far up the bed is for the group of a seed, and how many maps the group has."""
+    total, change, members = 0.0, 0.0, 0.0
+    depth, within = _limits(seed, groups, listed)
+    for q in groups.fused[seed]:
+        if q < 0:
+            break
+        agrees = abs(groups.depth[q] - depth) < within
+        total += groups.share[q] * groups.depth[q] if agrees else 0.0
+        change += groups.share[q] * groups.change[q] if agrees else 0.0
+        members += 1.0 if agrees else 0.0
+    # the weighted mean of depth + change * rise is zero
+    return -total / change, members
+
+
+@device
+def _share_out(seed: int, groups: Groups, listed: bool) -> None:
+    """Add the weights of the maps of a group evenly to those that were averaged into each."""
+    _average_around(seed, groups)
+    depth, within = _limits(seed, groups, listed)
+    for q in groups.fused[seed]:
+        if q < 0 or not abs(groups.depth[q] - depth) < within:
+            continue
+        for a in groups.averaged[q]:
+            if a >= 0 and abs(groups.own[a] - groups.own[q]) < AVERAGED_WITHIN:
+                groups.weight[a] += groups.share[q] / groups.number[q]
 
 
 @device
@@ -691,151 +729,57 @@ def _best_seed(
 
 
 @device
-def _set_rises(groups: Groups, k: int) -> None:
-    """Find the rise and the size of the group of each seed, of k maps.
-
-    Which maps agree is decided for the bed of the lines, and again for that of each group.
-    """
-    spread = _move(groups, k, 0.0)
-    for q in range(k):
-        _average(q, groups)
-    for seed in range(k):
-        groups.rise[seed], groups.size[seed] = _fuse(seed, groups)
-    for seed in range(k):
-        # where all depths agree, for both beds, so do the groups
-        if max(spread, _move(groups, k, groups.rise[seed])) >= AGREE:
-            _average_around(seed, groups)
-            step, groups.size[seed] = _fuse(seed, groups)
-            groups.rise[seed] += step
-
-
-@device
-def _move(groups: Groups, k: int, rise: float) -> float:
-    """Set the depths of k maps for a bed higher by `rise`; return their range."""
-    low, high = np.inf, -np.inf
-    for q in range(k):
-        own = groups.t[q] + groups.slope[q] * rise
-        # NaN is neither lower nor higher
-        low, high = own if own < low else low, own if own > high else high
-        groups.own[q] = own
-    return high - low
-
-
-@device
-def _average_around(seed: int, groups: Groups) -> None:
-    """Average the depths that may be fused with that of a seed."""
-    for q in groups.fused[seed]:
-        if q < 0:
-            break
-        _average(q, groups)
-
-
-@device(forceinline=True)
-def _average(q: int, groups: Groups) -> None:
-    """Average a depth with those of its partners that agree."""
-    own, total, change, count = groups.own[q], 0.0, 0.0, 0.0
-    for a in groups.averaged[q]:
-        if a < 0:
-            break
-        # no branch, which the processor would predict wrongly half the time
-        agrees = abs(groups.own[a] - own) < AVERAGED_WITHIN
-        total += groups.own[a] if agrees else 0.0
-        change += groups.slope[a] if agrees else 0.0
-        count += 1.0 if agrees else 0.0
-    each = 1.0 / count
-    groups.depth[q], groups.change[q] = total * each, change * each
-
-
-@device(forceinline=True)
-def _fuse(seed: int, groups: Groups) -> tuple[float, float]:
-    """Return how far up the bed is for the group of a seed, and how many maps the group has."""
-    total, change, members = 0.0, 0.0, 0.0
-    for q in groups.fused[seed]:
-        if q < 0:
-            break
-        agrees = abs(groups.depth[q] - groups.depth[seed]) < AGREE
-        total += groups.share[q] * groups.depth[q] if agrees else 0.0
-        change += groups.share[q] * groups.change[q] if agrees else 0.0
-        members += 1.0 if agrees else 0.0
-    # the weighted mean of depth + change * rise is zero
-    return -total / change, members
-
-
-@device
-def _weigh_listed(maps: Maps, given: FloatArray, groups: Groups, tile: Tile, block: Block) -> None:
-    """Set the weights of the maps of points with lists; `given` are those of the entries, if any.
-
-    Which depths agree depends on the bed, and the bed on which agree.
-    """
-    step = tile.step
-    step[:] = 0.0
-    for beds in range(1, _BEDS + 1):
-        searched = False
-        for j in range(maps.rows.size):
-            if tile.going[j]:
-                tile.room[BED * TILE + j] += step[j]
-        look(tile, maps.near, maps.weights, block)
-        for j in range(maps.rows.size):
-            if not tile.going[j]:
-                continue
-            at, bed = maps.each[j], tile.room[BED * TILE + j]
-            cameras = maps.camera[maps.start[at] : maps.start[at + 1]]
-            _group(groups, cameras, block.matcher)
-            _set_lines(groups, cameras, j, tile)
-            step[j] = _weigh_list(maps.rows[j], j, cameras, given, groups, tile, block)
-            tile.going[j] = beds < _BEDS and abs(step[j]) > FAR * abs(bed)
-            searched = searched or tile.going[j]
-            if not tile.going[j]:
-                for q in range(cameras.size):
-                    maps.weights[tile.row[cameras[q]], j] = groups.weight[q]
-        if not searched:
-            break
-
-
-@device
-def _weigh_list(
-    i: int, j: int, cameras: IntArray, given: FloatArray, groups: Groups, tile: Tile, block: Block
-) -> float:
-    """Set the weights of the maps of point i, the j-th of its tile; return the step of its bed."""
-    points, step = block.points, 0.0
-    for _ in range(_ROUNDS):
-        _move(groups, cameras.size, step)
-        groups.weight[: cameras.size] = 0.0
-        for at in range(points.start[i], points.start[i + 1]):
-            c = points.camera[at]
-            share = given[at] if given.size else _per_square(c, j, tile, block)
-            _share(groups.place[c], share, groups)
+def _set_steps(tile: Tile, weights: FloatArray) -> None:
+    """Set how far up the bed of each point is at which the weighted mean of the depths is zero."""
+    for j in range(weights.shape[1]):
         total, change = 0.0, 0.0
-        for q in range(cameras.size):
-            if groups.weight[q] > 0.0 and groups.slope[q] == groups.slope[q]:
-                total += groups.weight[q] * groups.t[q]
-                change += groups.weight[q] * groups.slope[q]
-        step = -total / change
-    return step
+        for k in range(len(weights)):
+            slope = tile.looks[k, BY_HEIGHT * TILE + j]
+            if weights[k, j] > 0.0 and slope == slope:
+                total += weights[k, j] * tile.looks[k, DEPTH * TILE + j]
+                change += weights[k, j] * slope
+        tile.step[j] = -total / change
 
 
-@device(allocates=True)
-def _with_neighbours(
-    rows: IntArray, place: IntArray, tile: Tile, block: Block
-) -> tuple[IntArray, IntArray]:
-    """Return the listed images of each point, and their partners whose frames hold the point."""
-    points, matcher = block.points, block.matcher
-    most = 0
-    for i in rows:
-        most += points.start[i + 1] - points.start[i]
-    start = np.zeros(rows.size + 1, np.int64)
-    found, count = np.empty(most * (matcher.averaged.shape[1] + 1), np.int64), 0
-    for j in range(rows.size):
-        place[:] = ABSENT
-        p = three(tile.points, _ORIGINAL * TILE + j)
-        for c in points.camera[points.start[rows[j]] : points.start[rows[j] + 1]]:
-            if place[c] < 0:
-                place[c], found[count], count = 0, c, count + 1
-            for a in matcher.averaged[c]:
-                # a partner that was not looked at yet
-                if a >= 0 and place[a] == ABSENT:
-                    place[a] = _OUTSIDE
-                    if holds(matcher.inner, a, minus(row_of(block.images.centres, a), p)):
-                        place[a], found[count], count = 0, a, count + 1
-        start[j + 1] = count
-    return start, found[:count]
+@device
+def _move_on(tile: Tile, weights: FloatArray, least_m: float, share: float) -> bool:
+    """Move the beds to where the fused depths give the apparent points; return whether any moved.
+
+    A bed moves by more than `least_m` and a share of its distance from the apparent point.
+    """
+    _set_steps(tile, weights)
+    searched = False
+    for j in range(weights.shape[1]):
+        step, bed = tile.step[j], tile.room[BED * TILE + j]
+        # NaN where no image with a weight sees the bed
+        tile.going[j] = np.isfinite(step) and abs(step) > least_m + share * abs(bed)
+        if tile.going[j]:
+            tile.room[BED * TILE + j] = bed + step
+            searched = True
+    return searched
+
+
+@device
+def _finish(result: FloatArray, maps: Maps, tile: Tile) -> None:
+    """Write the rows: the weighted mean of the Q, moved by the rest of the step."""
+    weights = maps.weights
+    _set_steps(tile, weights)
+    for j in range(weights.shape[1]):
+        row, step = result[maps.rows[j]], tile.step[j]
+        total, x, y, square, count = 0.0, 0.0, 0.0, 0.0, 0
+        for k in range(len(weights)):
+            look, w = tile.looks[k], weights[k, j]
+            if w > 0.0 and look[BY_HEIGHT * TILE + j] == look[BY_HEIGHT * TILE + j]:
+                # Q on the ray of this image, at the height of the bed after the step
+                u = look[_PLACE * TILE + j] + step * look[_PLACE_BY_HEIGHT * TILE + j]
+                v = look[(_PLACE + 1) * TILE + j] + step * look[(_PLACE_BY_HEIGHT + 1) * TILE + j]
+                total, count, square = total + w, count + 1, square + w * (u * u + v * v)
+                x, y = x + w * u, y + w * v
+        # without a map that sees the bed the point stays where it is
+        row[OUTCOME] = ONE_CAMERA if maps.start[j + 1] > maps.start[j] else NO_CAMERA
+        per_weight = 1.0 / total
+        x, y, square = x * per_weight, y * per_weight, square * per_weight
+        if np.isfinite(step) and np.isfinite(square):
+            row[0], row[1], row[2] = x, y, tile.room[BED * TILE + j] + step
+            row[_DISTANCE] = np.sqrt(max(square - x * x - y * y, 0.0))
+            row[OUTCOME], row[_COUNT] = CORRECTED, count

@@ -1,5 +1,10 @@
 """Intersect the refracted rays of each point (``snell``), or search its tracks (``consistent``).
 
+With the refracted ray t_i that leaves the water at A_i, the true point Q is nearest to all rays
+(Skarlatos & Agrafiotis 2018, eq 11, for any number of rays with equal weights):
+
+    Q = argmin sum |(I - t_i t_i') (Q - A_i)|^2 = (sum M_i)^-1 sum M_i A_i,    M_i = I - t_i t_i'
+
 Points are processed a tile of neighbours at a time and camera by camera, so that the inner loop
 runs over the points of the tile and is vectorised. The cameras are those whose frames hold the
 points, or those of a list per point (view lists, or the steepest few); both add the same terms in
@@ -30,7 +35,6 @@ from pcfix.refract.batch import (
     Intersection,
     Optics,
     optics_of,
-    require_orientation,
     warn_of_unsolved,
 )
 from pcfix.refract.choice import Rig, Rule, rig_of, rule_of, shapes_of
@@ -50,10 +54,6 @@ def intersect(batch: Batch) -> Intersection:
     The cameras are those of the views or, without these, all whose frames hold the apparent point,
     as that is where the SfM software projected it. The covariances, where the settings ask for
     them, are computed in the same pass.
-
-    Notes
-    -----
-    Skarlatos & Agrafiotis 2018, eqs 10 and 11, for any number of rays with equal weight.
     """
     return _intersected(batch, None)
 
@@ -69,7 +69,6 @@ def consistent(batch: Batch) -> Intersection:
     Points without a solution, under waves that focus the light, get that of ``snell``, with a
     warning.
     """
-    require_orientation(batch.survey.cameras, "Method consistent", "use method snell")
     return _intersected(batch, optics_of(batch.survey.cameras))
 
 
@@ -120,6 +119,7 @@ def _intersect(
         rows = order[t * TILE : (t + 1) * TILE]
         tile, sums = np.empty(7 * TILE), np.zeros(11 * TILE)
         low, high = tiling.gather(tile, rows, points)
+        # the least squared cosine of the incidence angles
         sums[10 * TILE :] = 1.0
         if start.size:
             near, marks = tiling.marks_of_lists(start, camera, rows, len(centres))
@@ -131,6 +131,7 @@ def _intersect(
         )
         _solve(result, used, rows, sums, marks[:seeing], near)
         if optics is not None:
+            # tracks: search from the intersection, where there is one
             for j in range(rows.size):
                 row = result[rows[j]]
                 search[STATE * TILE + j] = SEARCHED if row[_OUTCOME] == CORRECTED else LOST
@@ -141,6 +142,7 @@ def _intersect(
             )  # fmt: skip
             for j in range(rows.size):
                 row = result[rows[j]]
+                # without a solution the intersection stays
                 row[_FOUND] = 1.0 if search[STATE * TILE + j] == FOUND else 0.0
                 if row[_FOUND] > 0.0:
                     row[0], row[1], row[2] = three(search, Q * TILE + j)
@@ -167,6 +169,7 @@ def _add_cameras(
     """
     seeing = 0
     for k in range(near.size):
+        # the row of a camera that gives no ray is used again by the next one
         c, on, some = near[k], marks[seeing], True
         if listed:
             for j in range(on.size):

@@ -14,11 +14,9 @@ from pcfix.refract.batch import ALIKE, FLAT_DEG, Batch, Survey, require_orientat
 from pcfix.refract.methods import batches, on_land, with_rays
 from pcfix.refract.patches import FEWEST_WITHOUT_LIST, gsd_m
 from pcfix.refract.reconstructions import (
-    BARE,
     IN_FRAME,
     LIMITS,
     Hint,
-    Reconstruction,
     Verdict,
     reconstructions_of,
     type_given,
@@ -56,7 +54,8 @@ def resolved(
         camera_set = "all" if settings.camera_set == "auto" else settings.camera_set
         settings = replace(settings, method=method, camera_set=camera_set)
     elif method == "auto" and bare:
-        settings = BARE.settings(settings)
+        # tracks, as dense matchers cannot be modelled
+        settings = replace(settings, method="snell", camera_set="all", depth_factor=None)
     elif method == "auto" and views is not None:
         settings = replace(settings, method="consistent")
     if settings.camera_set == "mvs":
@@ -69,9 +68,13 @@ def resolved(
 
 
 def wants_sample(survey: Survey, views: ViewKind | None) -> bool:
-    """Return whether a sample of the whole cloud is needed."""
-    known = survey.settings.depth_factor != "auto"
-    return wants_matcher(survey, views) or _wants_limit(survey.settings, views) or not known
+    """Return whether a sample of the whole cloud is needed, with a kind of view list or none."""
+    settings = survey.settings
+    if settings.depth_factor == "auto" or _wants_comparison(survey):
+        return True
+    if views is None:
+        return _wants_matcher(survey) or _wants_limit(settings)
+    return views in ("depth-maps", "pair-images") and settings.method == "consistent"
 
 
 def with_factor(batch: Batch) -> tuple[Batch, StereoFactor | None]:
@@ -90,9 +93,15 @@ def with_factor(batch: Batch) -> tuple[Batch, StereoFactor | None]:
     return replace(batch, survey=replace(survey, settings=settings)), found
 
 
-def _wants_limit(settings: ScienceOptions, views: ViewKind | None) -> bool:
+STRONG = 0.25
+"""Largest share of the discontinuities that a limit may leave. On simulated tracks with obliques,
+where a limit doubles the errors, it leaves 0.28; where it more than halves them, on a rendered
+block with obliques, 0.15 to 0.2; on a real river, whose depths it makes plausible, 0.02 to 0.12."""
+
+
+def _wants_limit(settings: ScienceOptions) -> bool:
     """Whether the largest incidence angle is to be estimated from the cloud."""
-    return views is None and settings.max_angle == "auto" and settings.method in ALIKE
+    return settings.max_angle == "auto" and settings.method in ALIKE
 
 
 def _wants_comparison(survey: Survey) -> bool:
@@ -101,18 +110,15 @@ def _wants_comparison(survey: Survey) -> bool:
     That needs one water surface.
     """
     settings, cameras = survey.settings, survey.cameras
-    told = settings.dimensions == "all" and settings.method != "regression"
-    full = cameras.lenses is not None and cameras.rotations is not None
-    return told and full and survey.own_water is None
+    wanted = settings.dimensions == "all" and settings.method != "regression"
+    oriented = cameras.lenses is not None and cameras.rotations is not None
+    return wanted and oriented and survey.own_water is None
 
 
-def wants_matcher(survey: Survey, views: ViewKind | None) -> bool:
-    """Return whether the partners of the images are needed, for a kind of view list or none."""
-    settings, compared = survey.settings, _wants_comparison(survey)
-    if views is None:
-        return settings.models_matcher or settings.method == "auto" or compared
-    dense = views in ("depth-maps", "pair-images")
-    return compared or (dense and settings.method == "consistent")
+def _wants_matcher(survey: Survey) -> bool:
+    """Whether the partners of the images are needed, without a view list."""
+    settings = survey.settings
+    return settings.models_matcher or settings.method == "auto" or _wants_comparison(survey)
 
 
 def learn_of_sample(
@@ -120,45 +126,35 @@ def learn_of_sample(
 ) -> tuple[Survey, tuple[Verdict, ...]]:
     """Resolve ``auto`` and estimate the partners of the images and the bed, as needed.
 
-    The batch are points of the whole cloud, evenly spread, with land; their view lists have a kind.
+    The batch are points of the whole cloud, evenly spread, with land and without view lists.
     `ties` are tie points of the original model; by default the points show which images overlap.
     `hint` is the type that the software is known for, `near` are submerged points with their
     neighbours for the detection of the type, if those of the batch are too far apart. Returns the
     survey without ``auto`` and the verdicts.
     """
-    if batch.views is None and batch.survey.settings.method == "auto":
+    survey = batch.survey
+    if survey.settings.method == "auto":
         found = _learn_of_sources(batch, ties, hint, near)
         if found is not None:
             return found
-    survey = batch.survey
-    kind = None if batch.views is None else batch.views.kind
-    if wants_matcher(survey, kind):
+    if _wants_matcher(survey):
         survey = with_matcher(batch, ties)
     sample = replace(submerged_of(batch), survey=survey)
-    if batch.views is not None:
-        verdict = weigh_lists(sample, is_open=False)
-        survey = with_verdict(survey, verdict)
-        return survey, () if verdict is None else (verdict,)
     of_type = sample if near is None else replace(near, survey=survey)
     survey, verdicts = _weighed(of_type, hint)
     settings, learned = survey.settings, survey.learned._replace(land=None)
     if batch.original_model is not None:
         # land has the reconstruction type of the cloud, also where a formula corrects the bed
-        made = survey
+        land = on_land(survey)
         for one in verdicts:
             if one.is_given and one.is_against:
-                made = replace(made, settings=one.runner_up.settings(made.settings))
-        land = on_land(made)
-        if not made.settings.models_matcher:
+                land = replace(land, settings=one.runner_up.settings(land.settings))
+        if not land.settings.models_matcher:
             land = replace(land, learned=land.learned._replace(matcher=None))
         learned = learned._replace(land=land)
     if not settings.models_matcher:
         learned = learned._replace(matcher=None)
-    elif (
-        settings.method == "consistent"
-        and settings.matcher in ("depth-maps", "single-map")
-        and len(sample)
-    ):
+    elif settings.chooses_maps and len(sample):
         learned = learned._replace(bed=_learn_bed(replace(sample, survey=survey)))
     return replace(survey, learned=learned), verdicts
 
@@ -187,9 +183,9 @@ def _learn_of_sources(
     for one in large.tolist():
         part = _of_source(batch, one)
         own = None if near is None else _of_source(near, one)
-        surveys[one], told = learn_of_sample(part, ties, hint, own)
+        surveys[one], found = learn_of_sample(part, ties, hint, own)
         of = f"point source {one} ({100.0 * len(part) / len(batch):.0f} % of the points)"
-        verdicts += [verdict._replace(of=of) for verdict in told]
+        verdicts += [verdict._replace(of=of) for verdict in found]
     if len({verdict.chosen.words for verdict in verdicts if verdict.is_sure}) < 2:
         return None
     most = int(large[-1])
@@ -206,16 +202,19 @@ def _weighed(sample: Batch, hint: Hint | None) -> tuple[Survey, tuple[Verdict, .
     """Resolve ``auto`` and set the model uncertainty, for submerged points without lists."""
     survey, verdicts = sample.survey, list[Verdict | None]()
     if survey.settings.method == "auto":
-        reconstructions = reconstructions_of(sample)
-        verdicts.append(weigh(sample, reconstructions, hint=hint))
-        survey = with_verdict(survey, verdicts[0], reconstructions[0])
-        if len(reconstructions) > 1:
+        types = reconstructions_of(sample)
+        verdicts.append(weigh(sample, types, hint=hint))
+        # without evidence the first type is assumed
+        survey = replace(survey, settings=types[0].settings(survey.settings))
+        survey = with_verdict(survey, verdicts[0])
+        if len(types) > 1:
             return survey, tuple(filter(None, verdicts))
-    if _wants_limit(survey.settings, None):
+    if _wants_limit(survey.settings):
         # which rays were used in the reconstruction does not depend on the formula: test by snell
         sample = replace(sample, survey=survey)
         limit = weigh(sample, LIMITS)
-        if limit is not None and limit.chosen == LIMITS[1] and limit.is_strong:
+        fits = limit is not None and limit.chosen == LIMITS[1] and limit.patches
+        if limit is not None and fits and limit.share <= min(STRONG, 0.5 - 2.0 * limit.sigma):
             survey = replace(survey, learned=survey.learned._replace(limit_deg=FLAT_DEG))
             verdicts.append(limit)
         elif survey.settings.dimensions == "all" and not _wants_comparison(survey):
@@ -231,27 +230,28 @@ def _weighed(sample: Batch, hint: Hint | None) -> tuple[Survey, tuple[Verdict, .
     return survey, tuple(filter(None, verdicts))
 
 
-def with_verdict(
-    survey: Survey, verdict: Verdict | None, else_as: Reconstruction | None = None
-) -> Survey:
+def with_verdict(survey: Survey, verdict: Verdict | None) -> Survey:
     """Return a survey with the options and the model uncertainty of a verdict."""
     if verdict is None:
-        given = survey.settings
-        return survey if else_as is None else replace(survey, settings=else_as.settings(given))
+        return survey
     learned = survey.learned._replace(model_uncertainty=verdict.model_uncertainty)
     return replace(survey, settings=verdict.chosen.settings(survey.settings), learned=learned)
 
 
+LEAST_PLACES, PLACES_AN_IMAGE = 4000, 10  # that show which images overlap
+
+
 def with_matcher(batch: Batch, ties: TiePoints | None) -> Survey:
     """Return the survey with the predicted partners of the images."""
-    from pcfix.refract.matcher import matcher_of, matcher_of_ties, places_for
+    from pcfix.refract.matcher import matcher_of, matcher_of_ties
 
     survey = batch.survey
     places, matched = batch.original_model or (batch.xyz, survey.cameras)
     if ties is not None:
         matcher = matcher_of_ties(matched, ties)
     else:
-        step = max(1, len(batch) // places_for(matched))
+        enough = max(LEAST_PLACES, PLACES_AN_IMAGE * len(matched))
+        step = max(1, len(batch) // enough)
         matcher = matcher_of(matched, np.ascontiguousarray(places[::step]))
     return replace(survey, learned=survey.learned._replace(matcher=matcher))
 

@@ -101,6 +101,7 @@ def _predict(
     n, k = height.shape[1:]
     bed, best, normal = np.zeros(6), np.zeros(6), np.empty((6, 7))
     for p in range(*span):
+        # of the candidates, which says how far apart beds may be
         spread = _spread(height[p], prior[p])
         for fold in range(FOLDS):
             most = -np.inf
@@ -117,6 +118,7 @@ def _predict(
                 if likelihood > most:
                     most = likelihood
                     best[:] = bed
+            # the best bed predicts the points that it was not fitted to
             for i in range(fold, n, FOLDS):
                 for c in range(k):
                     rest[p, i, c] = (height[p, i, c] - _height(terms[p, i], best)) / gain[p, i, c]
@@ -173,6 +175,7 @@ def _step(
         if not total > 0.0:
             continue
         likelihood += np.log(total)
+        # normal equations of the surface, with the mean candidate as the height of the point
         for a in range(6):
             for b in range(a, 6):
                 normal[a, b] += weight / total * terms[i, a] * terms[i, b]

@@ -25,7 +25,7 @@ import numpy as np
 from pcfix.errors import GeometryError, SettingError
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.model import BoolArray, Cameras, FloatArray, Outcome
-from pcfix.refract.batch import Batch, Chosen, Intersection, require_orientation
+from pcfix.refract.batch import Batch, Chosen, Intersection
 from pcfix.refract.rays import MIN_DETERMINANT
 
 TOLERANCE = 1e-9
@@ -118,6 +118,7 @@ def _solve(
         # the depth under the water of each camera; 0 above it
         d = np.maximum(points.height[i] - points.xyz[i, 2] + points.offset[cameras], 0.0)
         rays = _crossings(e, d, np.hypot(e[:, 0], e[:, 1]) / e[:, 2], points.n)
+        # how far the true point is aside of the apparent one, and below it
         x, y, down_m, solved = 0.0, 0.0, 0.0, True
         if method == _MEAN:
             down_m = rays[0].sum() / max(k, 1)
@@ -229,6 +230,7 @@ def _equal_x(e: FloatArray, rays: Crossings) -> tuple[float, bool]:
             if base == 0.0:
                 continue
             q, q_other = (u[a] * x + v[a] * y) / base, (u[b] * x + v[b] * y) / base
+            # least squares over the pairs: q (z - below) is the same for both rays
             parallax = q - q_other
             products += parallax * (q * below[a] - q_other * below[b])
             squares += parallax * parallax
@@ -332,7 +334,7 @@ class StereoFactor:
 
 
 def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
-    """Return the depth factor of the stereo pairs of a block over water of a level.
+    """Return the depth factor of the stereo pairs of a block, with angles and lenses, over water.
 
     Raises GeometryError if fewer than two images look down, or neighbours do not overlap.
 
@@ -363,7 +365,6 @@ def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
     """
     from scipy.spatial import cKDTree
 
-    require_orientation(cameras, "depth-factor auto")
     rotations, lenses = np.asarray(cameras.rotations), cameras.lenses or ()
     flat = np.array([lens.projection == "perspective" for lens in lenses])
     rows = np.flatnonzero(flat & (-rotations[:, 2, 2] >= np.cos(np.radians(NADIR_DEG))))

@@ -1,7 +1,11 @@
-"""Predict which images a dense matcher compares with each other.
+"""Predict which images a dense matcher compares with each other, and the bed of the surroundings.
 
-For each image the others are scored by the places that both see: by the angle between the two
-rays, best at some 12 degrees; by the ratio of their distances; and by how much of the image the
+For each image i the other images j are scored by the places p that both see,
+
+    score_ij = covered_i  sum_p found(a_p)  g(a_p)  f(d_jp / d_ip)
+
+with the angle a_p between the two rays (g is a Gaussian around 12 degrees, wider on the upper
+side), the depths d of p in the images (f is 1 for equal ones), and the share of image i that the
 common places cover. This is the rule of OpenMVS (`Scene::SelectNeighborViews`); COLMAP and other
 patch matchers differ in the constants. On a real block it finds 91 % of the partners from places
 of the dense cloud and 98 % from the tie points that the matcher used.
@@ -33,7 +37,6 @@ REPEATED_DEG = 45.0
 
 TOLERANCE_PX2 = 0.1
 CELLS = 16
-LEAST_PLACES, PLACES_AN_IMAGE = 4000, 10
 WIDTH_M, NEAR_WIDTH_M = 0.2, 0.06
 LEAST_AREA = 0.05
 LEAST_COMMON = 3
@@ -100,11 +103,6 @@ def matcher_of_ties(cameras: Cameras, ties: TiePoints) -> Matcher:
     return _matcher(cameras, places, _seen(cameras, places, saw), tracked=True)
 
 
-def places_for(cameras: Cameras) -> int:
-    """Return how many places of the scene are enough for a block."""
-    return max(LEAST_PLACES, PLACES_AN_IMAGE * len(cameras))
-
-
 def _matcher(cameras: Cameras, places: FloatArray, seen: _Seen, *, tracked: bool) -> Matcher:
     table = np.full((len(cameras), NEIGHBOURS), -1)
     in_tiles(_find_partners, len(cameras), places, cameras.centres, seen, tracked, table)
@@ -138,19 +136,19 @@ BORDER_PX = 8.0
 
 def without_border(cameras: Cameras) -> Cameras:
     """Return cameras whose frames are narrower by the border in which no patch fits."""
-    if cameras.lenses is None:
-        return cameras
-    borders = [BORDER_PX * lens.pixel_size for lens in cameras.lenses]
-    return replace(cameras, lenses=tuple(map(with_border, cameras.lenses, borders)))
+    lenses = cameras.lenses or ()
+    inner = tuple(with_border(lens, BORDER_PX * lens.pixel_size) for lens in lenses)
+    return replace(cameras, lenses=inner)
 
 
 def _seen(cameras: Cameras, places: FloatArray, likely: Iterable[IntArray]) -> _Seen:
-    """Return which images see which places; `likely` has the rows that each image may see."""
-    if cameras.rotations is None or cameras.lenses is None:
-        raise ValueError("a model of the matcher needs angles and lenses")
-    found = list[tuple[IntArray, IntArray, FloatArray]]()
-    for c, (lens, rows) in enumerate(zip(cameras.lenses, likely, strict=True)):
-        rays = (places[rows] - cameras.centres[c]) @ cameras.rotations[c].T
+    """Return which images, with angles and lenses, see which places.
+
+    `likely` has the rows of the places that each image may see.
+    """
+    found, rotations = list[tuple[IntArray, IntArray, FloatArray]](), np.asarray(cameras.rotations)
+    for c, (lens, rows) in enumerate(zip(cameras.lenses or (), likely, strict=True)):
+        rays = (places[rows] - cameras.centres[c]) @ rotations[c].T
         u, v = project(lens, rays).T
         inside = (u >= 0.0) & (u < lens.width) & (v >= 0.0) & (v < lens.height)
         column, row = CELLS * u[inside] / lens.width, CELLS * v[inside] / lens.height

@@ -17,7 +17,7 @@ larger; that part of d is subtracted first.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numpy as np
 
@@ -53,11 +53,9 @@ _MIX = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0xD6E8FEB86659FD93)
 _TERMS = 6
 
 
-class Patches(NamedTuple):
-    """Groups of neighbours among points of a cloud."""
-
-    rows: IntArray  # (m,), the rows of a batch that are in a patch
-    place: IntArray  # (p, 32) or (p, 16), rows of `rows`, patch by patch
+Patches: TypeAlias = tuple[IntArray, IntArray]
+"""Groups of neighbours: the m rows of a batch that are in one, and their places among these rows,
+shape (p, 32) or (p, 16), patch by patch."""
 
 
 def patches_of(batch: Batch, *, at_borders: bool) -> Patches | None:
@@ -100,7 +98,7 @@ def _patches_of(batch: Batch, points: int, at_borders: bool) -> Patches | None:
     if batch.views is None and is_wide:
         return None
     rows, place = np.unique(patch, return_inverse=True)
-    return Patches(rows, place.reshape(patch.shape))
+    return rows, place.reshape(patch.shape)
 
 
 def _border_distance_m(xy: FloatArray, centres: FloatArray) -> FloatArray:

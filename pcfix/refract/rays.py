@@ -205,13 +205,16 @@ def light_near(
     Newton's method needs two steps: without a condition to end, loops over it are vectorised. The
     projection centre must be above the plane.
     """
+    # H + h, and D; the sideways vector s as in `light_path`
     across, depth = dot(normal, e), h - dot(normal, q)
     height = across - h
     s = beyond(minus(q, e), height + depth, normal)
     m2 = n * n if depth > 0.0 else 1.0
     a = (m2 - 1.0) * dot(s, s)
+    # tan^2 of the incidence angle of the apparent point gives the first S and k
     root = np.sqrt(m2 + (m2 - 1.0) * (dot(e, e) / (across * across) - 1.0))
     k = 1.0 / (height + depth / root)
+    # two Newton steps
     root = np.sqrt(m2 + a * k * k)
     k += (1.0 - k * (height + depth / root)) / (height + depth * m2 / (root * root * root))
     root = np.sqrt(m2 + a * k * k)

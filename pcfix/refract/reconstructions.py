@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, ViewKind
+from pcfix.model import FloatArray, IntArray, Outcome, ViewKind
 from pcfix.options.correct import Dimensions, ScienceOptions
 from pcfix.refract import patches
 from pcfix.refract.batch import FLAT_DEG, Batch, ModelUncertainty
 from pcfix.refract.likelihood import MODEL_ERROR, Candidates, log_likelihood, standard_errors
 from pcfix.refract.methods import correct, with_rays
-from pcfix.refract.patches import SMOOTH_GSD, Patches, scatter_m, shares
+from pcfix.refract.patches import SMOOTH_GSD, scatter_m, shares
 
 SURE = 2.3264
 """Standard errors of a significant difference: 99 %."""
@@ -63,11 +63,15 @@ class Reconstruction(NamedTuple):
     changes: dict[str, Any]  # the options that correct such a cloud
     kind: ViewKind | None = None  # of its view list, if there is one
 
+    @property
+    def is_single(self) -> bool:
+        """Whether it is single maps, which predict little but the scatter of neighbours."""
+        return self.words in (_SINGLE, _NEAREST)
+
     def settings(self, given: ScienceOptions) -> ScienceOptions:
         """Return the options that correct such a cloud."""
-        of_factor = self.changes.get("method", given.method) == "factor"
-        gone: dict[str, Any] = {} if of_factor else {"depth_factor": None}
-        return replace(given, **gone, **self.changes)
+        factor = given.depth_factor if self.changes["method"] == "factor" else None
+        return replace(given, depth_factor=factor, **self.changes)
 
 
 _TRACKS, _MAPS, _PAIRS = "tracks", "depth maps", "stereo pairs"
@@ -94,9 +98,6 @@ LISTED = (
     Reconstruction(_MAPS, {"method": "consistent"}, "depth-maps"),
     Reconstruction(_PAIRS, {"method": "consistent"}, "pair-images"),
 )
-BARE = Reconstruction(_TRACKS, {"method": "snell", "camera_set": "all"})
-"""The only type without lenses or angles."""
-
 LIMITS = (
     Reconstruction("all rays", {"method": "snell"}),
     Reconstruction(
@@ -105,10 +106,6 @@ LIMITS = (
     ),
 )
 """The rays that may have been used in the reconstruction, for the methods of `ALIKE`."""
-STRONG = 0.25
-"""Largest share of the discontinuities that a limit may leave. On simulated tracks with obliques,
-where a limit doubles the errors, it leaves 0.28; where it more than halves them, on a rendered
-block with obliques, 0.15 to 0.2; on a real river, whose depths it makes plausible, 0.02 to 0.12."""
 
 SOFTWARE: dict[str, tuple[str, ...]] = {
     "openmvs": (_MAPS,), "odm": (_MAPS,), "opendronemap": (_MAPS,), "opensfm": (_MAPS,),
@@ -130,21 +127,19 @@ class Hint(NamedTuple):
     source: str
 
 
-def hint_of(names: tuple[str, ...]) -> Hint | None:
-    """Return the types that software is known for, by the first name that is known."""
-    for name in names:
-        for word in re.findall(r"[a-z]+", name.lower()):
-            if word in SOFTWARE:
-                return Hint(SOFTWARE[word], name.strip())
-    return None
+def hint_of(software: str) -> Hint | None:
+    """Return the types that software is known for, by the first word of its name that is known."""
+    words = (word for word in re.findall(r"[a-z]+", software.lower()) if word in SOFTWARE)
+    known = next(words, None)
+    return None if known is None else Hint(SOFTWARE[known], software.strip())
 
 
 class Verdict(NamedTuple):
     """The reconstruction type of a cloud, and the evidence.
 
-    `share` and `runner_up_share` are the shares of the discontinuities, by which the two types
-    differ, that are left in the bed of each: 0 where right. `candidates` are the shares that other
-    types leave, against the chosen one. `straight` is that share between the chosen type and
+    `share` is the share of the discontinuities, by which the chosen type and the runner-up differ,
+    that is left in the bed of the chosen one: 0 where right. `candidates` are the shares that the
+    other types leave, against the chosen one. `straight` is the share between the chosen type and
     straight rays, near 1 if the poses have absorbed the refraction, and its standard error.
     """
 
@@ -152,8 +147,8 @@ class Verdict(NamedTuple):
     runner_up: Reconstruction  # the next best; if the user set the type, the best of all others
     errors: float  # standard errors by which the evidence is for the chosen type
     share: float
-    runner_up_share: float
-    sigma: float  # standard error of both
+    sigma: float  # standard error of the share
+    candidates: dict[str, float]
     deeper_m: float  # mean depth of the runner-up's bed below the chosen one
     patches: int  # 0 without evidence
     confidence: float  # probability that the type is right, and none of the others
@@ -163,7 +158,6 @@ class Verdict(NamedTuple):
     remarks: tuple[str, ...] = ()  # what makes the evidence weak
     of: str = ""  # the points it is about; empty for all
     straight: tuple[float, float] | None = None
-    candidates: tuple[tuple[str, float], ...] = ()
 
     @property
     def is_fused(self) -> bool:
@@ -176,11 +170,6 @@ class Verdict(NamedTuple):
         return self.errors > SURE
 
     @property
-    def is_strong(self) -> bool:
-        """Whether the type leaves hardly any discontinuities, at two standard errors from half."""
-        return self.patches > 0 and self.share <= min(STRONG, 0.5 - 2.0 * self.sigma)
-
-    @property
     def is_against(self) -> bool:
         """Whether the other type fits significantly better."""
         return self.errors < -SURE
@@ -190,7 +179,7 @@ class Verdict(NamedTuple):
         differs = self.is_against and abs(self.deeper_m) > self.model_uncertainty.formal_m
         unsure = differs if self.is_given else not self.is_sure
         # of single maps the shares say little
-        by_shares = not _is_single((self.chosen, self.runner_up)).any()
+        by_shares = not (self.chosen.is_single or self.runner_up.is_single)
         poor = by_shares and not self.is_sure and self.share > FITS
         absurd = self.share < min(MOST_BEYOND, -SURE * self.sigma)
         none_fits = not self.is_given and self.patches > 0 and (poor or absurd)
@@ -203,19 +192,16 @@ class Verdict(NamedTuple):
             "sure": self.is_sure,
             "confidence": round(self.confidence, 4),
             "share": round(self.share, 3),
-            "candidates": {name: round(share, 3) for name, share in self.candidates},
+            "candidates": {name: round(share, 3) for name, share in self.candidates.items()},
             "runner_up": self.runner_up.words,
-            "runner_up_share": round(self.runner_up_share, 3),
-            "sigma": round(self.sigma, 3),
             "runner_up_deeper_m": round(self.deeper_m, 4),
             "patches": self.patches,
-            "by": self.by,
             "scatter_m": round(self.model_uncertainty.scatter_m, 4),
             "doubt_per_depth": round(self.model_uncertainty.per_depth, 4),
         }
 
     def __str__(self) -> str:
-        way = "lower" if self.deeper_m >= 0.0 else "higher"
+        way, other = "lower" if self.deeper_m >= 0.0 else "higher", self.runner_up.words
         points = self.of[:1].upper() + self.of[1:] or "Cloud"
         how = "set by the user"
         if not self.is_given:
@@ -223,23 +209,21 @@ class Verdict(NamedTuple):
             how = f"detected{by}, confidence {100.0 * self.confidence:.0f} %"
         fit = ", which fits better" if self.is_given and self.is_against else ""
         text = (
-            f"{points}: {self.chosen.words} ({how}). Next best: {self.runner_up.words}{fit}; the"
-            f" bed would be {abs(self.deeper_m):.3f} m {way}."
+            f"{points}: {self.chosen.words} ({how}). Next best: {other}{fit}; the bed would be"
+            f" {abs(self.deeper_m):.3f} m {way}."
         )
         if not self.patches or self.share > 0.5:
             return text
-        left, other = (100.0 * min(max(x, 0.0), 1.0) for x in (self.share, self.runner_up_share))
+        left, more = np.clip([self.share, self.candidates[other]], 0.0, 1.0)
         return (
-            f"{text} Discontinuities between image footprints left in the bed: {left:.0f} %, with"
-            f" {self.runner_up.words} {other:.0f} % ({self.patches} patches)."
+            f"{text} Discontinuities between image footprints left in the bed: {100.0 * left:.0f}"
+            f" %, with {other} {100.0 * more:.0f} % ({self.patches} patches)."
         )
 
 
 def reconstructions_of(batch: Batch) -> tuple[Reconstruction, ...]:
     """Return the possible types of the points, of every kind of view list if it may be any."""
-    cameras, views = batch.survey.cameras, batch.views
-    if cameras.lenses is None or cameras.rotations is None:
-        return (BARE,)
+    views = batch.views
     if views is None:
         given, auto = batch.survey.settings.camera_set, batch.survey.settings.method == "auto"
         return tuple(
@@ -305,14 +289,16 @@ def weigh(
     sample = patches.patches_of(batch, at_borders=at_borders) if len(types) > 1 else None
     if sample is None:
         return None
-    part = batch.take(sample.rows)
+    rows, place = sample
+    part = batch.take(rows)
     survey = replace(part.survey, level_offset_m=None)
     part = replace(part, survey=survey, level_sigma_m=None)
-    is_dense = sample.place.shape[1] == patches.PATCH_POINTS[0]
-    beds = _beds(part, replace(batch, survey=part.survey), sample, types)
+    is_dense = place.shape[1] == patches.PATCH_POINTS[0]
+    around = patches.others_around(replace(batch, survey=part.survey), rows)
+    beds = _beds(part, around, place, types)
     if beds is None or (given is not None and given not in beds.types):
         return None
-    remarks, among, by = _remarks(part, sample.place), list(range(len(beds.types))), ""
+    remarks, among, by = _remarks(part, place), list(range(len(beds.types))), ""
     if remarks:
         beds = beds._replace(errors=beds.errors / WEAK)
     if given is None:
@@ -336,8 +322,10 @@ def weigh(
         runner_up=beds.types[other],
         errors=float(beds.errors[best, other]) if beds.patches else 0.0,
         share=float(beds.share[best, other]),
-        runner_up_share=float(beds.share[other, best]),
         sigma=float(beds.sigma[best, other]),
+        candidates={
+            one.words: float(beds.share[i, best]) for i, one in enumerate(beds.types) if i != best
+        },
         deeper_m=deeper_m,
         patches=beds.patches,
         confidence=min(confidence, MOST_CONFIDENCE),
@@ -346,27 +334,24 @@ def weigh(
         is_given=given is not None,
         remarks=remarks,
         straight=straight,
-        candidates=tuple(
-            (one.words, float(beds.share[i, best])) for i, one in enumerate(beds.types) if i != best
-        ),
     )
 
 
 def _beds(
-    part: Batch, batch: Batch, sample: Patches, types: tuple[Reconstruction, ...]
+    part: Batch, around: Batch, place: IntArray, types: tuple[Reconstruction, ...]
 ) -> _Beds | None:
     """Correct the points of the patches for each type; None if fewer than two can."""
-    around = patches.others_around(batch, sample.rows)
     z = np.array([_heights(part, around, one) for one in types])
     covered = np.isfinite(z).sum(axis=1)
     kept = np.flatnonzero(covered >= COVERED * covered.max())
     if len(kept) < 2 or not covered.max():
         return None
     z, types = z[kept], tuple(types[i] for i in kept)
-    place = sample.place[np.isfinite(z[:, sample.place]).all(axis=(0, 2))]
-    if len(place) < LEAST_PATCHES:
+    known = place[np.isfinite(z[:, place]).all(axis=(0, 2))]
+    if len(known) < LEAST_PATCHES:
         half, none = np.full((len(z), len(z)), 0.5), np.zeros((len(z), len(z)))
-        return _Beds(types, z, sample.place, 0, half, half, none)
+        return _Beds(types, z, place, 0, half, half, none)
+    place = known
     share, sigma = shares(part, place, z)
     errors = (0.5 - share) / np.maximum(sigma, 1e-9)
     if part.views is None and LIMITS[0] not in types:
@@ -382,14 +367,6 @@ def _beds(
     np.fill_diagonal(share, -np.inf)
     np.fill_diagonal(errors, np.inf)
     return _Beds(types, z, place, len(place), share, sigma, errors)
-
-
-def _is_single(types: tuple[Reconstruction, ...]) -> BoolArray:
-    """Return which types are single maps.
-
-    They predict little but the scatter of neighbours, or discontinuities at few places.
-    """
-    return np.array([one.words in (_SINGLE, _NEAREST) for one in types])
 
 
 def _log_likelihood(part: Batch, place: IntArray, one: Reconstruction, z: FloatArray) -> FloatArray:
@@ -408,7 +385,8 @@ def _log_likelihood(part: Batch, place: IntArray, one: Reconstruction, z: FloatA
 def _with_prior(beds: _Beds, is_dense: bool, hint: Hint | None) -> tuple[_Beds, str]:
     """Add what is known of the types by density and software; return what decided, if these did."""
     words = [one.words for one in beds.types]
-    is_single, tracks = _is_single(beds.types), np.array([one == _TRACKS for one in words])
+    is_single = np.array([one.is_single for one in beds.types])
+    tracks = np.array([one == _TRACKS for one in words])
     prior = (
         PRIOR_TRACKS[0] * tracks
         if is_dense
@@ -457,20 +435,21 @@ def _model_uncertainty(part: Batch, beds: _Beds, at: int, among: list[int]) -> M
     """
     depth = np.maximum(part.surface.height_m - beds.z[at], 1e-3)[beds.place]
     deep = depth > LEAST_DEPTH_M
-    is_single = _is_single(beds.types)
 
     def left(a: int, b: int, most: float) -> float:
-        apart = np.abs((beds.z[a] - beds.z[b])[beds.place]) / depth
-        share = _open_share(float(beds.errors[a, b]))
-        if not is_single[[a, b]].any():
-            share = max(
-                share, min(max(float(beds.share[a, b]), 0.0) + float(beds.sigma[a, b]), 1.0)
-            )
-        if not np.isfinite(apart[deep]).any():
+        apart = (np.abs((beds.z[a] - beds.z[b])[beds.place]) / depth)[deep]
+        # by the probability of the other type
+        wrong = 0.5 * math.erfc(beds.errors[a, b] / math.sqrt(2.0))
+        share = float(np.interp(wrong, OPEN, (0.0, 1.0)))
+        # single maps predict discontinuities at few places only
+        if not (beds.types[a].is_single or beds.types[b].is_single):
+            by_steps = max(float(beds.share[a, b]), 0.0) + float(beds.sigma[a, b])
+            share = max(share, min(by_steps, 1.0))
+        if not np.isfinite(apart).any():
             return 0.0
         # its 95 % interval covers 95 % of the differences
-        rms = float(np.sqrt(np.nanmean(apart[deep] ** 2)))
-        spread = max(rms, float(np.nanquantile(apart[deep], 0.95)) / 1.96)
+        rms = float(np.sqrt(np.nanmean(apart**2)))
+        spread = max(rms, float(np.nanquantile(apart, 0.95)) / 1.96)
         return (share if share <= most else 1.0) * spread
 
     best, _ = beds.rank(among)
@@ -481,11 +460,6 @@ def _model_uncertainty(part: Batch, beds: _Beds, at: int, among: list[int]) -> M
     budget = correct(_as(part, beds.types[at], "all"))
     formal = float(np.median(budget.sigma_z_m))
     return ModelUncertainty(math.sqrt(max(scatter**2 - formal**2, 0.0)), open_m, formal)
-
-
-def _open_share(errors: float) -> float:
-    """Return how much of the difference to another type counts, by its probability."""
-    return float(np.interp(0.5 * math.erfc(errors / math.sqrt(2.0)), OPEN, (0.0, 1.0)))
 
 
 def _as(part: Batch, one: Reconstruction, dimensions: Dimensions = "none") -> Batch:

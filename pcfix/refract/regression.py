@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -60,7 +60,7 @@ class DepthRegression:
 
     def as_dict(self) -> dict[str, Any]:
         """Return it in plain values."""
-        return {**asdict(self), "outliers": list(self.outliers), "notes": list(self.notes)}
+        return asdict(self)
 
     def __str__(self) -> str:
         return (
@@ -196,20 +196,16 @@ REACH = 4.0
 the nearest neighbour is closer than on a grid, 10."""
 
 
-class ApparentDepths(NamedTuple):
-    """Apparent depths and water levels at places, shape (p,); NaN without a bed around them."""
-
-    depth_m: FloatArray
-    level_m: FloatArray
-    nearest_m: FloatArray  # (p,), distance of the nearest submerged point; infinite without any
-    radius_m: float  # within which points count
-
-
-def apparent_depths(places: FloatArray, parts: Iterable[Part]) -> ApparentDepths:
+def apparent_depths(
+    places: FloatArray, parts: Iterable[Part]
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Return the medians of the submerged points nearest to places, shape (p, 2), in plan.
 
     They are 3 to `NEIGHBOURS`, within `REACH` times the distance between neighbouring points there.
     Points of noise (classes 7 and 18) do not count. The parts are read once, in bounded memory.
+    Returns the apparent depths and the water levels, shape (p,), NaN without a bed around a place;
+    the distance of the nearest submerged point, infinite without any; and the distance within which
+    points count. Metres.
     """
     near = NearestPoints(places, NEIGHBOURS, columns=6)
     for xyz, surface, classes in parts:
@@ -224,4 +220,4 @@ def apparent_depths(places: FloatArray, parts: Iterable[Part]) -> ApparentDepths
     # the height of the water over the place itself, where the surface is tilted
     level = height + (slope * (places[:, None] - xy)).sum(axis=2)
     depth = near.medians(height - near.rows[..., 2], radius)
-    return ApparentDepths(depth, near.medians(level, radius), near.distance_m[:, 0], radius)
+    return depth, near.medians(level, radius), near.distance_m[:, 0], radius

@@ -23,8 +23,7 @@ functions is continuous, with kinks where it changes from one pair to another. B
 starts at `snell`'s solution with the derivative diag(1, 1, apparent by true depth), and goes back
 to half such a step wherever it does not come nearer.
 
-A tile of points is processed camera by camera and pair by pair, so that the inner loops run over
-the points and are vectorised. Points that need more than a few steps form new tiles.
+Points that need more than a few steps form new tiles.
 """
 
 from __future__ import annotations
@@ -61,11 +60,10 @@ from pcfix.refract.batch import (
     Images,
     Intersection,
     images_of,
-    require_orientation,
-    to_original,
+    in_other,
     warn_of_unsolved,
 )
-from pcfix.refract.choice import Rig, Rule, cameras_of_pairs, rig_of, rule_of
+from pcfix.refract.choice import Rig, Rule, rig_of, rule_of
 from pcfix.refract.intersect import add_camera
 from pcfix.refract.rays import MIN_DETERMINANT, light_near, nearest_point, ray_distance
 from pcfix.refract.tiling import TILE, nine, put, slots, three
@@ -116,26 +114,23 @@ class Pairs(NamedTuple):
 def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
     """Return the true points from which the median of stereo pairs would be the apparent ones.
 
-    The views of the batch are pairs, or the cameras that may be in one; then `pairs`, of the kind
-    pairs, count if both cameras are among the views. By default the pairs are those of images that
-    the matcher matched, each once. The surface above each point is taken as a plane.
+    The views of the batch are the cameras that may be in a pair. `pairs` are view lists of the kind
+    pairs; by default the pairs are those of images that the matcher matched, each once. The surface
+    above each point is taken as a plane.
 
     `ray_count` and `incidence_deg` are of the cameras that are in a pair; `ray_miss_m` is the
     distance from their refracted rays through the apparent point, as for `snell`. A point with
     cameras but without a pair is `ONE_CAMERA`, one with narrow pairs only `PARALLEL_RAYS`. Points
     without a solution get that of `snell`, with a warning.
     """
-    require_orientation(batch.survey.cameras, "Method consistent", "use method snell")
-    if batch.rays.kind == "pairs":
-        pairs, batch = batch.rays, replace(batch, views=cameras_of_pairs(batch.rays))
-    survey, matcher = batch.survey, batch.survey.learned.matcher
-    if pairs is None and matcher is None:
-        raise ValueError("pairs or a model of the matcher are needed")
-    start, camera, partners = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 0), int)
+    survey, matcher, none = batch.survey, batch.survey.learned.matcher, np.zeros(0, np.int64)
+    start, camera, partners = none, none, np.zeros((0, 0), np.int64)
     if pairs is not None:
         start, camera = np.asarray(pairs.start, np.int64), np.asarray(pairs.camera, np.int64)
     elif matcher is not None:
         partners = _each_once(matcher.matched)
+    else:
+        raise ValueError("pairs or a model of the matcher are needed")
     images, rule = images_of(batch.original_model, survey.cameras), rule_of(survey)
     search, derivative = np.zeros((len(batch), _WIDTH_OF_SEARCH)), np.zeros((len(batch), 3, 3))
     block = Block(
@@ -198,6 +193,7 @@ def _search(
         for _ in range(STEPS):
             if not _step(rows, rays, places, values, now, tile, near, pairs, block):
                 break
+        # a search that is done, or came near enough, replaces the intersection
         for j in range(rows.size):
             found, one = result[rows[j]], block.search[rows[j]]
             if found[_OUTCOME] == CORRECTED and one[_BEST] <= CLOSE_M:
@@ -223,6 +219,7 @@ def _pairs_of(
         candidates[j] = (points.start[i + 1] - points.start[i]) * step
         if listed.size:
             candidates[j] = (listed[i + 1] - listed[i]) // 2
+    # the number of each pair of rays, in the order in which the points have them
     number, total, most = np.full((k, k), ABSENT), 0, candidates.max()
     rays = np.empty((min(k * k, rows.size * most), 2), np.int64)
     own = np.empty((3, rows.size, most), np.int64)
@@ -240,6 +237,7 @@ def _pairs_of(
             if a < 0 or b < 0 or a == b or row[a] < 0 or row[b] < 0:
                 continue
             ray_a, ray_b = row[a], row[b]
+            # both cameras must be among those of the point
             if not (marks[ray_a, j] > 0.0 and marks[ray_b, j] > 0.0):
                 continue
             if not _is_wide(a, b, j, tile, points):
@@ -282,6 +280,7 @@ def _start(
         i, one = rows[j], block.search[rows[j]]
         first, last = points.start[i], points.start[i + 1]
         if pairs.wide[j] == 0:
+            # no pair has a base, or there is none
             few = ONE_CAMERA if last > first else NO_CAMERA
             result[i, _OUTCOME] = PARALLEL if pairs.narrow[j] else few
             continue
@@ -349,7 +348,7 @@ def _see(
         p, normal = three(tile, j), three(tile, 4 * TILE + j)
         above = normal[2] * (tile[3 * TILE + j] - p[2] + offset)
         k, _, _, _, s = light_near(three(now, j), minus(centre, p), normal, above, points.n)
-        w = to_original(images, c, minus(scaled(k, s), normal))
+        w = in_other(images.adjusted, optics, c, minus(scaled(k, s), normal))
         e = minus(original, three(tile, 7 * TILE + j))
         size2, ahead = dot(e, e), -dot(axis, e)
         # behind a perspective camera the depth along the axis has no meaning

@@ -1,6 +1,6 @@
-"""What a correction came to, added up chunk by chunk in bounded memory, and the orders of S-44.
+"""Add up the results of a correction chunk by chunk, and compare uncertainties with IHO S-44.
 
-Vertical uncertainty is in the terms of hydrographic surveys: TVU at 95 %, IHO S-44, edition 6.
+Vertical uncertainty is the TVU at 95 % of hydrographic surveys, IHO S-44, edition 6.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ COVERAGE_95 = 1.96
 """Standard errors of a Gaussian quantity within which 95 % lie, as S-44 takes it in one dimension.
 """
 REASONS = {
-    Outcome.NO_CAMERA: "no camera has it in its frame, or in its list of views",
-    Outcome.ONE_CAMERA: "one usable ray only",
-    Outcome.FLAT_RAYS: "fewer than two rays within the largest angle (--max-angle)",
-    Outcome.PARALLEL_RAYS: "rays nearly parallel",
+    Outcome.NO_CAMERA: "outside the frames of all cameras, or without a camera in the view list",
+    Outcome.ONE_CAMERA: "only one usable ray",
+    Outcome.FLAT_RAYS: "fewer than two rays within the maximum incidence angle (--max-angle)",
+    Outcome.PARALLEL_RAYS: "rays are nearly parallel",
 }
 _BIN_M = 0.001
 
@@ -165,17 +165,17 @@ class Tally(Sums):
 
     @property
     def submerged(self) -> int:
-        """Points below the surface so far."""
+        """Number of points below the water surface."""
         neither = self.outcomes[Outcome.LAND] + self.outcomes[Outcome.NOT_TRANSFERRED]
         return int(self.outcomes.sum() - neither)
 
     @property
     def corrected(self) -> int:
-        """Points moved so far."""
+        """Number of corrected points."""
         return int(self.outcomes[Outcome.CORRECTED])
 
     def uncorrected(self) -> dict[str, int]:
-        """Return how many submerged points were not moved, by reason."""
+        """Return the number of submerged points that were not corrected, by reason."""
         return {text: int(self.outcomes[reason]) for reason, text in REASONS.items()}
 
     def as_dict(self) -> dict[str, Any]:

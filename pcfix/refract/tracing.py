@@ -12,7 +12,7 @@ scattershot    grids of paths narrowed to the shortest optical length (Fermat)
 
 The first three look for a refracted ray that hits the point. On facets, and on the bilinear
 patches of a raster, there may be none: through a crease that is a trough comes light that obeys
-Fermat, but not the normal of any facet. There `trace` narrows the grids of `scattershot` from the
+Fermat, but not the normal of any facet. There `trace` shrinks the grids of `scattershot` around the
 end of the method to the path of least optical length nearby.
 
 Coordinates are relative to the object point. A ray is named by its plan place (x, y) on the
@@ -71,7 +71,6 @@ class Tracing:
 
     piercing_xyz: FloatArray  # (n, 3), where the light leaves the water, metres, world frame
     direction: FloatArray  # (n, 3), unit vectors from the projection centre to there
-    iterations: IntArray  # (n,), steps of the method; shots of grids
     converged: BoolArray  # (n,), whether a path was found
     on_crease: BoolArray  # (n,), whether it leaves through a crease
 
@@ -83,7 +82,6 @@ def trace(
     *,
     refractive_index: float = DEFAULT_REFRACTIVE_INDEX,
     method: str = "kotowski",
-    narrow: bool = True,
 ) -> Tracing:
     """Trace light backwards, from projection centres to object points under water.
 
@@ -100,8 +98,6 @@ def trace(
         Of the water against air, at least 1.
     method : {"kotowski", "afrt", "mdfrt", "scattershot"}
         How the path is found; see `pcfix.refract.tracing`.
-    narrow : bool, default True
-        Where the method finds no ray, search the shortest path nearby.
 
     Returns
     -------
@@ -151,21 +147,18 @@ def trace(
         )
     point, centre = (np.array(a, float).T for a in np.broadcast_arrays(xyz, seen_from))
     pairs, count = Endpoints(surface, point, centre - point, n), point.shape[1]
-    pierced, steps = np.full((3, count), np.nan), np.zeros(count, np.int64)
-    on_crease = np.zeros(count, np.bool_)
+    pierced, on_crease = np.full((3, count), np.nan), np.zeros(count, np.bool_)
 
     def run(span: Span) -> None:
         with threads(1), np.errstate(all="ignore"):
             for block in range(*span):
                 rows = np.arange(block * BLOCK, min((block + 1) * BLOCK, count))
-                path = _path(pairs.of(rows), method, narrow)
-                pierced[:, rows], steps[rows], on_crease[rows] = path
+                pierced[:, rows], on_crease[rows] = _path(pairs.of(rows), method)
 
     in_tiles(run, -(-count // BLOCK))
     return Tracing(
         piercing_xyz=(point + pierced).T,
         direction=_unit(pierced - pairs.e).T,
-        iterations=steps,
         converged=np.isfinite(pierced[0]),
         on_crease=on_crease,
     )
@@ -254,58 +247,54 @@ def _unit(a: FloatArray) -> FloatArray:
     return a / np.sqrt(_dot(a, a))
 
 
-def _path(pairs: Endpoints, method: str, narrow: bool) -> Found:
-    """Return where the light of pairs pierces the surface, the steps, and whether on a crease."""
+def _path(pairs: Endpoints, method: str) -> Paths:
+    """Return where the light of pairs pierces the surface, (3, m), and whether on a crease."""
     e, m = pairs.e, pairs.e.shape[1]
-    found, steps = np.full((3, m), np.nan), np.zeros(m, np.int64)
-    on_crease = np.zeros(m, np.bool_)
+    pierced, on_crease = np.full((3, m), np.nan), np.zeros(m, np.bool_)
     level, over = (pairs.pierced(xy)[0][2] for xy in (np.zeros((2, m)), e[:2]))
     # not where the camera is under the water, or somewhere infinite
     is_above = ~(e[2] <= over) & (np.abs(e).sum(axis=0) < np.inf)
     # a point above the water is seen straight
-    found[:, is_above & ~(level > 0.0)] = 0.0
+    pierced[:, is_above & ~(level > 0.0)] = 0.0
     rows = np.flatnonzero(is_above & (level > 0.0) & (e[2] > 0.0))
     wet, level = pairs.of(rows), level[rows]
     # the straight line pierces the surface about here
-    share = np.minimum(level / wet.e[2], HIGHEST_START)
-    xy = share * wet.e[:2]
+    start = np.minimum(level / wet.e[2], HIGHEST_START) * wet.e[:2]
     if method == "scattershot":
         # on calm water the place is between the point and the straight line; the first grid covers
         # these and as much as the point is deep all around
-        half = level + 0.5 * np.abs(xy).max(axis=0)
-        xy = _best_knot(wet, 0.5 * xy, half, KNOTS)[0]
-        xy, steps[rows], is_found = _narrowed(wet, xy, 2.0 * half / KNOTS)
+        half = level + 0.5 * np.abs(start).max(axis=0)
+        xy = _best_knot(wet, 0.5 * start, half, KNOTS)[0]
+        xy, found = _shortest(wet, xy, 2.0 * half / KNOTS)
     else:
-        start = xy
-        xy, steps[rows], is_found = _search(wet, start, level, method)
-        lost = np.flatnonzero(~is_found)
-        if narrow and len(lost):
+        xy, found = _search(wet, start, level, method)
+        lost = np.flatnonzero(~found)
+        if len(lost):
             near = np.where(np.isnan(wet.pierced(xy)[0][2]), start, xy)[:, lost]
-            xy[:, lost], more, is_found[lost] = _narrowed(wet.of(lost), near, NEAR * level[lost])
-            steps[rows[lost]] += more
-    rows, wet, xy = rows[is_found], wet.of(is_found), xy[:, is_found]
-    found[:, rows] = wet.pierced(xy)[0]
+            xy[:, lost], found[lost] = _shortest(wet.of(lost), near, NEAR * level[lost])
+    rows, wet, xy = rows[found], wet.of(found), xy[:, found]
+    pierced[:, rows] = wet.pierced(xy)[0]
     on_crease[rows] = ~(np.hypot(*wet.offset(xy)) <= CREASE_M)
-    return found, steps, on_crease
+    return pierced, on_crease
 
 
-Found: TypeAlias = tuple[FloatArray, IntArray, BoolArray]
-"""Plan places (2, m) where a tracer ended, its numbers of steps, and whether it found a path."""
+Paths: TypeAlias = tuple[FloatArray, BoolArray]
+"""Places where light pierces the surface, a column for each, and a property of each."""
 
 
-def _search(pairs: Endpoints, start: FloatArray, level: FloatArray, method: str) -> Found:
-    """Find where the residual of a method vanishes, from places on the straight lines on.
+def _search(pairs: Endpoints, start: FloatArray, level: FloatArray, method: str) -> Paths:
+    """Find where the residual of a method vanishes, from places on the straight lines.
 
-    `level` are the heights of the water over the points. Mulsow 2024 does not say how the residual
-    is brought to zero. Here it is Newton's method with differences of neighbouring places. A step
-    that makes the residual grow, or leaves the water, is halved until it is short.
+    `level` are the heights of the water over the points. Returns places (2, m) and whether a ray
+    pierces the surface there. Mulsow 2024 does not say how the residual is brought to zero. Here it
+    is Newton's method with differences of neighbouring places. A step that makes the residual grow,
+    or leaves the water, is halved until it is short.
     """
     # beyond the edge of the water: start above the point
     xy = np.where(np.isnan(pairs.residual(start, method)[0]), 0.0, start)
-    rest = pairs.residual(xy, method)
-    steps, found = np.zeros(len(level), np.int64), np.zeros(len(level), np.bool_)
+    rest, found = pairs.residual(xy, method), np.zeros(len(level), np.bool_)
     rows, some = np.arange(len(level)), pairs
-    for step in range(1, SEARCH_STEPS + 1):
+    for _ in range(SEARCH_STEPS):
         place, r, depth = xy[:, rows], rest[:, rows], level[rows]
         aside = np.minimum(DIFFERENCE_M, 0.05 * depth)
         by_x = some.residual(np.stack([place[0] + aside, place[1]]), method) - r
@@ -321,7 +310,7 @@ def _search(pairs: Endpoints, start: FloatArray, level: FloatArray, method: str)
                 break
             s[:, far] *= 0.5
             new[:, far] = some.of(far).residual(place[:, far] + s[:, far], method)
-        steps[rows], rest[:, rows] = step, new
+        rest[:, rows] = new
         goes_on = ~np.isnan(new[0])
         xy[:, rows[goes_on]] += s[:, goes_on]
         found[rows] = goes_on & (size <= CLOSE_M)
@@ -329,10 +318,10 @@ def _search(pairs: Endpoints, start: FloatArray, level: FloatArray, method: str)
         rows, some = rows[goes_on], some.of(goes_on)
         if not len(rows):
             break
-    return xy, steps, found & (np.hypot(*pairs.offset(xy)) <= CREASE_M)
+    return xy, found & (np.hypot(*pairs.offset(xy)) <= CREASE_M)
 
 
-def _narrowed(pairs: Endpoints, xy: FloatArray, half: FloatArray) -> Found:
+def _shortest(pairs: Endpoints, xy: FloatArray, half: FloatArray) -> Paths:
     """Return the nearest places of least optical length (Fermat), from half the size of grids on.
 
     Mulsow 2024 names scattershot only ("brute force"). There is no start value, no derivative, no
@@ -344,25 +333,22 @@ def _narrowed(pairs: Endpoints, xy: FloatArray, half: FloatArray) -> Found:
     too blunt in the end: a ray nearby is searched by its distance from the point. Without one the
     path goes through a crease, known to about 1e-6 m along it.
     """
-    xy, half, shots = xy.copy(), half.copy(), np.zeros(len(half), np.int64)
+    xy, half = xy.copy(), half.copy()
     for _ in range(SHOTS):
         rows = np.flatnonzero(half > BLUNT_M)
         if not len(rows):
             break
         xy[:, rows], on_rim = _best_knot(pairs.of(rows), xy[:, rows], half[rows], 2)
         half[rows] *= np.where(on_rim, 1.0, 0.5)
-        shots[rows] += 1
-    near, steps, is_ray = _search(pairs, xy, np.full(len(half), NEIGHBOUR_M), "mdfrt")
+    near, is_ray = _search(pairs, xy, np.full(len(half), NEIGHBOUR_M), "mdfrt")
     is_ray &= np.hypot(*(near - xy)) <= NEIGHBOUR_M
     # at an edge of the water the shortest path means nothing
     around = [np.array([[i], [j]]) * NEIGHBOUR_M for i, j in product((-1.0, 1.0), repeat=2)]
     inside = np.all([~np.isnan(pairs.pierced(xy + corner)[0][2]) for corner in around], axis=0)
-    return np.where(is_ray, near, xy), shots + steps, is_ray | inside
+    return np.where(is_ray, near, xy), is_ray | inside
 
 
-def _best_knot(
-    pairs: Endpoints, xy: FloatArray, half: FloatArray, knots: int
-) -> tuple[FloatArray, BoolArray]:
+def _best_knot(pairs: Endpoints, xy: FloatArray, half: FloatArray, knots: int) -> Paths:
     """Return the places of the shortest paths on grids about x, y, and whether they are on the rim.
 
     The grids have `knots` knots to each side of their middle, within `half`.

@@ -22,8 +22,7 @@ thousands. P is seen in the direction -e_i, and w_i is scaled to one along the n
 is known to about a thousandth. From `snell`'s solution each step with the inverse of the sum gains
 about three digits, and two or three steps are enough.
 
-A tile of points is processed camera by camera, as in `pcfix.refract.intersect`: the inner loops
-run over the points and are vectorised, for the usual lens and a plane of water.
+The inner loops over the points of a tile are vectorised for the usual lens and a plane of water.
 """
 
 from __future__ import annotations
@@ -75,6 +74,7 @@ def search_tile(
                     _set_rays(rays[k], tile, marks[k], rig, near[k], optics, plain_lens(lens))
                 else:
                     _set_rays(rays[k], tile, marks[k], rig, near[k], optics, None)
+        # g and its derivative at the places so far, camera by camera
         room[_G * TILE : _STEP2 * TILE] = 0.0
         for k in range(near.size):
             c, lens = near[k], optics.lenses[optics.row[near[k]]]

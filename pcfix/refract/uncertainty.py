@@ -44,8 +44,19 @@ move of D^-1 T Q. With W = J'J and S = W D^-1, D^-1 across as in the table,
 as W e = 0. Q depends on P only through pi(P): dQ / dP = (sum S T)^-1 sum W, and K cancels out. Up
 to 45 degrees the two differ by less than 2 %; of rays at 73 degrees the first is twice as large.
 
-In both cases S delta = c A delta + b (d.delta) g with a symmetric A, g = S d and two numbers: M, 1
-and 0 in space; W, 1 / (1 - m) and -beta / (1 - m) in images.
+In both cases S delta = c A delta + b (d.delta) g, with a symmetric A, g = S d, and S N = -v g:
+
+==========  ===  ==========  ===============  ==========================
+residuals   A    c           b                v
+==========  ===  ==========  ===============  ==========================
+in space    M    1           0                r / kappa
+in images   W    1 / (1-m)   -beta / (1-m)    (1 - b rho^2) / H
+==========  ===  ==========  ===============  ==========================
+
+With D p = D (p - (N.p) e / H) for any p, as P may also move up, the sums have the terms
+
+    S T = c A + g (b d + (v - r / kappa) N)'
+    S D = (1 - m) c A + g (((1 - m) b + beta) d - ((1 - m) (1 - H v) + beta rho^2) N / H)'
 
 Neglected is the turn of M, and of J, times the residual, which is of second order.
 """
@@ -53,7 +64,7 @@ Neglected is the turn of M, and of J, times the residual, which is of second ord
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -77,12 +88,9 @@ from pcfix.options.correct import LEVEL_M
 from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Chosen, Intersection, Survey
 from pcfix.refract.choice import Rig, rig_of
-from pcfix.refract.rays import refracted
+from pcfix.refract.rays import MIN_DETERMINANT, refracted
 from pcfix.refract.tiling import TILE, add_three, inverse_of, nine, product_of, put, slots, three
 from pcfix.water.surface import Field, height_at
-
-MIN_DETERMINANT = 1e-6
-"""As of `pcfix.refract.rays.nearest_point`, of half the trace cubed: k^3 for k rays in space."""
 
 MODEL_GSD = 0.8
 """Standard error of the model of depth maps, common to a block: the bias of blocks with known truth
@@ -138,8 +146,10 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
 def with_uncertainty(found: Intersection, batch: Batch) -> Intersection:
     """Return a result with its covariances and standard errors of Z, if the settings ask for them.
 
-    To the errors of the budget are added those of the model of depth maps, of the reconstruction
-    type, of mismatches and of adjusted poses, where these were estimated.
+    The variance of Z is that of the budget or of a regression, and where they were estimated those
+    of the model of depth maps, of mismatches and the reconstruction type, and of adjusted poses:
+
+        Var Z = [Cov Q]_zz + ambiguity^2 + (k GSD)^2 + scatter^2 + (per_depth depth)^2 + poses^2
     """
     survey, covariance, ambiguity = batch.survey, found.covariance_m2, found.ambiguity_m
     found = found._replace(ambiguity_m=None)
@@ -151,20 +161,17 @@ def with_uncertainty(found: Intersection, batch: Batch) -> Intersection:
         if survey.settings.method == "regression" and line is not None:
             covariance[:, [_XZ, _YZ]] = 0.0
             covariance[:, _ZZ] = line.sigma_m(surface.height_m - batch.xyz[:, 2]) ** 2
-    if not moved.all():
-        covariance[~moved] = 0.0
-    variance = covariance[moved, _ZZ]
+    covariance[~moved] = 0.0
+    variance, level = covariance[moved, _ZZ], surface.height_m[moved]
     if ambiguity is not None:  # of depth maps
-        cameras = survey.cameras
-        focal_px = float(np.median([lens.focal_px for lens in cameras.lenses or ()]))
-        gsd_m = (np.median(cameras.centres[:, 2]) - surface.height_m[moved]) / focal_px
-        is_single = survey.settings.matcher != "depth-maps"
-        model_gsd = MODEL_SINGLE_GSD if is_single else MODEL_GSD
-        variance += ambiguity[moved] ** 2 + (model_gsd * gsd_m) ** 2
+        focal_px = float(np.median([lens.focal_px for lens in survey.cameras.lenses or ()]))
+        gsd_m = (np.median(survey.cameras.centres[:, 2]) - level) / focal_px
+        is_fused = survey.settings.matcher == "depth-maps"
+        variance += ambiguity[moved] ** 2
+        variance += ((MODEL_GSD if is_fused else MODEL_SINGLE_GSD) * gsd_m) ** 2
     if learned.model_uncertainty is not None:
-        model, z = learned.model_uncertainty, batch.xyz[:, 2] + found.shift_m[:, 2]
-        depth = (surface.height_m - z)[moved]
-        variance += model.scatter_m**2 + (model.per_depth * depth) ** 2
+        model, z = learned.model_uncertainty, (batch.xyz[:, 2] + found.shift_m[:, 2])[moved]
+        variance += model.scatter_m**2 + (model.per_depth * (level - z)) ** 2
     if learned.poses is not None:
         variance += learned.poses.at(batch.xyz[moved, :2]) ** 2
     covariance[moved, _ZZ] = variance
@@ -246,13 +253,15 @@ class Sight(NamedTuple):
 
 
 class Ray(NamedTuple):
-    """One ray, for kernels; see the table above."""
+    """One ray, for kernels; see the docstring of the module."""
 
-    one: float  # how often it counts
+    times: float  # how often it counts
     e: Vector
+    d: Vector  # e across N
     normal: Vector  # N
     height: float  # H
     length2: float  # L^2
+    rho2: float  # d.d
     h: float
     y: float
     bend: float  # r, 1 where light goes straight
@@ -261,6 +270,10 @@ class Ray(NamedTuple):
     lean: float  # r / kappa: the tangent in water for each metre across in air
     away: float  # 1 - m
     beta: float
+
+
+Effect: TypeAlias = tuple[Symmetric, Vector, float, float, float]
+"""A, g, c, b and v: how a displacement of a ray goes into the sums."""
 
 
 @device(allocates=True)
@@ -278,16 +291,19 @@ def _ray_of(room: FloatArray, tile: FloatArray, marks: FloatArray, j: int, sight
     p, normal = three(tile, j), three(tile, 4 * TILE + j)
     e = minus(sight.centre, p) if marks[j] > 0.0 else normal
     height, length2 = dot(normal, e), dot(e, e)
+    rho2 = length2 - height * height
     h = normal[2] * (tile[3 * TILE + j] - (p[2] - sight.offset))
     # light of a point above the water goes straight
     bend, y = sight.bend if h > 0.0 else 1.0, h + room[_ABOVE * TILE + j]
-    kappa = np.sqrt(length2 - bend * bend * (length2 - height * height))
+    kappa = np.sqrt(length2 - bend * bend * rho2)
     # one division for two
     share = 1.0 / (height * kappa)
     inv_k, inv_h = share * height, share * kappa
-    lean = bend * inv_k
+    lean, d = bend * inv_k, beyond(e, -height, normal)
     away, beta = 1.0 - h * inv_h + y * lean, y * lean * inv_k * inv_k * (bend * bend - 1.0)
-    return Ray(marks[j], e, normal, height, length2, h, y, bend, kappa, inv_h, lean, away, beta)
+    return Ray(
+        marks[j], e, d, normal, height, length2, rho2, h, y, bend, kappa, inv_h, lean, away, beta
+    )
 
 
 @device(forceinline=True)
@@ -302,9 +318,9 @@ def _weight(ray: Ray, sight: Sight) -> Symmetric:
     flat = axis[0] != 0.0 or axis[1] != 0.0 or axis[2] != 0.0
     # depth along the axis, or the squared distance
     deep = -dot(axis, e) if flat else length2
-    inv = 1.0 / deep if ray.one > 0.0 else 0.0
+    inv = 1.0 / deep if ray.times > 0.0 else 0.0
     # (f / Z)^2 or (f / L)^2; 0 for rays that do not count
-    w = ray.one * sight.square * (inv * inv if flat else inv)
+    w = ray.times * sight.square * (inv * inv if flat else inv)
     a = inv if flat else -0.5 * inv
     b = 0.5 * length2 * inv * inv if flat else 0.0
     zx, zy, zz = axis[0] if flat else e[0], axis[1] if flat else e[1], axis[2] if flat else e[2]
@@ -316,34 +332,24 @@ def _weight(ray: Ray, sight: Sight) -> Symmetric:
 
 
 @device(forceinline=True)
-def _inverse(ray: Ray) -> tuple[float, float]:
-    """Return what D^-1 does to p across d, and along it."""
-    # 1 - m + beta rho^2
-    outer = ray.away + ray.beta * (ray.length2 - ray.height * ray.height)
-    share = 1.0 / (ray.away * outer)
-    return share * outer, share * ray.away
-
-
-@device(forceinline=True)
-def _effect(
-    ray: Ray, w: Symmetric, in_space: bool | None
-) -> tuple[Symmetric, Vector, float, float]:
-    """Return A, g, c and b, by which a move of the ray goes into the sums; see the docstring.
-
-    numba compiles a version for residuals in space, and one for None: in images.
-    """
-    if in_space is None:
-        inner, outer = _inverse(ray)
-        return w, scaled(-ray.height * outer, product(w, ray.normal)), inner, -ray.beta * inner
-    height, length2, kappa = ray.height, ray.length2, ray.kappa
-    d, per = refracted(ray.e, length2, ray.normal, height, ray.bend), ray.one / length2
+def _effect(ray: Ray, w: Symmetric, in_images: bool) -> Effect:
+    """Return the effect of a displacement of a ray, on residuals in images or in space."""
+    if in_images:
+        # one division for two: c, and S d = W d / (1 - m + beta rho^2), where W d = -H W N
+        outer = ray.away + ray.beta * ray.rho2
+        share = 1.0 / (ray.away * outer)
+        c, b = share * outer, -ray.beta * share * outer
+        g = scaled(-ray.height * share * ray.away, product(w, ray.normal))
+        return w, g, c, b, (1.0 - b * ray.rho2) * ray.inv_h
+    t = refracted(ray.e, ray.length2, ray.normal, ray.height, ray.bend)
     # M = I - t t', with the refracted ray of the length L
-    xx, xy, xz, yy, yz, zz = plus_square(NO_SQUARES, d)
-    m = ray.one - per * xx, -per * xy, -per * xz, ray.one - per * yy, -per * yz, ray.one - per * zz
-    # M d = (kappa^2 d - r kappa rho^2 N) / L^2, d = e - H N
-    along = kappa * kappa * per
-    up = along * height + ray.bend * kappa * (length2 - height * height) * per
-    return m, minus(scaled(along, ray.e), scaled(up, ray.normal)), 1.0, 0.0
+    one, per = ray.times, ray.times / ray.length2
+    xx, xy, xz, yy, yz, zz = plus_square(NO_SQUARES, t)
+    m = one - per * xx, -per * xy, -per * xz, one - per * yy, -per * yz, one - per * zz
+    # M d = (kappa^2 d - r kappa rho^2 N) / L^2
+    up = per * ray.bend * ray.kappa * ray.rho2
+    g = beyond(scaled(per * ray.kappa * ray.kappa, ray.d), -up, ray.normal)
+    return m, g, 1.0, 0.0, ray.lean
 
 
 @device(forceinline=True)
@@ -363,28 +369,24 @@ def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: V
 
 @device
 def _add_common(
-    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, in_space: bool | None
+    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, in_images: bool
 ) -> None:
     """Add one camera's rays to the sums of a tile's points: what moves Q, P, level and index."""
     for j in range(marks.size):
         ray = _ray_of(room, tile, marks, j, sight)
-        w, e, normal, lean = _weight(ray, sight), ray.e, ray.normal, ray.lean
-        a, g, c, b = _effect(ray, w, in_space)
-        if in_space is None:
-            # S T = c W + g (b e + up N)', as W N = -g (1 + beta rho^2 / (1 - m)) (1 - m) / H
-            rho2 = ray.length2 - ray.height * ray.height
-            up = (1.0 - b * rho2) * ray.inv_h - b * ray.height - lean
-            _add_nine(room, BY_Q * TILE + j, c, a, g, plus(scaled(up, normal), scaled(b, e)))
-        else:
-            # M T = M, as M t = 0; M D (p - (N.p) e / H), as M e = (1 - r H / kappa) g
-            up = (ray.away * (lean * ray.height - 1.0) - ray.beta * ray.length2) * ray.inv_h
-            q = plus(scaled(up, normal), scaled(ray.beta, e))
-            _add_nine(room, BY_Q * TILE + j, 1.0, a, g, (0.0, 0.0, 0.0))
-            _add_nine(room, BY_P * TILE + j, ray.away, a, g, q)
+        w, normal, lean, away = _weight(ray, sight), ray.normal, ray.lean, ray.away
+        a, g, c, b, v = _effect(ray, w, in_images)
+        # S T
+        _add_nine(room, BY_Q * TILE + j, c, a, g, beyond(scaled(b, ray.d), v - lean, normal))
+        if not in_images:
+            # S D; in images it is W
+            up = (away * (1.0 - ray.height * v) + ray.beta * ray.rho2) * ray.inv_h
+            q = beyond(scaled(away * b + ray.beta, ray.d), -up, normal)
+            _add_nine(room, BY_P * TILE + j, away * c, a, g, q)
         # delta by n over d: y r^2 L^2 / kappa^3
         inv_k2 = 1.0 / (ray.kappa * ray.kappa)
         by_n = ray.y * lean * ray.bend * ray.length2 * inv_k2 if ray.bend < 1.0 else 0.0
-        room[RAYS * TILE + j] += ray.one
+        room[RAYS * TILE + j] += ray.times
         add_three(room, BY_LEVEL * TILE + j, ray.inv_h - lean, g)
         add_three(room, BY_N * TILE + j, by_n, g)
         _add_six(room, SIGHT * TILE + j, 1.0, w)
@@ -392,19 +394,19 @@ def _add_common(
 
 @device
 def _add_tilt(
-    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, in_space: bool | None
+    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, in_images: bool
 ) -> None:
     """Add how the slope of the water moves each of one camera's rays: S delta by tau.
 
-    delta = turn tau + along (d.tau) d, along = gamma + m r / kappa; d.tau = e.tau.
+    delta = turn tau + along (d.tau) d, along = gamma + m r / kappa.
     """
     for j in range(marks.size):
         ray = _ray_of(room, tile, marks, j, sight)
-        a, g, c, b = _effect(ray, _weight(ray, sight), in_space)
+        a, g, c, b, _ = _effect(ray, _weight(ray, sight), in_images)
         turn, inv_k = -ray.y * (1.0 - ray.height * ray.lean), 1.0 / ray.kappa
         along = ray.y * ray.bend * ray.bend * ray.lean * ray.height * inv_k * inv_k
         along += (ray.h * ray.inv_h - ray.y * ray.lean) * ray.lean - ray.h * ray.inv_h * ray.inv_h
-        _add_nine(room, BY_TILT * TILE + j, turn * c, a, g, scaled(turn * b + along, ray.e))
+        _add_nine(room, BY_TILT * TILE + j, turn * c, a, g, scaled(turn * b + along, ray.d))
 
 
 @device
@@ -416,31 +418,25 @@ def _add_noise(
     An error that moves the straight ray at P by z, of covariance C, moves its image by J z and
     adds W C W. A turned camera has C = attitude^2 L^2 times what is across the ray, a moved one
     centre_m^2. A wave of slope tau at the piercing point moves the refracted ray at depth y by
-    -y (1 - r H / kappa) (tau + r^2 / kappa^2 d (d.tau)); D^-1 of that is what moves P, by c_t
-    across d and c_r along.
+    -y (1 - r H / kappa) (tau + r^2 / kappa^2 d (d.tau)), which adds S delta delta' S in images.
     """
     for j in range(marks.size):
         ray = _ray_of(room, tile, marks, j, sight)
-        w, length2, height = _weight(ray, sight), ray.length2, ray.height
-        inner, outer = _inverse(ray)
-        # a slope of the wave moves the refracted ray by this across d
-        across = budget.waves * ray.y * (1.0 - height * ray.lean)
-        # and by the factor 1 + bow rho^2 along d
-        bow = ray.bend * ray.bend / (ray.kappa * ray.kappa)
-        c_t = across * inner
-        c_r = across * outer * (1.0 + bow * (length2 - height * height))
-        # (c_r^2 - c_t^2) / rho^2, also straight down; W d = -H W N
-        more = across * outer * (bow - ray.beta * inner) * (c_r + c_t)
-        # variance of the place of P from attitude, centre and waves, with C isotropic
-        by_place = budget.attitude**2 * length2 + budget.centre_m**2 + c_t * c_t
-        by_normal = more * height * height - c_t * c_t
+        w = _weight(ray, sight)
+        _, g, c, b, v = _effect(ray, w, True)
+        # S delta = across (c W tau + along (d.tau) g), with tau across N, where c W N = -v g
+        across = budget.waves * ray.y * (1.0 - ray.height * ray.lean)
+        along = b + ray.lean * ray.lean
+        by_wave = along * (2.0 * v * ray.height + along * ray.rho2) - v * v
+        # variance of the place of P from attitude, centre and waves, in all directions
+        by_place = budget.attitude**2 * ray.length2 + budget.centre_m**2 + (across * c) ** 2
         # W W, as W is symmetric: the sum of the squares of its rows
         square = plus_square(NO_SQUARES, (w[0], w[1], w[2]))
         square = plus_square(plus_square(square, (w[1], w[3], w[4])), (w[2], w[4], w[5]))
         at = NOISE * TILE + j
         _add_six(room, at, budget.image_px**2, w)
         _add_six(room, at, by_place, square)
-        _add_six(room, at, by_normal, plus_square(NO_SQUARES, product(w, ray.normal)))
+        _add_six(room, at, across * across * by_wave, plus_square(NO_SQUARES, g))
 
 
 @kernel(allocates=True)
@@ -473,14 +469,9 @@ def add_errors(
         sight = Sight(
             row_of(rig.centres, c), rig.offset[c], row_of(rig.axes, c), rig.focal_px[c] ** 2, bend
         )
-        if budget.in_images:
-            _add_common(room, tile, marks[k], sight, None)
-        else:
-            _add_common(room, tile, marks[k], sight, True)
-        if budget.tilt > 0.0 and budget.in_images:
-            _add_tilt(room, tile, marks[k], sight, None)
-        elif budget.tilt > 0.0:
-            _add_tilt(room, tile, marks[k], sight, True)
+        _add_common(room, tile, marks[k], sight, budget.in_images)
+        if budget.tilt > 0.0:
+            _add_tilt(room, tile, marks[k], sight, budget.in_images)
         if budget.by_ray:
             _add_noise(room, tile, marks[k], sight, budget)
 
@@ -503,6 +494,7 @@ def finish_tile(
     for j in range(rows.size):
         m, k = nine(sums, BY_Q * TILE + j), sums[RAYS * TILE + j]
         det, b = inverse_of(m)
+        # half the trace: k for k rays in space, as in `nearest_point`
         half = 0.5 * (m[0] + m[4] + m[8])
         solved = (k >= 2.0) & (det >= MIN_DETERMINANT * half * half * half)
         by_noise = b

@@ -136,8 +136,8 @@ def test_sources(tmp_path):
     ],
 )
 def test_software(name, words):
-    assert words in hint_of(("LAStools", name)).words
-    assert hint_of(("LAStools", "Pix4D")) is None
+    assert words in hint_of(name).words
+    assert hint_of("Pix4D") is None
 
 
 def gridded(scene, step_m):

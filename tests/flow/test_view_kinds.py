@@ -48,7 +48,7 @@ def test_simulated(cloud, block):
     views = replace(scene.views.take(rows), kind="depth-maps")
     found = kind_of(scene.xyz[rows], scene.cameras, scene.water, views)
     assert found.chosen.kind == cloud and found.is_sure
-    assert found.share < 0.3 < 0.7 < found.runner_up_share
+    assert found.share < 0.3 < 0.7 < found.candidates[found.runner_up.words]
 
 
 def test_not_enough_evidence():

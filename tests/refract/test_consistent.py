@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import pcfix
 from pcfix.errors import SettingError
 from pcfix.model import Cameras, Lens, Outcome, Views, WaterMesh, WaterPlane, WaterRaster
 from pcfix.options.correct import ScienceOptions
@@ -363,4 +364,4 @@ def test_no_orientation():
         if "angles" in missing:
             bare = replace(bare, rotations=None)
         with refused("cameras.no_orientation", SettingError, missing=missing):
-            run(np.array([[0.0, 0, -3]]), bare, WaterPlane(0.0), views_of([[0, 1]]))
+            pcfix.correct_points(np.array([[0.0, 0, -3]]), bare, 0.0, method="consistent")

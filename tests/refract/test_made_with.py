@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from pcfix.model import Outcome, WaterPlane
 from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import Learned, OriginalModel, to_adjusted, to_original
+from pcfix.refract.batch import Learned, OriginalModel
 from pcfix.refract.matcher import Bed
 from pcfix.refract.methods import correct, on_land, shift_of_land
 from pcfix.water.surface import surface_above
@@ -16,11 +16,7 @@ from tests.refract.test_depth_maps import CAMERAS, MATCHED, MIXED, N_WATER, NADI
 from tests.refract.test_depth_maps import FUSED as OTHERS
 from tests.refract.test_depth_maps import matcher as plain_matcher
 from tests.utils.batches import batch_of
-from tests.utils.compiled import compiled
 from tests.utils.depth_map_twin import LENS, fused_slowly
-
-to_original = compiled(to_original)
-to_adjusted = compiled(to_adjusted)
 
 WATER = WaterPlane(0.3, 0.004, -0.003)
 

@@ -45,11 +45,11 @@ def test_simulated_cloud(name):
     place = ["tracks", "depth-maps", "pairs"].index(kind)
     assert verdict.chosen is IN_FRAME[place]
     assert settings.method == "consistent"
-    assert verdict.share < verdict.runner_up_share
+    assert verdict.share < verdict.candidates[verdict.runner_up.words]
     # the single maps of images predict nearly the scatter of simulated fused maps
     assert verdict.is_sure or name in ("pairs", "depth-maps")
     assert (verdict.confidence >= 0.99) == verdict.is_sure
-    assert {one.words for one in IN_FRAME} == {verdict.chosen.words, *dict(verdict.candidates)}
+    assert {one.words for one in IN_FRAME} == {verdict.chosen.words, *verdict.candidates}
     assert verdict.runner_up.words in str(verdict)
 
 
@@ -70,8 +70,8 @@ def test_software_is_a_prior():
     xyz, water = scene.xyz[rows], scene.water
     batch = Batch(xyz, surface_above(water, xyz), Survey(water, scene.cameras, AUTO))
     _, (free,) = learn_of_sample(batch)
-    _, (against,) = learn_of_sample(batch, hint=hint_of(("openmvs",)))
-    _, (agreeing,) = learn_of_sample(batch, hint=hint_of(("SURE 5.0",)))
+    _, (against,) = learn_of_sample(batch, hint=hint_of("openmvs"))
+    _, (agreeing,) = learn_of_sample(batch, hint=hint_of("SURE 5.0"))
     assert free.chosen is against.chosen is agreeing.chosen is IN_FRAME[3]
     assert against.errors <= free.errors <= agreeing.errors
 
