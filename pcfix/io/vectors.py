@@ -17,7 +17,7 @@ import shapely
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io import tables
 from pcfix.io.atomic import cannot_write, temporary_output
-from pcfix.io.crs import LOCAL, parse_crs, way_to_cloud
+from pcfix.io.crs import parse_crs, way_to_cloud
 from pcfix.io.files import check_input, check_output
 from pcfix.libraries import analysis_library, optional_library
 from pcfix.model import FloatArray
@@ -113,7 +113,7 @@ def read_vectors(path: File, *, crs: str | None = None) -> Vectors:
     if gone.all():
         raise bad_file(name, "vector.empty", "holds no geometry with coordinates.")
     vectors = Vectors(geometries[~gone], crs or found, name)  # without empty features
-    if vectors.crs is None or vectors.crs.strip().lower() == LOCAL:
+    if vectors.crs is None:
         return vectors
     stated = parse_crs(vectors.crs, name)
     x, y = vectors.coordinates[:, 0], vectors.coordinates[:, 1]
