@@ -320,8 +320,9 @@ def transformation(
         sentence = f"{name}: PROJ knows no transformation {names}; their datums are treated as one."
         notes = (PcfixWarning("crs.datum", sentence),)
     elif step.accuracy > SILENT_ACCURACY_M:
-        sentence = f"{name}: positions {names} are accurate to about {step.accuracy:g} m{without}."
-        sentence += f" {install}." if grids else ""
+        sentence = f"{name}: positions {names} are accurate to about {step.accuracy:g} m."
+        if grids and 0.0 <= accuracy_m < step.accuracy:
+            sentence += f" With the grid {', '.join(grids)} it is {accuracy_m:g} m. {install}."
         notes = (PcfixWarning("crs.accuracy", sentence, accuracy_m=step.accuracy, grids=grids),)
 
     def forward(xyz: FloatArray) -> FloatArray:
