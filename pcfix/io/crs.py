@@ -353,7 +353,7 @@ def is_same_numbers(source: CRS, target: CRS, *, heights: bool = True) -> bool:
 
 
 def way_to_cloud(
-    crs: str | None, cloud_crs: str | CRS | None, at: FloatArray, name: str, *, heights: bool
+    crs: str | CRS | None, cloud_crs: str | CRS | None, at: FloatArray, name: str, *, heights: bool
 ) -> tuple[Points | None, Notes]:
     """Return the transformation from a file's CRS to the cloud's, None for none, and notes.
 
@@ -361,7 +361,7 @@ def way_to_cloud(
     The cloud's is projected, in metres. `heights` says whether z matters.
     """
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
-    if crs is not None and crs.strip().lower() == LOCAL:
+    if isinstance(crs, str) and crs.strip().lower() == LOCAL:
         return None, ()
     source = None if crs is None else parse_crs(crs, name)
     if all(one is None or is_local(one) for one in (source, cloud)):

@@ -355,19 +355,19 @@ def _from_metashape(path: Path) -> Marks:
         stated = (marker if found is None else found).attrib
         if all(stated.get(axis) for axis in "xyz"):
             where = f"marker {label}, reference"
-            xyz = [xml_number(path, where, stated[axis]) for axis in "xyz"]
+            place = [xml_number(path, where, stated[axis]) for axis in "xyz"]
             sigma = metashape.spreads(path, where, stated, np.full(3, default))
-            is_check = stated.get("enabled") in ("false", "0")
-            surveyed[marker.get("id") or ""] = label, xyz, sigma, is_check
+            is_disabled = stated.get("enabled") in ("false", "0")
+            surveyed[marker.get("id") or ""] = label, place, sigma, is_disabled
     marks = [] if chunk.frame is None else metashape.measured_marks(chunk.frame)
     marks = [mark for mark in marks if mark[0] in surveyed]
     if not marks:
         sentence = "has no marker with surveyed coordinates and a mark in an image. Export them."
         raise bad_file(path, "gcps.none", sentence)
-    labels, xyz, sigma, is_check = zip(*(surveyed[mark[0]] for mark in marks), strict=True)
+    labels, xyz, sigmas, is_check = zip(*(surveyed[mark[0]] for mark in marks), strict=True)
     own = (chunk.root.findtext("marker_reference") or "").strip()
     crs = own or (chunk.root.findtext("reference") or "").strip() or LOCAL
-    count, sigma_m = len(marks), np.array(sigma)
+    count, sigma_m = len(marks), np.array(sigmas)
     return Marks(
         path=path,
         where=[f"marker {label}" for label in labels],
