@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-from typing import Any
 
 from pcfix.errors import bad_file
 from pcfix.io.files import check_input, read_json, refusing, write_text
@@ -56,16 +55,15 @@ def read_regression(path: File) -> DepthRegression:
             raise bad_file(found, "regression.value", sentence, name=name, value=value)
 
     for name in _FIELDS:
-        value: Any = content.get(name)
+        value = content.get(name)
         if name != "cv_rmse" or value is not None or name not in content:
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            check(name, "a finite number", number and math.isfinite(value))
+            check(name, "a finite number", type(value) in (int, float) and math.isfinite(value))
             check(name, "at least 0", name not in _NOT_NEGATIVE or value >= 0.0)
     count = content["count"]
-    check("slope", "above 0", content["slope"] > 0.0)
     whole = count >= LEAST_COUNT and count == int(count)
+    check("slope", "above 0", content["slope"] > 0.0)
     check("count", f"a whole number of at least {LEAST_COUNT}", whole)
     check("deepest", "above shallowest", content["deepest"] > content["shallowest"])
     values = {field: content[name] for name, field in _FIELDS.items()}
-    notes = notes_of(count, content["slope"])
-    return DepthRegression(**values, source=str(content.get("source", "")), notes=notes)
+    source = str(content.get("source", ""))
+    return DepthRegression(**values, source=source, notes=notes_of(count, content["slope"]))
