@@ -27,7 +27,7 @@ from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps, part_report
 from pcfix.io.las.writing import corrected_header
-from pcfix.io.regressions import write_regression
+from pcfix.io.saved import write_regression
 from pcfix.io.tiles import Clouds
 from pcfix.io.views import ViewReport, beside
 from pcfix.label.labelling import Labelling
