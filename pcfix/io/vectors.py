@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 Geometries = npt.NDArray[Any]
+load_pyogrio = partial(optional_library, "pyogrio", "vector", "Read and write vector files")
 
 TEXT_SUFFIXES = (".wkt", ".csv", ".txt")
 GDAL_SUFFIXES = (".gpkg", ".shp", ".geojson", ".json", ".kml", ".gpx")
@@ -150,11 +151,6 @@ def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool
         sentence = "some of it has no place in the cloud's CRS. Check the file's CRS."
         raise bad_file(vectors.name, "vector.outside_crs", sentence)
     return moved
-
-
-def load_pyogrio() -> Any:
-    """Import the library of vector files."""
-    return optional_library("pyogrio", "vector", "Read and write vector files")
 
 
 def _read_gdal(path: Path, layer: str) -> tuple[Geometries, str | None, str]:
