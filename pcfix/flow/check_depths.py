@@ -11,7 +11,7 @@ import numpy as np
 
 from pcfix.errors import GeometryError, SettingError
 from pcfix.flow.surfaces import CloudView, Points, parts_of
-from pcfix.io.regressions import read_regression
+from pcfix.io.saved import read_regression
 from pcfix.io.tables import read_check_depths
 from pcfix.label.labelling import Part
 from pcfix.options.correct import ScienceOptions

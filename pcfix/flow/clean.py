@@ -19,7 +19,7 @@ from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
-from pcfix.io.las.writing import noted_header, own_settings
+from pcfix.io.las.writing import output_header, own_settings
 from pcfix.io.tiles import Clouds, open_cloud
 from pcfix.model import LOW_NOISE, NOISE_CLASSES, BoolArray, FloatArray, WaterSurface
 from pcfix.options.declare import File, taken
@@ -208,7 +208,7 @@ def _cleaning(plan: CleanPlan, source: LasSource) -> FileWork:
     """Return the cleaning of one file: its header with a record of it, and each chunk."""
     found = plan.summary.as_dict()
     content = {name: found[name] for name in ("pcfix", "settings", "water", "reasons")}
-    header = noted_header(source, "cleaning", {**content, "drop": plan.drop})
+    header = output_header(source, "cleaning", {**content, "drop": plan.drop})
 
     def compute(points: Chunk, row: int) -> tuple[BoolArray, int]:
         """Return which points of a chunk are noise, and their number."""

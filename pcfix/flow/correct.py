@@ -26,8 +26,8 @@ from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of, 
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps, part_report
-from pcfix.io.las.writing import corrected_header
-from pcfix.io.regressions import write_regression
+from pcfix.io.las.writing import output_header
+from pcfix.io.saved import write_regression
 from pcfix.io.tiles import Clouds
 from pcfix.io.views import ViewReport, beside
 from pcfix.label.labelling import Labelling
@@ -107,7 +107,7 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
     """Return the correction of one file: its header, and each chunk."""
     written = columns.columns_for(plan.options.dimensions, plan.options.unsure)
     steps = centring_steps(source.header)
-    header = corrected_header(source, written, plan.provenance(), steps)
+    header = output_header(source, "settings", plan.provenance(), written, steps)
     uncorrected = plan.options.uncorrected
 
     def compute(points: Chunk, row: int) -> tuple[Correction, CloudTally]:

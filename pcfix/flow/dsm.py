@@ -241,7 +241,7 @@ def _write_rasters(
         )
         with rasters.open_raster(paths["dsm"]) as heights, shade as out:
             for window in lattice.window.parts(BLOCK_CELLS):
-                height = rasters.read_within(heights, window.grown(1), lattice.window)
+                height = rasters.read_within(heights, window.grown(1))
                 light = hillshade(height, size_m, rules.azimuth, rules.altitude)
                 rasters.write_part(out, light, window, 1)
     found = {"min": low, "mean": total / count, "max": high} if count else {}

@@ -24,7 +24,7 @@ from pcfix.flow.surfaces import (
 )
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource, part_report
-from pcfix.io.las.writing import noted_header
+from pcfix.io.las.writing import output_header
 from pcfix.io.tiles import Clouds
 from pcfix.label.labelling import LabelCounts, Labelling, Part, WaterMask
 from pcfix.model import WaterPlane, WaterSurface
@@ -158,16 +158,15 @@ def check(plan: LabelPlan, counts: LabelCounts) -> None:
 
 def _labelling(plan: LabelPlan, source: LasSource) -> FileWork:
     """Return the labelling of one file: its header with a record of it, and each chunk."""
-    water, mask, part = plan.water, plan.labelling.mask, part_report(source.part)
+    water, mask = plan.water, plan.labelling.mask
     content = {
         "pcfix": __version__,
         "settings": plan.labelling.settings.as_dict(),
         "water": str(water),
         "water_plane": list(astuple(water)) if isinstance(water, WaterPlane) else None,
         "water_mask": None if mask is None else mask.name,
-        **({} if part is None else {"part": part}),
     }
-    header = noted_header(source, "labelling", content)
+    header = output_header(source, "labelling", content)
 
     def apply(points: Chunk, classes: Classes) -> Chunk:
         new = convert(points, header.point_format)

@@ -100,8 +100,8 @@ def _write_shaded(folder: Path) -> None:
         with rasters.new_raster(plain, lattice, plan, bands, dtype="uint8", nodata=None) as out:
             for window in lattice.window.parts(BLOCK_CELLS):
                 wide = window.grown(edge)
-                height = rasters.read_within(surface, wide, lattice.window)
-                deep = rasters.read_within(depth, wide.moved(down, right), below.window)
+                height = rasters.read_within(surface, wide)
+                deep = rasters.read_within(depth, wide.moved(down, right))
                 level = minimum_filter(np.nan_to_num(height + deep, nan=np.inf), 2 * edge + 1)
                 is_wet = np.isnan(deep) & (height < level) & np.isfinite(level)
                 deep = np.where(is_wet, level - height, deep)[edge:-edge, edge:-edge]

@@ -33,7 +33,7 @@ from pcfix.io import rasters, vectors
 from pcfix.io.clouds import is_cloud
 from pcfix.io.files import read_json
 from pcfix.io.gnss_positions import read_gnss
-from pcfix.io.members import FILE as MEMBERS
+from pcfix.io.saved import ENSEMBLE
 from pcfix.io.tiles import Tiles, check_one_file
 from pcfix.libraries import analysis_library
 from pcfix.model import WaterDimension
@@ -57,7 +57,7 @@ Plain = dict[str, Any]
 RECORD = "run.json"
 REFERENCE_DSM = "reference_dsm.tif"
 COLMAP = ("cameras.bin", "images.bin", "points3D.bin", "georeference.json")
-ADJUSTED = ("report.html", SUMMARY, MEMBERS, *(f"colmap/{name}" for name in COLMAP), *MODELS[1:])
+ADJUSTED = ("report.html", SUMMARY, ENSEMBLE, *(f"colmap/{name}" for name in COLMAP), *MODELS[1:])
 """The files that an adjustment may leave, its report first."""
 
 

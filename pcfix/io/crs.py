@@ -25,7 +25,7 @@ from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
-    from pyproj import CRS, Transformer
+    from pyproj import CRS
 
 Heights = Literal["ellipsoidal", "gravity", "unstated"]
 
@@ -35,7 +35,8 @@ METRES = ("metre", "meter")
 def parse_crs(given: str | CRS, name: str) -> CRS:
     """Return the CRS of a text: an EPSG code, WKT of any flavour, PROJ string or name.
 
-    `name` is the file or option that gave it, for messages.
+    ``local``, and axes east, north, up at a place, are not tied to the earth; see `is_local`. The
+    `name` is that of the file or option that gave the text, for messages.
     """
     from pyproj import CRS
     from pyproj.exceptions import CRSError
@@ -43,6 +44,8 @@ def parse_crs(given: str | CRS, name: str) -> CRS:
     if isinstance(given, CRS):
         return CRS(given)
     text = re.sub(r"^(\w+)::", r"\1:", given.strip())
+    if text.lower() == LOCAL or is_topocentric(text):
+        text = 'LOCAL_CS["local axes",LOCAL_DATUM["local",0],UNIT["metre",1]]'
     try:
         crs = CRS.from_user_input(int(text) if text.isdecimal() else text)
         parts(crs)  # PROJ writes and reads it again, which may fail
@@ -176,6 +179,7 @@ def shortened(text: str) -> str:
 
 
 GEOGRAPHIC_WGS84 = "EPSG:4979"
+LOCAL = "local"
 
 
 def geographic_3d(crs: CRS) -> CRS:
@@ -245,7 +249,6 @@ Notes = tuple[PcfixWarning, ...]
 SILENT_ACCURACY_M = 1.0
 """A transformation that is worse than this gets a note."""
 _AREA_MARGIN_DEG = 0.01
-LOCAL = "local"
 
 
 class HeightsError(InputError):
@@ -255,36 +258,23 @@ class HeightsError(InputError):
 def transformation(
     source: CRS, target: CRS, at: FloatArray, name: str, *, heights: bool, instead: str = ""
 ) -> tuple[Points, Notes]:
-    """Return the transformation of `heights` too, or in plan, where only their unit changes.
+    """Return PROJ's best transformation that is not a ballpark where that matters, and notes.
 
-    It takes points (n, 3), x east or longitude first; numbers that it returns are not finite where
-    there is no such place. It is needed at places (n, 3) of `source`. In plan neither CRS may be
-    geocentric. If heights cannot be transformed it is a `HeightsError` with the remedy `instead`.
-    Also return notes on what is assumed.
+    With `heights` it transforms these too; else it is one in plan, and heights only change their
+    unit, and neither CRS may be geocentric. It takes points (n, 3), x east or longitude first;
+    numbers that it returns are not finite where there is no such place. It is needed at places
+    (n, 3) of `source`. A `HeightsError`, with the remedy `instead`, if heights cannot be
+    transformed.
     """
-    if heights:
-        step, notes = _operation(source, target, at, name, heights=True, instead=instead)
-        return lambda xyz: np.column_stack(step.transform(*xyz.T)), notes
-    factor = metres_up(source) / metres_up(target)
-    plans = parts(source)[0], parts(target)[0]
-    if is_same(*plans):
-        return lambda xyz: xyz * [1.0, 1.0, factor], ()
-    step, notes = _operation(*plans, at, name, heights=False)
-
-    def forward(xyz: FloatArray) -> FloatArray:
-        return np.column_stack([*step.transform(xyz[:, 0], xyz[:, 1]), factor * xyz[:, 2]])
-
-    return forward, notes
-
-
-def _operation(
-    source: CRS, target: CRS, at: FloatArray, name: str, *, heights: bool, instead: str = ""
-) -> tuple[Transformer, Notes]:
-    """Return PROJ's best transformation that is not a ballpark where that matters, and notes."""
     from pyproj import Transformer
     from pyproj.exceptions import ProjError
     from pyproj.transformer import AreaOfInterest, TransformerGroup
 
+    factor = metres_up(source) / metres_up(target)
+    if not heights:
+        source, target = parts(source)[0], parts(target)[0]
+        if is_same(source, target):
+            return lambda xyz: xyz * [1.0, 1.0, factor], ()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a missing grid is named in the error or note
@@ -310,34 +300,37 @@ def _operation(
         for one in group.unavailable_operations
         if is_usable(one.name)
     ]
-    grids, accuracy_m = min(
-        (one for one in lacking if one[0]), key=lambda one: len(one[0]), default=([], -1.0)
-    )
-    commands = " && ".join(f"pyproj sync --file {grid}" for grid in grids)
+    by_count = sorted((one for one in lacking if one[0]), key=lambda one: len(one[0]))
+    grids, accuracy_m = (by_count or [([], -1.0)])[0]
+    names = f"from {source.name} to {target.name}"
     without = f" without the grid {', '.join(grids)}" if grids else ""
+    commands = " && ".join(f"pyproj sync --file {grid}" for grid in grids)
     install = f"Install it with '{commands}', or set PROJ_NETWORK=ON"
     if not real:
-        one, other = _height_words(source), _height_words(target)
         why = install if grids else "PROJ knows no transformation between them"
         remedy = f"; {instead}." if instead else "."
-        sentence = f"{name}: {one} cannot be transformed to {other}{without}. {why}{remedy}"
+        sentence = f"{name}: heights cannot be transformed {names}{without}. {why}{remedy}"
         raise HeightsError("crs.heights", sentence, grids=grids)
-    best = next((one for one in real if np.isfinite(one.transform(*at.T)).all()), real[0])
-    names = f"from {source.name} to {target.name}"
-    if "ballpark geographic" in best.description.lower():
+    step = next((one for one in real if np.isfinite(one.transform(*at.T)).all()), real[0])
+    notes: Notes = ()
+    if "ballpark geographic" in step.description.lower():
         if grids:
             sentence = f"cannot be transformed {names}{without}. {install}."
             raise bad_file(name, "crs.grid_missing", sentence, grids=grids)
         sentence = f"{name}: PROJ knows no transformation {names}; their datums are treated as one."
-        return best, (PcfixWarning("crs.datum", sentence),)
-    if best.accuracy <= SILENT_ACCURACY_M:
-        return best, ()
-    better = ""
-    if grids and 0.0 <= accuracy_m < best.accuracy:
-        better = f", but to {accuracy_m:g} m with the grid {', '.join(grids)}. {install}"
-    sentence = f"{name}: positions {names} are accurate to about {best.accuracy:g} m{better}."
-    values = {"accuracy_m": best.accuracy, "grids": grids}
-    return best, (PcfixWarning("crs.accuracy", sentence, **values),)
+        notes = (PcfixWarning("crs.datum", sentence),)
+    elif step.accuracy > SILENT_ACCURACY_M:
+        sentence = f"{name}: positions {names} are accurate to about {step.accuracy:g} m."
+        if grids and 0.0 <= accuracy_m < step.accuracy:
+            sentence += f" With the grid {', '.join(grids)} it is {accuracy_m:g} m. {install}."
+        notes = (PcfixWarning("crs.accuracy", sentence, accuracy_m=step.accuracy, grids=grids),)
+
+    def forward(xyz: FloatArray) -> FloatArray:
+        if heights:
+            return np.column_stack(step.transform(*xyz.T))
+        return np.column_stack([*step.transform(xyz[:, 0], xyz[:, 1]), factor * xyz[:, 2]])
+
+    return forward, notes
 
 
 def heights_agree(source: CRS, target: CRS) -> bool:
@@ -359,16 +352,8 @@ def is_same_numbers(source: CRS, target: CRS, *, heights: bool = True) -> bool:
     return same and not (heights and metres_up(source) != metres_up(target))
 
 
-def _height_words(crs: CRS) -> str:
-    vertical = parts(crs)[1]
-    if vertical is not None:
-        return vertical.name
-    kind = "ellipsoidal heights" if heights_of(crs) == "ellipsoidal" else "heights"
-    return f"{kind} ({crs.name})"
-
-
 def way_to_cloud(
-    crs: str | None, cloud_crs: str | CRS | None, at: FloatArray, name: str, *, heights: bool
+    crs: str | CRS | None, cloud_crs: str | CRS | None, at: FloatArray, name: str, *, heights: bool
 ) -> tuple[Points | None, Notes]:
     """Return the transformation from a file's CRS to the cloud's, None for none, and notes.
 
@@ -376,7 +361,7 @@ def way_to_cloud(
     The cloud's is projected, in metres. `heights` says whether z matters.
     """
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
-    if crs is not None and crs.strip().lower() == LOCAL:
+    if isinstance(crs, str) and crs.strip().lower() == LOCAL:
         return None, ()
     source = None if crs is None else parse_crs(crs, name)
     if all(one is None or is_local(one) for one in (source, cloud)):
@@ -400,17 +385,15 @@ def way_to_cloud(
         sentence = f"{source.name} is neither a map projection nor in degrees."
         raise bad_file(name, "crs.not_projected", sentence, crs=source.name)
     agree = not heights or heights_agree(source, cloud)
-    kinds, missing = (heights_of(source), heights_of(cloud)), ""
-    notes: Notes = ()
-    if kinds[0] == "unstated" != kinds[1]:
-        missing = "the file"
-    elif kinds == ("ellipsoidal", "unstated"):
+    kinds, notes = (heights_of(source), heights_of(cloud)), list[PcfixWarning]()
+    missing = "the file" if kinds[0] == "unstated" != kinds[1] else ""
+    if kinds == ("ellipsoidal", "unstated"):
         missing = f"the cloud's CRS ({cloud.name})"
-    if heights and agree and missing:
+    if heights and missing:
         sentence = f"{name}: {missing} names no vertical datum; that of the other is assumed."
-        notes = (PcfixWarning("crs.heights_assumed", sentence),)
+        notes.append(PcfixWarning("crs.heights_assumed", sentence))
     if agree and is_same_numbers(source, cloud, heights=heights):
-        return None, notes
+        return None, tuple(notes)
     # a search for the code of a CRS takes long
     plan = "" if agree else typed(parts(source)[0])
     instead = f"or, if the heights agree with the cloud's, give the file's CRS as {plan}"

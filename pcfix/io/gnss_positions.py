@@ -53,7 +53,7 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
         Of the positions, instead of that in the file. That of the cameras if none is stated.
     """
     source = Path(path) if Path(path).is_dir() else check_input(path)
-    if crs is not None and crs.strip().lower() != "local":
+    if crs is not None:
         parse_crs(crs, str(source))
     if (kind := _WITHOUT_NAMES.get(source.suffix.lower())) is not None:
         sentence = f"is {kind}, which names no images. Make a table with the columns image,"
@@ -72,17 +72,15 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
     if listed is None:
         sentence = "has no measured positions. Give a table with the columns image, x, y, z."
         raise bad_file(source, "gnss.none", sentence)
-    bad = (listed.sigma_m <= 0.0).any(axis=1)
-    if bad.any():
-        name = names[int(np.argmax(bad))]
-        sentence = f"image {name}: a standard deviation is not positive. Leave it empty if unknown."
-        raise bad_file(source, "gnss.sigma", sentence, image=name)
     row_of: dict[str, int] = {}
-    for i, label in enumerate(names):
-        first = row_of.setdefault(label, i)
+    for i, name in enumerate(names):
+        first = row_of.setdefault(name, i)
+        if (listed.sigma_m[i] <= 0.0).any():
+            sentence = f"image {name}: standard deviations must be positive, or empty if unknown."
+            raise bad_file(source, "gnss.sigma", sentence, image=name)
         if not np.array_equal(listed.xyz[i], listed.xyz[first], equal_nan=True):
-            sentence = f"image {label} has two positions. Give one for every image."
-            raise bad_file(source, "gnss.two_positions", sentence, image=label)
+            sentence = f"image {name} has two positions. Give one for every image."
+            raise bad_file(source, "gnss.two_positions", sentence, image=name)
     row, ambiguous = match_labels(list(row_of), cameras.labels)
     for name in ambiguous:
         sentence = f"image {name} could be several of the model. Use names with their folders."
@@ -95,8 +93,7 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
     if not known:
         sentence = f"no position belongs to an image such as {cameras.labels[0]}. Give those of"
         raise bad_file(source, "gnss.no_image", f"{sentence} this block.")
-    found = GnssPositions(xyz, sigma, listed.crs if crs is None else crs)
-    cameras = replace(cameras, gnss=found)
+    cameras = replace(cameras, gnss=GnssPositions(xyz, sigma, crs or listed.crs))
     if is_tied(cameras.crs, str(source)):
         enu_m = adjusted_minus_gnss(cameras, str(source))[0][:, :2]
         both = enu_m[np.isfinite(enu_m).all(axis=1)]

@@ -28,7 +28,6 @@ Reference: "Ground Control Points" in the manual of OpenDroneMap, https://docs.o
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,11 +42,11 @@ from pcfix.io.cameras.odm import named_crs
 from pcfix.io.cameras.table import AXES, centres, has_header
 from pcfix.io.cameras.table import SPELLINGS as POSITIONS
 from pcfix.io.cameras.table import crs as table_crs
-from pcfix.io.crs import LOCAL, is_local, is_topocentric, parse_crs, way_to_cloud
+from pcfix.io.crs import LOCAL, is_local, parse_crs, way_to_cloud
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels, unnamed
 from pcfix.io.tables import Table, number, read_lines, read_table
-from pcfix.model import Cameras, FloatArray, GroundControl, IntArray
+from pcfix.model import BoolArray, Cameras, FloatArray, GroundControl, IntArray
 from pcfix.options.declare import File
 
 SIGMA_M, SIGMA_PX = 0.01, 0.5
@@ -87,20 +86,28 @@ ODM = ("x", "y", "z", "u", "v", "label", "point")
 """Fields of ODM's list, the last one optional."""
 
 
-class Mark(NamedTuple):
-    """A mark of a point in an image, and what its row states about the point; NaN for nothing."""
+class Marks(NamedTuple):
+    """The m marks of a file, and what it states of the point of each; NaN for nothing."""
 
-    where: str  # in the file
-    point: str
-    image: str
-    uv: FloatArray
-    xyz: FloatArray  # in the CRS of the file
-    sigma_m: FloatArray = np.full(3, np.nan)
-    sigma_px: float = np.nan
-    is_check: bool = False
-    under_water: bool = False
-    on: str = ""  # surface on which the point lies
-    sigma_on: float = np.nan
+    path: Path
+    where: list[str]  # in the file
+    point: list[str]
+    image: list[str]
+    uv: FloatArray  # (m, 2), pixels
+    xyz: FloatArray  # (m, 3), in `crs`
+    sigma_m: FloatArray  # (m, 3)
+    sigma_px: FloatArray  # (m,)
+    is_check: BoolArray
+    under_water: BoolArray
+    on: list[str]  # surfaces on which the points lie
+    sigma_on: FloatArray  # (m,)
+    crs: str | None
+
+    def error(self, row: int, code: str, words: str, **values: Any) -> InputError:
+        """Return an error about a mark: file, place, point, image and what is wrong."""
+        point, image = self.point[row], self.image[row]
+        sentence = f"{self.where[row]}: point {point}, image {image}: {words}"
+        return bad_file(self.path, code, sentence, point=point, image=image, **values)
 
 
 def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None) -> GroundControl:
@@ -121,49 +128,48 @@ def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None)
     crs : str, optional
         Of the points, instead of that in the file; ``local`` uses the numbers unchanged.
     """
-    source = check_input(path)
-    marks, stated_crs = read_marks(source)
-    camera, notes = _cameras_of(source, marks, cameras)
-    first: dict[str, Mark] = {}
-    for mark in marks:
-        one = first.setdefault(mark.point, mark)
-        mine, its = (np.hstack([m.xyz, m.sigma_m, m.is_check, m.under_water]) for m in (mark, one))
-        if mark.on != one.on or not np.array_equal(mine, its, equal_nan=True):
-            words = f"this point is described differently at {one.where}. Use other names."
-            raise _wrong(source, "gcps.contradiction", mark, words)
-    _check_images(source, marks, cameras, camera)
+    marks = read_marks(check_input(path))
+    camera, notes = _cameras_of(marks, cameras)
+    row_of: dict[str, int] = {}
+    first = np.array([row_of.setdefault(name, i) for i, name in enumerate(marks.point)])
+    stated = np.column_stack([marks.xyz, marks.sigma_m, marks.is_check, marks.under_water])
+    for i, one in enumerate(first.tolist()):
+        same = np.array_equal(stated[i], stated[one], equal_nan=True)
+        if not same or marks.on[i] != marks.on[one]:
+            words = f"this point is described differently at {marks.where[one]}. Use other names."
+            raise marks.error(i, "gcps.contradiction", words)
     posed = np.flatnonzero(camera >= 0)
-    seen = {marks[i].point for i in posed}
-    points = [mark for name, mark in first.items() if name in seen]
-    row_of = {mark.point: i for i, mark in enumerate(points)}
-    xyz, way_notes = _to_cameras(source, points, cameras, crs or stated_crs)
-    unseen = [name for name in first if name not in seen]
+    rows = np.unique(first[posed])  # the first mark of each point that is used
+    unseen = [name for name, row in row_of.items() if row not in rows]
     if unseen:
-        words = f"{source}: no image with a pose shows {_few(unseen)}; skipped."
-        notes.append(PcfixWarning("gcps.unseen", words, path=source, points=unseen))
-    for note in (*notes, *way_notes):
+        words = f"{path}: no image with a pose shows {_few(unseen)}; skipped."
+        notes.append(PcfixWarning("gcps.unseen", words, path=marks.path, points=unseen))
+    xyz, more = _to_cameras(marks, rows, cameras, crs or marks.crs)
+    for note in (*notes, *more):
         warnings.warn(note, PcfixWarning, stacklevel=2)
-    on = tuple(mark.on for mark in points) if any(mark.on for mark in marks) else ()
-    sigma_on = _or_else([mark.sigma_on for mark in points], SIGMA_M)
-    sigma_m = _or_else([mark.sigma_m for mark in points], SIGMA_M)
+    sigma_m, sigma_on, sigma_px = (
+        np.where(np.isnan(values), default, values)
+        for values, default in (
+            (marks.sigma_m[rows], SIGMA_M),
+            (marks.sigma_on[rows], SIGMA_M),
+            (marks.sigma_px[posed], SIGMA_PX),
+        )
+    )
+    has_surfaces = any(marks.on)
     return GroundControl(
-        names=tuple(row_of),
+        names=tuple(marks.point[i] for i in rows),
         xyz=xyz,
         sigma_m=np.where(np.isnan(xyz), np.inf, sigma_m),
-        is_check=np.array([mark.is_check for mark in points]),
-        under_water=np.array([mark.under_water for mark in points]),
-        point=np.array([row_of[marks[i].point] for i in posed]),
+        is_check=marks.is_check[rows],
+        under_water=marks.under_water[rows],
+        point=np.searchsorted(rows, first[posed]),
         camera=camera[posed],
-        image_xy=np.array([marks[i].uv for i in posed]),
-        sigma_px=_or_else([marks[i].sigma_px for i in posed], SIGMA_PX),
+        image_xy=marks.uv[posed],
+        sigma_px=sigma_px,
         crs=cameras.crs,
-        on=on,
-        on_sigma_m=sigma_on if on else np.zeros(0),
+        on=tuple(marks.on[i] for i in rows) if has_surfaces else (),
+        on_sigma_m=sigma_on if has_surfaces else np.zeros(0),
     )
-
-
-def _or_else(values: Sequence[Any], default: float) -> FloatArray:
-    return np.where(np.isnan(values), default, values)
 
 
 def _few(names: list[str]) -> str:
@@ -171,84 +177,64 @@ def _few(names: list[str]) -> str:
     return ", ".join(names[:_NAMED]) + more
 
 
-def _wrong(path: Path, code: str, mark: Mark, words: str, **values: Any) -> InputError:
-    """Return an error about a mark: file, place, point, image and what is wrong."""
-    sentence = f"{mark.where}: point {mark.point}, image {mark.image}: {words}"
-    return bad_file(path, code, sentence, point=mark.point, image=mark.image, **values)
+def _cameras_of(marks: Marks, cameras: Cameras) -> tuple[IntArray, list[PcfixWarning]]:
+    """Return the camera of each mark, -1 for images without a pose, and a warning about these.
 
-
-def _cameras_of(
-    path: Path, marks: list[Mark], cameras: Cameras
-) -> tuple[IntArray, list[PcfixWarning]]:
-    """Return the camera of each mark, -1 for images without a pose, and a warning about these."""
-    names = list(dict.fromkeys(mark.image for mark in marks))
-    row, ambiguous = match_labels(names, cameras.labels)
-    of_name = dict(zip(names, row.tolist(), strict=True))
-    camera = np.array([of_name[mark.image] for mark in marks])
-    lost = [name for name in names if of_name[name] < 0]
-    others = {*ambiguous, *unnamed(lost, cameras.unposed)}
-    unknown = [name for name in lost if name in others]
+    Refuse marks in unknown images or outside their image, and two marks of a point in an image.
+    """
+    names = list(dict.fromkeys(marks.image))
+    found, ambiguous = match_labels(names, cameras.labels)
+    camera = found[[names.index(name) for name in marks.image]]
+    lost = [name for name, row in zip(names, found, strict=True) if row < 0]
+    if ambiguous:
+        words = "the name fits several images of the model. Use names with their folders."
+        raise marks.error(marks.image.index(ambiguous[0]), "images.ambiguous", words)
+    unknown = list(unnamed(lost, cameras.unposed))
     if unknown:
-        mark = next(mark for mark in marks if mark.image == unknown[0])
-        if mark.image in ambiguous:
-            words = "the name fits several images of the model. Use names with their folders."
-            raise _wrong(path, "images.ambiguous", mark, words)
         words = f"{_few(unknown)} are not among the {len(cameras)} images of the model"
         words += f" (first {cameras.labels[0]}). Give the points of this block."
-        raise _wrong(path, "gcps.unknown_image", mark, words, images=unknown)
-    if (camera < 0).all():
-        raise bad_file(path, "gcps.no_pose", "none of its images has a pose. Align them first.")
-    if not lost:
-        return camera, []
-    words = f"{path}: {(camera < 0).sum()} of {len(camera)} marks are in images without a pose"
-    words += f" ({_few(lost)}) and were skipped."
-    return camera, [PcfixWarning("gcps.unposed", words, path=path, images=lost)]
-
-
-def _check_images(path: Path, marks: list[Mark], cameras: Cameras, camera: IntArray) -> None:
-    """Refuse marks outside their image, and two marks of a point in an image."""
+        row = marks.image.index(unknown[0])
+        raise marks.error(row, "gcps.unknown_image", words, images=unknown)
+    if len(lost) == len(names):
+        raise bad_file(marks.path, "gcps.no_pose", "none of its images has a pose. Align them.")
     if cameras.lenses is None:
         sentence = "marks in images need cameras with lenses. Give --sensor."
-        raise bad_file(path, "cameras.no_lens", sentence)
-    first: dict[tuple[str, int], Mark] = {}
+        raise bad_file(marks.path, "cameras.no_lens", sentence)
+    first: dict[tuple[str, int], int] = {}
     for row in np.flatnonzero(camera >= 0).tolist():
-        mark, lens = marks[row], cameras.lenses[camera[row]]
-        before = first.setdefault((mark.point, int(camera[row])), mark)
-        if before is not mark:
-            words = f"the point has a mark in this image at {before.where}. Remove one."
-            raise _wrong(path, "gcps.twice", mark, words)
+        lens, (u, v) = cameras.lenses[camera[row]], marks.uv[row].tolist()
+        before = first.setdefault((marks.point[row], int(camera[row])), row)
+        if before != row:
+            words = f"the point has a mark in this image at {marks.where[before]}. Remove one."
+            raise marks.error(row, "gcps.twice", words)
         if lens.unit != "px":
             words = "the lens is in mm. Give a sensor with focal_px, width_px, height_px."
-            raise _wrong(path, "gcps.lens_unit", mark, words)
-        u, v = mark.uv.tolist()
+            raise marks.error(row, "gcps.lens_unit", words)
         if not (0.0 <= u <= lens.width and 0.0 <= v <= lens.height):
             words = f"{u:g}, {v:g} is outside the image of {lens.width:g} x {lens.height:g} pixels."
             words += " Count pixels from its upper left corner, to the right and down."
-            raise _wrong(path, "gcps.outside", mark, words, uv=[u, v])
+            raise marks.error(row, "gcps.outside", words, uv=[u, v])
+    if not lost:
+        return camera, []
+    words = f"{marks.path}: {(camera < 0).sum()} of {len(camera)} marks are in images without a"
+    words += f" pose ({_few(lost)}) and were skipped."
+    return camera, [PcfixWarning("gcps.unposed", words, path=marks.path, images=lost)]
 
 
 def _to_cameras(
-    path: Path, points: list[Mark], cameras: Cameras, source: str | None
-) -> tuple[FloatArray, Sequence[Any]]:
-    """Return the points in the CRS of the cameras, and notes; refuse points far from the block."""
-    name, target, xyz = str(path), cameras.crs, np.array([mark.xyz for mark in points])
-    if target is not None and target.strip().lower() == LOCAL:
-        if source is not None and source.strip().lower() != LOCAL:
-            sentence = f"is in {source}, the cameras are in a local frame. Transform the cameras."
-            raise bad_file(path, "crs.local", sentence, crs=source)
-        return xyz, ()
-    if target is not None and is_topocentric(target):
-        sentence = f"the cameras are in {target}. Transform them to the cloud's CRS first."
-        raise bad_file(path, "crs.topocentric", sentence, crs=target)
-    forward, notes = way_to_cloud(source, target, xyz, name, heights=True)
+    marks: Marks, rows: IntArray, cameras: Cameras, source: str | None
+) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
+    """Return points in the CRS of the cameras, and notes; refuse points far from the block."""
+    xyz, target = marks.xyz[rows], cameras.crs
+    forward, notes = way_to_cloud(source, target, xyz, str(marks.path), heights=True)
     moved = xyz if forward is None else forward(xyz)
     lost = ~np.isfinite(moved).all(axis=1) & np.isfinite(xyz).all(axis=1)
     if lost.any():
-        mark = points[int(np.argmax(lost))]
-        place = ", ".join(f"{value:.10g}" for value in mark.xyz)
+        i = int(np.argmax(lost))
+        place = ", ".join(f"{value:.10g}" for value in xyz[i])
         words = f"{place} is outside the cloud's CRS. Check that of the points."
-        raise _wrong(path, "crs.outside", mark, words)
-    if target is None:
+        raise marks.error(rows[i], "crs.outside", words)
+    if target is None or target.strip().lower() == LOCAL:
         return moved, notes
     # points that no image of the block can show
     middle = np.median(cameras.centres[:, :2], axis=0)
@@ -259,14 +245,14 @@ def _to_cameras(
         swapped = bool(np.hypot(*(moved[i, 1::-1] - middle)) <= reach_m)
         hint = "Swap x and y." if swapped else "Check the CRS of the points."
         words = f"the point is {apart_m[i] / 1e3:,.0f} km from the block. {hint}"
-        raise _wrong(path, "gcps.far", points[i], words, swapped=swapped)
+        raise marks.error(rows[i], "gcps.far", words, swapped=swapped)
     return moved, notes
 
 
 # Formats
 
 
-def read_marks(path: Path) -> tuple[list[Mark], str | None]:
+def read_marks(path: Path) -> Marks:
     """Read the marks of a file, and the CRS that it states."""
     if recognises(metashape, Source(path)):
         return _from_metashape(path)
@@ -284,7 +270,7 @@ def read_marks(path: Path) -> tuple[list[Mark], str | None]:
     return _from_table(read_table(path, *kinds, spellings=SPELLINGS))
 
 
-def _from_table(columns: Table) -> tuple[list[Mark], str | None]:
+def _from_table(columns: Table) -> Marks:
     path = columns.path
     stated = sorted({*columns.column("crs")} - {""}) if columns.has("crs") else []
     if len(stated) > 1:
@@ -295,98 +281,105 @@ def _from_table(columns: Table) -> tuple[list[Mark], str | None]:
     if unknown:
         sentence = f"PROJ does not know its CRS '{columns.crs}'. Give an EPSG code."
         raise bad_file(path, "crs.unknown", sentence, crs=columns.crs)
-    roles, wet = (_texts(columns, role) for role in ("role", "under_water"))
+    roles, wet = (
+        [text.lower().replace(" ", "_") for text in columns.column(role)]
+        if columns.has(role)
+        else [""] * len(columns.rows)
+        for role in ("role", "under_water")
+    )
     surfaces = ["on:water" if text in WATERLINE else text for text in roles]
     on = [text.removeprefix(ON) if text.startswith(ON) else "" for text in surfaces]
-    is_role = [text in CHECK + CONTROL or on[i] != "" for i, text in enumerate(roles)]
-    for role, texts, known, words in (
-        ("role", roles, is_role, "control, check, waterline or on:NAME"),
-        ("under_water", wet, [text in YES + NO for text in wet], "yes or no"),
-    ):
-        if not all(known):
-            row = known.index(False)
-            sentence = f"column {columns.name(role)}: '{texts[row]}' is not {words}."
-            raise columns.error(row, "table.choice", sentence, value=texts[row])
-    is_check, under_water = ([t in CHECK for t in roles], [t in YES for t in wet])
-    sigma_m = columns.where_there(("sigma_x", "sigma_y", "sigma_z"))
-    sigma_uv = columns.where_there(("sigma_u", "sigma_v"))
-    sigma_on = columns.where_there(("sigma_on",))[:, 0]
-    every = np.column_stack([sigma_m, sigma_uv, sigma_on])
-    for i, k in np.argwhere(every <= 0.0)[:1]:
-        words = f"the standard deviation {every[i, k]:g} must be positive."
-        raise columns.error(int(i), "gcps.sigma", words, value=float(every[i, k]))
-    names = columns.column("point")
+    for row, (role, is_wet) in enumerate(zip(roles, wet, strict=True)):
+        if not (on[row] or role in CHECK + CONTROL):
+            sentence = f"the role '{role}' is not control, check, waterline or on:NAME."
+            raise columns.error(row, "table.choice", sentence, value=role)
+        if is_wet not in YES + NO:
+            sentence = f"under water is '{is_wet}', not yes or no."
+            raise columns.error(row, "table.choice", sentence, value=is_wet)
+    sigmas = ("sigma_x", "sigma_y", "sigma_z", "sigma_u", "sigma_v", "sigma_on")
+    sigma = columns.where_there(sigmas)
+    for i, k in np.argwhere(sigma <= 0.0)[:1].tolist():
+        words = f"the standard deviation {sigma[i, k]:g} must be positive."
+        raise columns.error(i, "gcps.sigma", words, value=float(sigma[i, k]))
+    names, xyz = columns.column("point"), centres(columns, needed=not any(on))
     if "" in names:
-        line = columns.line[names.index("")]
-        raise bad_file(path, "gcps.no_name", f"line {line}: the point has no name.", line=line)
-    xyz, uv = centres(columns, needed=not any(on)), columns.of(("u", "v"))
+        raise columns.error(names.index(""), "gcps.no_name", "the point has no name.")
     for i in np.flatnonzero(np.isnan(xyz).any(axis=1)):
         if not on[i]:
             words = "the point has no x, y, z. Only those with role waterline or on:NAME need none."
             raise columns.error(int(i), "gcps.no_coordinates", words)
-    where = [f"line {line}" for line in columns.line]
-    sigma_px = np.sqrt((sigma_uv**2).mean(axis=1)).tolist()
-    rows = zip(
-        *(where, names, columns.labels, uv, xyz, sigma_m, sigma_px, is_check, under_water),
-        *(on, sigma_on),
-        strict=True,
+    return Marks(
+        path=path,
+        where=[f"line {line}" for line in columns.line],
+        point=names,
+        image=columns.labels,
+        uv=columns.of(("u", "v")),
+        xyz=xyz,
+        sigma_m=sigma[:, :3],
+        sigma_px=np.sqrt((sigma[:, 3:5] ** 2).mean(axis=1)),
+        is_check=np.array([role in CHECK for role in roles]),
+        under_water=np.array([one in YES for one in wet]),
+        on=on,
+        sigma_on=sigma[:, 5],
+        crs=system,
     )
-    return [Mark(*row) for row in rows], system
-
-
-def _texts(columns: Table, role: str) -> list[str]:
-    """Return the entries of a column in lower case; empty ones if it does not exist."""
-    if not columns.has(role):
-        return [""] * len(columns.rows)
-    return [text.strip().lower().replace(" ", "_") for text in columns.column(role)]
 
 
 def _odm_table(path: Path, rows: list[tuple[int, list[str]]]) -> Table:
     """Return ODM's list as a table; points without a name are named by their coordinates."""
+    places: dict[tuple[float, ...], str] = {}
+    texts = []
     for i, fields in rows:
         if len(fields) < len(ODM) - 1:
             sentence = f"line {i} has {len(fields)} fields. Give x, y, z, u, v, image."
             raise bad_file(path, "gcps.fields", sentence, line=i)
-    places = dict.fromkeys(tuple(map(number, fields[:3])) for _, fields in rows)
-    names = {place: f"GCP {i}" for i, place in enumerate(places, start=1)}
-    texts = [[*fields, names[tuple(map(number, fields[:3]))]][: len(ODM)] for _, fields in rows]
+        name = places.setdefault(tuple(map(number, fields[:3])), f"GCP {len(places) + 1}")
+        texts.append([*fields, name][: len(ODM)])
     place = {role: i for i, role in enumerate(ODM)}
     lines = [i for i, _ in rows]
     return Table(path, [*ODM], texts, lines, place, [""] * len(ODM), crs=named_crs(path))
 
 
-def _from_metashape(path: Path) -> tuple[list[Mark], str | None]:
+def _from_metashape(path: Path) -> Marks:
     """Read the markers that have surveyed coordinates, where they were measured in the images."""
     chunk = metashape.open_chunk(path)
-    frame, settings = chunk.frame, chunk.properties("settings")
+    settings = chunk.properties("settings")
     names = {c.get("id"): metashape.name_of(c) for c in chunk.root.iterfind("cameras//camera")}
     default, pixels = (
         xml_number(path, f"setting {name}", settings.get(name, "0"))
         for name in ("accuracy_markers", "accuracy_projections")
     )
-    surveyed: dict[str, Mark] = {}
+    surveyed = {}
     for marker in chunk.root.iterfind("markers//marker"):
         found, label = marker.find("reference"), metashape.name_of(marker)
         stated = (marker if found is None else found).attrib
         if all(stated.get(axis) for axis in "xyz"):
             where = f"marker {label}, reference"
-            xyz = np.array([xml_number(path, where, stated[axis]) for axis in "xyz"])
+            place = [xml_number(path, where, stated[axis]) for axis in "xyz"]
             sigma = metashape.spreads(path, where, stated, np.full(3, default))
-            surveyed[marker.get("id") or ""] = Mark(
-                f"marker {label}", label, "", np.full(2, np.nan), xyz,
-                np.where(sigma > 0.0, sigma, np.nan), pixels if pixels > 0.0 else np.nan,
-                stated.get("enabled") in ("false", "0"),
-            )  # fmt: skip
-    marks = []
-    for name, camera, uv in [] if frame is None else metashape.measured_marks(frame):
-        if name in surveyed:
-            image = names.get(camera, f"camera {camera}")
-            marks.append(surveyed[name]._replace(image=image, uv=uv))
+            is_disabled = stated.get("enabled") in ("false", "0")
+            surveyed[marker.get("id") or ""] = label, place, sigma, is_disabled
+    marks = [] if chunk.frame is None else metashape.measured_marks(chunk.frame)
+    marks = [mark for mark in marks if mark[0] in surveyed]
     if not marks:
         sentence = "has no marker with surveyed coordinates and a mark in an image. Export them."
         raise bad_file(path, "gcps.none", sentence)
+    labels, xyz, sigmas, is_check = zip(*(surveyed[mark[0]] for mark in marks), strict=True)
     own = (chunk.root.findtext("marker_reference") or "").strip()
     crs = own or (chunk.root.findtext("reference") or "").strip() or LOCAL
-    if crs.lower() == LOCAL or is_local(parse_crs(crs, str(chunk.path))):
-        crs = LOCAL
-    return marks, crs
+    count, sigma_m = len(marks), np.array(sigmas)
+    return Marks(
+        path=path,
+        where=[f"marker {label}" for label in labels],
+        point=list(labels),
+        image=[names.get(camera, f"camera {camera}") for _, camera, _ in marks],
+        uv=np.array([uv for *_, uv in marks]),
+        xyz=np.array(xyz),
+        sigma_m=np.where(sigma_m > 0.0, sigma_m, np.nan),
+        sigma_px=np.full(count, pixels if pixels > 0.0 else np.nan),
+        is_check=np.array(is_check),
+        under_water=np.zeros(count, np.bool_),
+        on=[""] * count,
+        sigma_on=np.full(count, np.nan),
+        crs=LOCAL if is_local(parse_crs(crs, str(chunk.path))) else crs,
+    )

@@ -134,17 +134,24 @@ class Records:
         columns = []
         for name in names:
             field, offset = self._place[name, False]
-            item = self.header.item(name, is_list=False)
-            columns.append(
-                _items_at(self._units, self.header.order, item)[self._start[:, field] + offset]
-            )
+            kind = self.header.item(name, is_list=False)
+            items = _items_at(self._units, self.header.order, kind)
+            columns.append(items[self._start[:, field] + offset])
         return np.column_stack(columns).astype(np.float64)
 
     def lists(self, name: str) -> tuple[IntArray, npt.NDArray[Any]]:
         """Return where the lists of a property start, shape (n + 1,), and their items."""
         field, _ = self._place[name, True]
-        units = _items_at(self._units, self.header.order, self.header.item(name, is_list=True))
-        return _joined(units, self._start[:, field], self._count[:, field], int(self._item[field]))
+        items = _items_at(self._units, self.header.order, self.header.item(name, is_list=True))
+        first, count, size = self._start[:, field], self._count[:, field], int(self._item[field])
+        start = np.concatenate([[0], np.cumsum(count)])
+        values = np.empty(start[-1], items.dtype)
+        for at in range(0, len(count), _ROWS_AT_ONCE):
+            rows = slice(at, at + _ROWS_AT_ONCE)
+            low, high = start[at], start[min(at + _ROWS_AT_ONCE, len(count))]
+            unit = np.repeat(first[rows] - size * start[:-1][rows], count[rows])
+            values[low:high] = items[unit + size * np.arange(low, high)]
+        return start, values
 
 
 def _items_at(units: npt.NDArray[Any], order: str, item: str | None) -> npt.NDArray[Any]:
@@ -153,23 +160,6 @@ def _items_at(units: npt.NDArray[Any], order: str, item: str | None) -> npt.NDAr
         return units
     kind = np.dtype(f"{order}{item}")
     return np.ndarray(max(len(units) - kind.itemsize + 1, 0), kind, units, strides=(1,))
-
-
-def _joined(
-    items: npt.NDArray[Any], first: IntArray, count: IntArray, size: int
-) -> tuple[IntArray, npt.NDArray[Any]]:
-    """Copy lists, each of `count` items of `size` units from `first` on, one after another.
-
-    Return where each starts in the copy, shape (n + 1,), and the copy.
-    """
-    start = np.concatenate([[0], np.cumsum(count)])
-    values = np.empty(start[-1], items.dtype)
-    for at in range(0, len(count), _ROWS_AT_ONCE):
-        rows = slice(at, at + _ROWS_AT_ONCE)
-        low, high = start[at], start[min(at + _ROWS_AT_ONCE, len(count))]
-        unit = np.repeat(first[rows] - size * start[:-1][rows], count[rows])
-        values[low:high] = items[unit + size * np.arange(low, high)]
-    return start, values
 
 
 def _units(path: Path, header: Header) -> npt.NDArray[Any]:

@@ -55,13 +55,9 @@ def place_of(transform: Affine, column: Any, row: Any) -> tuple[Any, Any]:
     return t.a * column + t.b * row + t.c, t.d * column + t.e * row + t.f
 
 
-def read_within(source: DatasetReader, window: Window, whole: Window) -> FloatArray:
+def read_within(source: DatasetReader, window: Window) -> FloatArray:
     """Return part of the first band, shape (rows, columns), NaN for no value and beyond it."""
-    values = np.full((window.height, window.width), np.nan)
-    inside = window.clipped(whole)
-    if inside.height > 0 and inside.width > 0:
-        values[inside.within(window)] = read_masked(source, window=_slices(inside))
-    return values
+    return read_masked(source, window=_slices(window), boundless=True)
 
 
 def lattice_of(source: DatasetReader) -> Lattice:

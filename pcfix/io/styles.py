@@ -12,8 +12,7 @@ import io
 import zipfile
 from importlib.resources import files
 from pathlib import Path
-from typing import NamedTuple
-from xml.sax.saxutils import quoteattr
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,12 +25,6 @@ RAMPS = {"depth": DEPTH, "height": HEIGHT, "uncertainty": UNCERTAINTY, "RayCount
 FROM_ZERO = ("depth", "uncertainty", "RayCount")
 CUT = 0.5
 """Percent of the cells at either end that share the last colour, so that outliers do not count."""
-
-_PAGE = """<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>
-<qgis version="3.22" styleCategories="{categories}">
-{body}
-</qgis>
-"""
 
 
 def limits_of(values: FloatArray, what: str) -> tuple[float, float]:
@@ -47,26 +40,12 @@ def limits_of(values: FloatArray, what: str) -> tuple[float, float]:
 def raster_style(path: Path, what: str) -> str:
     """Return the style of a raster of one band, by what it holds."""
     low, high = limits_of(preview(path)[0], what)
-    items = []
-    for share, colour in stops_of(RAMPS.get(what, HEIGHT)):
-        value, code = low + share * (high - low), "".join(f"{part:02x}" for part in colour)
-        item = f'     <item value="{value:.6g}" color="#{code}" alpha="255" label="{value:.2f}"/>'
-        items.append(item)
-    listed = "\n".join(items)
-    body = f""" <pipe>
-  <rasterrenderer type="singlebandpseudocolor" band="1" opacity="1" alphaBand="-1"
-    classificationMin="{low:.6g}" classificationMax="{high:.6g}">
-   <rasterTransparency/>
-   <rastershader>
-    <colorrampshader colorRampType="INTERPOLATED" classificationMode="1" clip="0"
-      minimumValue="{low:.6g}" maximumValue="{high:.6g}">
-{listed}
-    </colorrampshader>
-   </rastershader>
-  </rasterrenderer>
- </pipe>
- <blendMode>0</blendMode>"""
-    return _PAGE.format(categories="Symbology", body=body)
+    stops = [
+        (f"{value:.6g}", "".join(f"{part:02x}" for part in colour), f"{value:.2f}")
+        for share, colour in stops_of(RAMPS.get(what, HEIGHT))
+        for value in (low + share * (high - low),)
+    ]
+    return _style(stops=stops, low=f"{low:.6g}", high=f"{high:.6g}")
 
 
 class Symbol(NamedTuple):
@@ -78,55 +57,20 @@ class Symbol(NamedTuple):
     shape: str = "circle"
 
 
-_LAYERS = {
-    "marker": (
-        "SimpleMarker",
-        {"color": "{c},255", "name": "{shape}", "size": "{size}", "outline_color": "40,40,40,255"},
-    ),
-    "line": ("SimpleLine", {"line_color": "{c},255", "line_width": "{size}"}),
-    "fill": (
-        "SimpleFill",
-        {"color": "{c},0", "style": "no", "outline_color": "{c},255", "outline_width": "{size}"},
-    ),
-}
-
-
 def vector_style(symbols: dict[str, Symbol], attribute: str = "", label: str = "") -> str:
     """Return the style of a layer: one symbol, or one for each value of an attribute.
 
     The label is an expression of QGIS.
     """
-    texts = []
-    for row, one in enumerate(symbols.values()):
-        kind, options = _LAYERS[one.kind]
-        fields = {"c": ",".join(map(str, one.colour)), "shape": one.shape, "size": one.size}
-        given = "".join(
-            f'<Option type="QString" name="{key}" value={quoteattr(value.format(**fields))}/>'
-            for key, value in options.items()
-        )
-        texts.append(
-            f'<symbol type="{one.kind}" name="{row}" alpha="1"><layer class="{kind}" enabled="1">'
-            f'<Option type="Map">{given}</Option></layer></symbol>'
-        )
-    drawn = "\n".join(texts)
-    head, rows = 'type="singleSymbol"', ""
-    if attribute:
-        head = f'type="categorizedSymbol" attr={quoteattr(attribute)}'
-        rows = "<categories>" + "".join(
-            f'<category value={quoteattr(name)} symbol="{row}" label={quoteattr(name)}'
-            ' render="true"/>'
-            for row, name in enumerate(symbols)
-        )
-        rows += "</categories>"
-    body = f" <renderer-v2 {head}>{rows}<symbols>\n{drawn}\n</symbols></renderer-v2>"
-    if label:
-        body += (
-            f'\n <labeling type="simple"><settings><text-style fieldName={quoteattr(label)}'
-            ' isExpression="1" fontSize="8" textColor="30,30,30,255"><text-buffer bufferDraw="1"'
-            ' bufferSize="0.8" bufferColor="255,255,255,255"/></text-style>'
-            '<placement placement="2" placementFlags="9"/></settings></labeling>'
-        )
-    return _PAGE.format(categories="Symbology|Labeling", body=body)
+    return _style(symbols=symbols, attribute=attribute, label=label)
+
+
+def _style(**values: Any) -> str:
+    from jinja2 import Environment, FileSystemLoader
+
+    loader = FileSystemLoader(Path(__file__).parent)
+    rules = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    return rules.get_template("style.qml.j2").render(values) + "\n"
 
 
 FOLDER = "pcfix"

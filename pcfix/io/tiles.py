@@ -26,7 +26,7 @@ Clouds: TypeAlias = "File | Iterable[File] | Tiles"
 SUFFIXES = (".las", ".laz")
 LISTS = (".txt", ".lst", ".list")
 OVERLAP = 0.01
-"""Of the smaller tile's side: neighbours may reach so far into each other, by rounding."""
+"""A fraction of a tile's side: neighbours may reach so far into each other, by rounding."""
 
 
 @dataclass(frozen=True)
@@ -184,47 +184,36 @@ def _listed(path: Path) -> list[Path] | None:
 
 def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
     """Return files as one cloud; an `InputError` if the header of any cannot be read."""
-    kinds: dict[Path, tuple[Any, ...]] = {}
-    heads: list[tuple[int, FloatArray, FloatArray, float]] = []
+    heads: dict[Path, tuple[Any, ...]] = {}
     broken: dict[Path, str] = {}
     for path in paths:
         try:
             with LasSource(path) as source:
-                header = source.header
-                crs, form = metric_crs(source), header.point_format
-                kinds[path] = crs, form.id, tuple(form.dimension_names)
-                heads.append((len(source), header.mins, header.maxs, float(max(header.scales))))
+                header, form = source.header, source.header.point_format
+                kind = metric_crs(source), form.id, tuple(form.dimension_names)
+                box = header.mins, header.maxs, float(max(header.scales))
+                heads[path] = kind, len(source), *box
         except InputError as error:
             broken[path] = str(error)
     if broken:
         why = "\n".join(f"  {one}" for one in broken.values())
         sentence = f"{len(broken)} of {len(broken) + len(heads)} files cannot be read:\n{why}"
         raise bad_file(name, "cloud.broken_files", sentence, paths=list(broken))
-    # Refuse files of several coordinate systems, point formats or extra dimensions
-    first, *rest = kinds
-    for other in rest:
-        for words, one, another in zip(
-            ("CRS", "point format", "dimensions"), kinds[first], kinds[other], strict=True
-        ):
-            if one != another:
-                one, another = (getattr(value, "name", value) for value in (one, another))
-                sentence = f"{first.name} has the {words} {one}, {other.name} {another}. Convert"
-                sentence += " them to the same, or correct them separately."
-                raise bad_file(name, "cloud.mixed_tiles", sentence, paths=[first, other])
-    counts, lows, highs, steps = zip(*heads, strict=True)
-    tiles = Tiles(name, tuple(kinds), counts, np.array(lows), np.array(highs), max(steps))
-    # Warn of tiles that lie in each other by more than their borders, as points may be double
-    boxes = shapely.box(*tiles.lows[:, :2].T, *tiles.highs[:, :2].T)
-    one, other = shapely.STRtree(boxes).query(boxes, predicate="intersects")
-    one, other = np.unique(np.sort(np.column_stack([one, other])[one != other], axis=1), axis=0).T
-    shared = np.minimum(tiles.highs[one], tiles.highs[other]) - np.maximum(
-        tiles.lows[one], tiles.lows[other]
-    )
-    sides = tiles.highs - tiles.lows
-    border = OVERLAP * np.minimum(sides[one], sides[other])
-    deep = ((shared > border) & (shared > 0.0))[:, :2].all(axis=1)
-    pairs = np.column_stack([one, other])[deep]
-    found = [(tiles.paths[i].name, tiles.paths[j].name) for i, j in pairs]
+    kinds, counts, lows, highs, steps = zip(*heads.values(), strict=True)
+    tiles = Tiles(name, tuple(heads), counts, np.array(lows), np.array(highs), max(steps))
+    first = tiles.paths[0]
+    for path, kind in zip(heads, kinds, strict=True):
+        for words, *both in zip(("CRS", "point format", "dimensions"), kinds[0], kind, strict=True):
+            if both[0] != both[1]:
+                one, other = (getattr(value, "name", value) for value in both)
+                sentence = f"{first.name} has the {words} {one}, {path.name} {other}. Convert them"
+                sentence += " to the same, or correct them separately."
+                raise bad_file(name, "cloud.mixed_tiles", sentence, paths=[first, path])
+    # Warn of tiles that reach into each other by more than rounding, as points may be double
+    margin = OVERLAP / 2.0 * (tiles.highs - tiles.lows)[:, :2]
+    boxes = shapely.box(*(tiles.lows[:, :2] + margin).T, *(tiles.highs[:, :2] - margin).T)
+    pairs = shapely.STRtree(boxes).query(boxes, predicate="intersects").T.tolist()
+    found = [(tiles.paths[i].name, tiles.paths[j].name) for i, j in pairs if i < j]
     if found:
         sentence = f"{tiles}: {' and '.join(found[0])} overlap, as do {len(found)} pairs. Points in"
         sentence += " both count twice; cut off the buffers of the tiles."

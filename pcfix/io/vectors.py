@@ -17,7 +17,7 @@ import shapely
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io import tables
 from pcfix.io.atomic import cannot_write, temporary_output
-from pcfix.io.crs import LOCAL, parse_crs, way_to_cloud
+from pcfix.io.crs import parse_crs, plan_unit, way_to_cloud
 from pcfix.io.files import check_input, check_output
 from pcfix.libraries import analysis_library, optional_library
 from pcfix.model import FloatArray
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 Geometries = npt.NDArray[Any]
+load_pyogrio = partial(optional_library, "pyogrio", "vector", "Read and write vector files")
 
 TEXT_SUFFIXES = (".wkt", ".csv", ".txt")
 GDAL_SUFFIXES = (".gpkg", ".shp", ".geojson", ".json", ".kml", ".gpx")
@@ -113,14 +114,11 @@ def read_vectors(path: File, *, crs: str | None = None) -> Vectors:
     if gone.all():
         raise bad_file(name, "vector.empty", "holds no geometry with coordinates.")
     vectors = Vectors(geometries[~gone], crs or found, name)  # without empty features
-    if vectors.crs is None or vectors.crs.strip().lower() == LOCAL:
-        return vectors
-    stated = parse_crs(vectors.crs, name)
-    x, y = vectors.coordinates[:, 0], vectors.coordinates[:, 1]
-    wrong = (np.abs(x) > 360.0) | (np.abs(y) > 90.0)
-    if stated.is_geographic and stated.axis_info[0].unit_name == "degree" and wrong.any():
-        i = int(np.argmax(wrong))
-        sentence = f"{x[i]:.10g}, {y[i]:.10g} is not in degrees, as {stated.name} is. Give its CRS."
+    stated = None if vectors.crs is None else parse_crs(vectors.crs, name)
+    beyond = (np.abs(vectors.coordinates[:, :2]) > [360.0, 90.0]).any(axis=1)
+    if beyond.any() and stated and stated.is_geographic and plan_unit(stated)[0] == "degree":
+        x, y = vectors.coordinates[int(np.argmax(beyond)), :2]
+        sentence = f"{x:.10g}, {y:.10g} is not in degrees, as {stated.name} is. Give its CRS."
         raise bad_file(name, "vector.not_degrees", sentence, crs=stated.name)
     return vectors
 
@@ -153,11 +151,6 @@ def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool
         sentence = "some of it has no place in the cloud's CRS. Check the file's CRS."
         raise bad_file(vectors.name, "vector.outside_crs", sentence)
     return moved
-
-
-def load_pyogrio() -> Any:
-    """Import the library of vector files."""
-    return optional_library("pyogrio", "vector", "Read and write vector files")
 
 
 def _read_gdal(path: Path, layer: str) -> tuple[Geometries, str | None, str]:
@@ -204,14 +197,13 @@ def _read_text(path: Path) -> tuple[Geometries, str | None]:
         table = tables.read_table(path, *kinds, spellings=COLUMNS)
         if not table.has("wkt"):
             # degrees of x and y are those of the CRS
-            unit = ["" if one in tables.DEGREES else one for one in table.unit]
-            is_degrees = not table.has("x", "y")
-            axes = ("longitude", "latitude") if is_degrees else ("x", "y")
-            table = replace(table, unit=unit)
-            plan, z = table.of(axes), table.where_there(("z",))[:, 0]
-            points = np.asarray(shapely.points(np.column_stack([plan, z])))
-            geometries = np.where(np.isfinite(z), points, shapely.force_2d(points))
-            return geometries, tables.stated_crs(lines[:20]) or (WGS84 if is_degrees else None)
+            table = replace(table, unit=["" if u in tables.DEGREES else u for u in table.unit])
+            in_metres = table.has("x", "y")
+            axes = ("x", "y") if in_metres else ("longitude", "latitude")
+            xyz = np.column_stack([table.of(axes), table.where_there(("z",))])
+            points = np.asarray(shapely.points(xyz))
+            geometries = np.where(np.isfinite(xyz[:, 2]), points, shapely.force_2d(points))
+            return geometries, tables.stated_crs(lines[:20]) or (None if in_metres else WGS84)
         texts = list(zip(table.line, table.column("wkt"), strict=True))
     geometries = np.empty(len(texts), dtype=object)
     for row, (line, text) in enumerate(texts):
@@ -235,14 +227,6 @@ class Shoreline(NamedTuple):
     name: str
     notes: tuple[PcfixWarning, ...]
     counts: FloatArray
-
-
-class WaterPolygons(NamedTuple):
-    """A valid shapely (Multi)Polygon of the water in the cloud's CRS; its holes are dry."""
-
-    area: Any
-    name: str
-    notes: tuple[PcfixWarning, ...] = ()
 
 
 def read_shoreline(
@@ -304,8 +288,11 @@ def _vertices(geometries: Geometries) -> FloatArray:
     return np.asarray(np.delete(xyz, again, axis=0), np.float64)
 
 
-def read_water_polygons(path: File, cloud_crs: str | CRS | None = None) -> WaterPolygons:
-    """Read the polygons inside which points may be submerged, as one area."""
+def read_water_polygons(path: File, cloud_crs: str | CRS | None = None) -> Vectors:
+    """Read the polygons inside which points may be submerged, as one valid geometry.
+
+    Its holes are dry.
+    """
     vectors = in_cloud_crs(read_vectors(path), cloud_crs, heights=False)
     parts = shapely.force_2d(_single_parts(vectors.geometries))
     polygons = parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON]
@@ -323,7 +310,7 @@ def read_water_polygons(path: File, cloud_crs: str | CRS | None = None) -> Water
         kinds = sorted({geometry.geom_type for geometry in vectors.geometries})
         sentence = f"holds no polygon with an area ({', '.join(kinds)}). A mask needs polygons."
         raise bad_file(vectors.name, "mask.no_area", sentence, kinds=kinds)
-    return WaterPolygons(area, vectors.name, notes)
+    return replace(vectors, geometries=np.array([area]), notes=notes)
 
 
 OLDER = {"VERSION": "1.2"}

@@ -29,11 +29,13 @@ import struct
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io.cameras.colmap import read_images
@@ -49,8 +51,6 @@ from pcfix.sums import LEAST, MOST, SAME, Sums
 
 _HEAD = 8
 _IMAGES, _WEIGHTS = "view_indices", "view_weights"
-_OTHERS = (b"LASF", b"MVSI", b"PK\x03\x04", b"SQLi")
-"""The first bytes of files that people give instead: clouds, scenes, archives, databases."""
 _REMEDY = "Give COLMAP's fused.ply.vis or OpenMVS's dense PLY, as the software wrote it."
 LEAST_SHARE = 0.95
 """Of listed cameras whose frame holds the point: 1.00 on a real dense cloud, 0.75 with image
@@ -96,11 +96,21 @@ class ViewList:
     notes: tuple[PcfixWarning, ...] = ()
     orders: tuple[ImageOrder, ...] = ()  # possible meanings of a number, until geometry decides
     share_seen: float | None = None
-    spacing_m: float | None = None  # between neighbouring points, if there are positions
     tolerance_spacings: float = 0.05
 
     def __len__(self) -> int:
         return len(self.listed.start) - 1
+
+    @cached_property
+    def spacing_m(self) -> float:
+        """The median distance to the nearest neighbour around the middle of the file, metres."""
+        if self.xyz is None or len(self.xyz) < 2:
+            return 0.0
+        away = np.abs(self.xyz[:, :2] - self.xyz[len(self.xyz) // 2, :2]).max(axis=1)
+        near = min(_NEIGHBOURS, len(self.xyz) - 1)
+        box = self.xyz[away <= np.partition(away, near)[near]]
+        distance = np.asarray(cKDTree(box).query(box[:_NEIGHBOURS], k=2)[0])
+        return float(np.median(distance[:, 1]))
 
 
 def read_views(path: File, cameras: Cameras, *, to_cloud: Points | None = None) -> ViewList:
@@ -119,16 +129,11 @@ def read_views(path: File, cameras: Cameras, *, to_cloud: Points | None = None) 
     """
     found = check_input(path)
     with found.open("rb") as stream:
-        head = stream.read(4)
-    if head in _OTHERS:
-        raise bad_file(found, "views.not_one", f"is not a view list. {_REMEDY}")
+        is_ply = stream.read(3) == b"ply"
     vis = found.with_name(f"{found.name}.vis")
-    if not head.startswith(b"ply"):
-        views = _colmap(found)
-    elif read_header(found).item(_IMAGES, is_list=True) is None and vis.is_file():
-        views = _colmap(vis)
-    else:
-        views = _openmvs(found)
+    if is_ply and vis.is_file() and read_header(found).item(_IMAGES, is_list=True) is None:
+        found, is_ply = vis, False
+    views = _openmvs(found) if is_ply else _colmap(found)
     return _placed(replace(views, orders=image_orders(views, cameras)), cameras, to_cloud)
 
 
@@ -162,8 +167,7 @@ def _placed(views: ViewList, cameras: Cameras, to_cloud: Points | None) -> ViewL
         return views
     xyz = views.xyz if to_cloud is None else to_cloud(views.xyz)
     xyz = np.ascontiguousarray(xyz, np.float64)
-    placed = replace(views, xyz=xyz, spacing_m=spacing_m(xyz))
-    return fitted(placed, cameras, xyz, np.arange(len(views)))
+    return fitted(replace(views, xyz=xyz), cameras, xyz, np.arange(len(views)))
 
 
 def _colmap(path: Path) -> ViewList:
@@ -184,7 +188,8 @@ def _colmap(path: Path) -> ViewList:
         return raw
     vertices = read_header(ply).records
     if vertices == count:
-        return replace(raw, **_positions(Records(ply, read_header(ply))))
+        xyz, resolution_m = _positions(Records(ply, read_header(ply)))
+        return replace(raw, xyz=xyz, resolution_m=resolution_m)
     sentence = f"{ply}: has {vertices:,} points, the list {count:,}. Its positions are not used."
     return replace(raw, notes=(PcfixWarning("views.other_points", sentence, path=ply),))
 
@@ -195,7 +200,7 @@ def _openmvs(path: Path) -> ViewList:
     if header.item(_IMAGES, is_list=True) is None:
         raise bad_file(path, "views.no_lists", f"its points have no {_IMAGES}. {_REMEDY}")
     vertices = Records(path, header)
-    listed, positions = _listed(path, vertices), _positions(vertices)
+    listed, (xyz, resolution_m) = _listed(path, vertices), _positions(vertices)
     if header.item(_WEIGHTS, is_list=True) is not None:
         start, weight = vertices.lists(_WEIGHTS)
         is_positive = ((weight >= 0.0) & (weight < np.inf)).all()
@@ -203,10 +208,10 @@ def _openmvs(path: Path) -> ViewList:
             sentence = f"its {_WEIGHTS} are not one positive number for each image. {_REMEDY}"
             raise bad_file(path, "views.weights", sentence)
         listed = replace(listed, weight=weight.astype(np.float32))
-    return ViewList(path, "OpenMVS point cloud", listed, **positions)
+    return ViewList(path, "OpenMVS point cloud", listed, xyz, resolution_m)
 
 
-def _positions(vertices: Records) -> dict[str, Any]:
+def _positions(vertices: Records) -> tuple[FloatArray, float]:
     """Return the vertices of a PLY file, and how coarse the type of their numbers is, metres."""
     header = vertices.header
     if header.records == 0 or None in (header.item(axis, is_list=False) for axis in "xyz"):
@@ -220,7 +225,7 @@ def _positions(vertices: Records) -> dict[str, Any]:
         raise bad_file(header.name, "views.not_finite", sentence, row=row)
     single = header.item("x", is_list=False) == "f4"
     step = float(np.spacing(np.float32(np.abs(xyz).max()))) if single else 0.0
-    return {"xyz": xyz, "resolution_m": step}
+    return xyz, step
 
 
 def _listed(path: Path, records: Records) -> Views:
@@ -340,9 +345,8 @@ class ViewMatch:
         if views.xyz is not None:
             # a match may be off by the rounding of both files, or by a share of the spacing
             rounding_m = _ROUNDING * (step_m / 2 + views.resolution_m)
-            spacing_m = views.spacing_m or 0.0
-            self.tolerance_m = max(rounding_m, views.tolerance_spacings * spacing_m)
-            self._same_m = max(rounding_m, _SAME * spacing_m)
+            self.tolerance_m = max(rounding_m, views.tolerance_spacings * views.spacing_m)
+            self._same_m = max(rounding_m, _SAME * views.spacing_m)
         elif points != len(views):
             sentence = f"has {len(views):,} points, the cloud {points}. Put its PLY next to it."
             values = {"listed": len(views), "points": points}
@@ -383,7 +387,7 @@ class ViewMatch:
         listed = Views(np.cumsum(start), camera[posed], weight, some.kind)
         outside = beside_frames(xyz, listed, self._cameras)
         report.share_seen = views.share_seen
-        report.image_order, report.unposed = order.what, order.unposed
+        report.unposed = order.unposed
         report.entries, report.unposed_entries = int(posed.sum()), int((~posed).sum())
         report.beside_entries = int(outside.sum())
         report.beside_points = int(np.count_nonzero(outside))
@@ -403,8 +407,6 @@ class ViewMatch:
         if not len(rest):
             return row
         if self._tree is None:
-            from scipy.spatial import cKDTree
-
             self._tree = cKDTree(listed, balanced_tree=False, compact_nodes=False)
         reach = float(np.nextafter(self.tolerance_m or 0.0, np.inf))
         away, nearest = self._tree.query(xyz[rest], distance_upper_bound=reach, workers=-1)
@@ -422,7 +424,6 @@ class ViewReport(Sums):
 
     source: str = field(metadata=SAME)  # kind and path of the list
     list_points: int = field(metadata=SAME)
-    image_order: str = field(default="", metadata=SAME)  # the source of the order of the images
     share_seen: float | None = field(default=None, metadata=LEAST)  # see `ViewList`
     tolerance_m: float | None = field(default=None, metadata=SAME)  # of a match by position
     by_row: int = 0
@@ -451,46 +452,27 @@ class ViewReport(Sums):
 
     def warnings(self) -> list[PcfixWarning]:
         """Return warnings on points without a list and on images that are ignored."""
-        notes = list(self.notes)
-
-        def note(code: str, sentence: str, **values: Any) -> None:
-            notes.append(PcfixWarning(code, f"{self.source}: {sentence}", **values))
-
+        found: dict[str, str] = {}
         if self.unmatched > _MANY * self.points:
             sentence = f"lacks {self.unmatched:,} of the cloud's {self.points:,} points."
-            note("views.unmatched", sentence, count=self.unmatched, points=self.points)
+            found["views.unmatched"] = sentence
         if self.share_seen is None and self.entries:
-            note("views.order_untested", "the order of its images is untested: no camera frames.")
+            sentence = "the order of its images is untested: no camera frames."
+            found["views.order_untested"] = sentence
         if self.unposed_entries:
             named = f", such as {', '.join(self.unposed[:3])}" if self.unposed else ""
             sentence = f"{self.unposed_entries:,} entries without a pose{named} are ignored."
-            note("views.unposed", sentence, count=self.unposed_entries)
+            found["views.unposed"] = sentence
         if self.beside_entries:
-            note("views.not_in_frame", beside(self.beside_entries, self.beside_points))
-        return notes
+            found["views.not_in_frame"] = beside(self.beside_entries, self.beside_points)
+        notes = (PcfixWarning(code, f"{self.source}: {one}") for code, one in found.items())
+        return [*self.notes, *notes]
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        values = {k: v for k, v in vars(self).items() if k != "notes"}
-        values["unposed"] = list(self.unposed)
-        values["cameras_per_point"] = self.entries / max(self.by_row + self.by_position, 1)
-        return values
+        return {name: value for name, value in vars(self).items() if name != "notes"}
 
 
 def beside(entries: int, points: int) -> str:
     """Return the sentence on cameras that cannot have imaged the points they are listed for."""
     return f"{entries:,} entries of {points:,} points are ignored: their cameras face elsewhere."
-
-
-def spacing_m(xyz: FloatArray) -> float | None:
-    """Return the median distance to the nearest neighbour around the middle of the file, metres."""
-    from scipy.spatial import cKDTree
-
-    if len(xyz) < 2:
-        return None
-    centre = xyz[len(xyz) // 2]
-    away = np.maximum(np.abs(xyz[:, 0] - centre[0]), np.abs(xyz[:, 1] - centre[1]))
-    near = min(_NEIGHBOURS, len(xyz) - 1)
-    box = xyz[away <= np.partition(away, near)[near]]
-    distance = np.asarray(cKDTree(box).query(box[:_NEIGHBOURS], k=2)[0])
-    return float(np.median(distance[:, 1]))

@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
+from rasterio.windows import Window
+from scipy.ndimage import map_coordinates
 
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
 from pcfix.io import crs as systems
@@ -214,25 +216,31 @@ def read_water_raster(
         if source.count != 1:
             sentence = f"has {source.count} bands. Write the height of the water as one band."
             raise bad_file(name, "water.raster_bands", sentence, value=source.count)
-        t = source.transform
+        t, size = source.transform, np.array([source.width, source.height])
         if t.is_identity or not np.isfinite(t).all() or not abs(t.determinant) > 0.0:
             sentence = "has no valid geotransform. Export it as GeoTIFF, or with a world file."
             raise bad_file(name, "water.raster_place", sentence)
-        stated = None if source.crs is None else source.crs.to_wkt()
+        crs = None if source.crs is None else systems.parse_crs(source.crs.to_wkt(), name)
         share = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.5)])
-        x, y = place_of(t, *(share * [source.width, source.height]).T)
-        at = np.column_stack([x, y, 0.0 * x])
-        to_cloud, notes = systems.way_to_cloud(stated, cloud_crs, at, name, heights=True)
+        at = np.column_stack([*place_of(t, *(share * size).T), np.zeros(5)])
+        to_cloud, notes = systems.way_to_cloud(crs, cloud_crs, at, name, heights=True)
         from_cloud: Points = np.asarray  # in plan
-        if to_cloud is not None and stated is not None and cloud_crs is not None:
-            cloud, crs = systems.parse_crs(cloud_crs, "the cloud"), systems.parse_crs(stated, name)
+        if to_cloud is not None and crs is not None and cloud_crs is not None:
+            cloud = systems.parse_crs(cloud_crs, "the cloud")
             about = to_cloud(at) if bounds is None else _edge(bounds)
             from_cloud, _ = systems.transformation(cloud, crs, about, name, heights=False)
-            forward, unit = to_cloud, [1.0, 1.0, systems.metres_up(crs)]
-            to_cloud = lambda xyz: forward(xyz / unit)  # noqa: E731
-        near = None if bounds is None else from_cloud(_edge(bounds))
-        heights, t, more = _read(source, name, near)
-    title = name.replace("\\", "/").rpartition("/")[2]
+        first, last = np.zeros(2, np.int64), size
+        near = at if bounds is None else from_cloud(_edge(bounds))
+        if bounds is not None and np.isfinite(near).all():
+            cell = np.column_stack(place_of(~t, *near[:, :2].T))
+            first, last = np.clip([cell.min(axis=0) - 2, cell.max(axis=0) + 3], 0, size).astype(int)
+        if (last - first).min() < 2:
+            sentence = "has fewer than two rows and columns near the cloud. Check its CRS."
+            raise bad_file(name, "water.raster_apart", sentence)
+        _check_size(float((last - first).prod()), name)
+        window = Window(*first.tolist(), *(last - first).tolist())
+        heights, more = _heights(source, window, crs, name)
+        t = source.window_transform(window)
     # noise of the cells, against their neighbours: waves are smooth over a few cells
     around = (heights[:-2, 1:-1] + heights[2:, 1:-1] + heights[1:-1, :-2] + heights[1:-1, 2:]) / 4
     noise = np.abs(heights[1:-1, 1:-1] - around)
@@ -241,13 +249,106 @@ def read_water_raster(
     if slope_deg > ROUGH_DEG:
         sentence = f"{name}: the water surface is rough ({noise_m:.2f} m, slopes of {slope_deg:.0f}"
         sentence += " degrees). Smooth it, or fit a level to it."
-        more += (PcfixWarning("water.rough", sentence, noise_m=noise_m),)
-    for note in notes + more:
+        more.append(PcfixWarning("water.rough", sentence, noise_m=noise_m))
+    for note in (*notes, *more):
         warnings.warn(note, stacklevel=3)
-    if to_cloud is None and t.b == t.d == 0.0 and t.a > 0.0 > t.e:  # north-up in the cloud's CRS
-        return WaterRaster(heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), title)
-    transforms = to_cloud or (lambda xyz: xyz), from_cloud
-    return _resampled(heights, t, *transforms, bounds, (name, title))
+    left, top, cell_m = float(t.c), float(t.f), (float(t.a), float(-t.e))
+    is_grid = to_cloud is None and t.b == t.d == 0.0 < min(cell_m)  # north-up, in the cloud's CRS
+    if not is_grid and np.isfinite(heights).any():
+        if to_cloud is not None and crs is not None:
+            heights /= systems.metres_up(crs)
+        ways = to_cloud or np.asarray, from_cloud
+        heights, left, top, cell_m = _resampled(heights, t, *ways, bounds, name)
+    if not np.isfinite(heights).any():
+        sentence = "has no height near the cloud. Check its CRS and its nodata value."
+        raise bad_file(name, "water.raster_empty", sentence)
+    return WaterRaster(heights, left, top, cell_m, name.replace("\\", "/").rpartition("/")[2])
+
+
+def _edge(bounds: Bounds) -> FloatArray:
+    """Return points along bounds, z = 0."""
+    west, south, east, north = bounds
+    longest = max(east - west, north - south, 1.0) / _EDGE_POINTS
+    xy = shapely.get_coordinates(shapely.segmentize(shapely.box(*bounds), longest))
+    return np.column_stack([xy, np.zeros(len(xy))])
+
+
+def _check_size(cells: float, name: str) -> None:
+    if not 0.0 < cells <= MOST_CELLS:  # more than memory should hold
+        sentence = f"has {cells:,.0f} cells, {MOST_CELLS:,} at most. Resample it to coarser cells."
+        raise bad_file(name, "water.raster_size", sentence, cells=cells)
+
+
+def _heights(
+    source: DatasetReader, window: Window, crs: CRS | None, name: str
+) -> tuple[FloatArray, list[PcfixWarning]]:
+    """Read part of a raster, metres, NaN for no height; also return notes on what is assumed."""
+    # one unit of the heights is that of the band, else that of the CRS
+    unit, notes = (source.units[0] or "").strip(), list[PcfixWarning]()
+    if unit.lower() not in _UNITS_M:
+        sentence = f"its heights are in '{unit}'. Convert them to metres, or correct the unit."
+        raise bad_file(name, "water.raster_unit", sentence, value=unit)
+    unit_m = _UNITS_M[unit.lower()]
+    if unit_m is None and crs is not None and not systems.is_local(crs):
+        unit_m = systems.metres_up(crs)
+        if unit_m != 1.0 and systems.parts(crs)[1] is None:
+            sentence = f"{name}: has no unit of heights; that of its CRS is assumed"
+            sentence += f" ({unit_m:.4f} m)."
+            notes.append(PcfixWarning("water.raster_unit", sentence, unit_m=unit_m))
+    stored = read_masked(source, window=window)
+    heights = (stored * source.scales[0] + source.offsets[0]) * (unit_m or 1.0)
+    if source.nodata is None:
+        heights[np.abs(heights) > IMPOSSIBLE_M] = np.nan
+    heights[np.isinf(heights)] = np.nan
+    unknown = int(np.isnan(heights).sum())
+    if source.nodata is None and unknown:
+        sentence = f"{name}: has no nodata value. {unknown:,} impossible heights are ignored."
+        notes.insert(0, PcfixWarning("water.raster_nodata", sentence, count=unknown))
+    return heights, notes
+
+
+def _resampled(
+    given: FloatArray, transform: Affine, to_cloud: Points, from_cloud: Points,
+    bounds: Bounds | None, name: str,
+) -> tuple[FloatArray, float, float, tuple[float, float]]:  # fmt: skip
+    """Resample heights to square cells in the cloud's CRS, as small as the raster's smallest.
+
+    The heights have the unit of `to_cloud`; `from_cloud` transforms the plan only; `bounds` are in
+    the cloud's CRS. Return heights in metres, left, top and size of the cells.
+    """
+    # where the raster is, from points all over it, and the sides of its middle cell
+    high, wide = given.shape
+    share = np.linspace(0.0, 1.0, _EDGE_POINTS)
+    c, r = (grid.ravel() for grid in np.meshgrid(share * wide, share * high))
+    amid = wide / 2.0 + np.array([0.0, 1.0, 0.0]), high / 2.0 + np.array([0.0, 0.0, 1.0])
+    x, y = place_of(transform, np.append(c, amid[0]), np.append(r, amid[1]))
+    placed = to_cloud(np.column_stack([x, y, np.full(len(x), np.nanmean(given))]))
+    if not np.isfinite(placed).all():
+        sentence = "extends beyond the area of use of the cloud's CRS. Clip it."
+        raise bad_file(name, "water.raster_place", sentence)
+    cell = float(np.hypot(*(placed[-2:] - placed[-3])[:, :2].T).min())
+    (west, south, _), (east, north, _) = placed.min(axis=0), placed.max(axis=0)
+    if bounds is not None:
+        west, south = max(west, bounds[0]), max(south, bounds[1])
+        east, north = min(east, bounds[2]), min(north, bounds[3])
+    left, top = float(np.floor(west / cell) * cell), float(np.ceil(north / cell) * cell)
+    sides = np.maximum(np.ceil([(east - left) / cell, (top - south) / cell]), 2.0)
+    _check_size(float(sides.prod()), name)
+    columns, rows = sides.astype(np.int64).tolist()
+    heights = np.empty((rows, columns))
+    x, at_once = left + (np.arange(columns) + 0.5) * cell, max(1, _AT_ONCE // columns)
+    for first in range(0, rows, at_once):
+        strip = heights[first : first + at_once]
+        y, zero = top - (first + np.arange(len(strip)) + 0.5) * cell, np.zeros(strip.size)
+        places = from_cloud(np.column_stack([np.tile(x, len(y)), np.repeat(y, columns), zero]))
+        column, row = place_of(~transform, places[:, 0], places[:, 1])
+        # bilinear between the centres of cells; unknown beside an unknown cell
+        height = map_coordinates(given, [row - 0.5, column - 0.5], order=1, cval=np.nan)
+        known = np.isfinite(height)
+        height[known] = to_cloud(np.column_stack([places[known, :2], height[known]]))[:, 2]
+        height[~np.isfinite(height)] = np.nan
+        strip[:] = height.reshape(strip.shape)
+    return heights, left, top, (cell, cell)
 
 
 def rasters_of_images(
@@ -276,131 +377,13 @@ def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:
     from rasterio.transform import from_origin
 
     rows, columns = water.height_m.shape
-    system = None
-    if crs is not None and crs.strip().lower() != systems.LOCAL:
-        parsed = systems.parse_crs(crs, "cameras")
-        system = None if systems.is_local(parsed) else rasterio.CRS.from_wkt(parsed.to_wkt())
+    parsed = None if crs is None else systems.parse_crs(crs, "cameras")
+    is_tied = parsed is not None and not systems.is_local(parsed)
     profile = {
         "driver": "GTiff", "width": columns, "height": rows, "count": 1, "dtype": "float64",
         "nodata": np.nan, "compress": "deflate", "predictor": 3,
-        "crs": system,
+        "crs": rasterio.CRS.from_wkt(parsed.to_wkt()) if parsed and is_tied else None,
         "transform": from_origin(water.left_m, water.top_m, *water.cell_m),
     }  # fmt: skip
     with rasterio.open(path, "w", **profile) as target:
         target.write(water.height_m, 1)
-
-
-def _edge(bounds: Bounds) -> FloatArray:
-    """Return points along bounds, z = 0."""
-    west, south, east, north = bounds
-    longest = max(east - west, north - south, 1.0) / _EDGE_POINTS
-    xy = shapely.get_coordinates(shapely.segmentize(shapely.box(*bounds), longest))
-    return np.column_stack([xy, np.zeros(len(xy))])
-
-
-def _read(
-    source: DatasetReader, name: str, near: FloatArray | None
-) -> tuple[FloatArray, Affine, systems.Notes]:
-    """Read the heights around some places, shape (n, 3), or all, in metres.
-
-    Also return the transform from their (column, row) to the raster's CRS, and notes.
-    """
-    from rasterio.windows import Window
-
-    left, top, right, bottom = 0, 0, source.width, source.height
-    if near is not None and np.isfinite(near).all():
-        column, row = place_of(~source.transform, near[:, 0], near[:, 1])
-        left, right = (int(v) for v in np.clip([column.min() - 2, column.max() + 3], 0, right))
-        top, bottom = (int(v) for v in np.clip([row.min() - 2, row.max() + 3], 0, bottom))
-    if right - left < 2 or bottom - top < 2:
-        sentence = "has fewer than two rows and columns near the cloud. Check its CRS."
-        raise bad_file(name, "water.raster_apart", sentence)
-    _check_size((bottom - top) * (right - left), name)
-    window = Window(left, top, right - left, bottom - top)
-    stored = read_masked(source, window=window)
-    # one unit of the heights is that of the band, else that of the CRS
-    unit, notes = (source.units[0] or "").strip(), list[PcfixWarning]()
-    if unit.lower() not in _UNITS_M:
-        sentence = f"its heights are in '{unit}'. Convert them to metres, or correct the unit."
-        raise bad_file(name, "water.raster_unit", sentence, value=unit)
-    unit_m = _UNITS_M[unit.lower()]
-    if unit_m is None and source.crs is not None:
-        crs = systems.parse_crs(source.crs.to_wkt(), name)
-        unit_m = 1.0 if systems.is_local(crs) else systems.metres_up(crs)
-        if unit_m != 1.0 and systems.parts(crs)[1] is None:
-            sentence = f"{name}: has no unit of heights; that of its CRS is assumed"
-            sentence += f" ({unit_m:.4f} m)."
-            notes.append(PcfixWarning("water.raster_unit", sentence, unit_m=unit_m))
-    heights = (stored * source.scales[0] + source.offsets[0]) * (unit_m or 1.0)
-    if source.nodata is None:
-        heights[np.abs(heights) > IMPOSSIBLE_M] = np.nan
-    heights[np.isinf(heights)] = np.nan
-    unknown = int(np.isnan(heights).sum())
-    if source.nodata is None and unknown:
-        sentence = f"{name}: has no nodata value. {unknown:,} impossible heights are ignored."
-        notes.insert(0, PcfixWarning("water.raster_nodata", sentence, count=unknown))
-    _check_known(heights, name)
-    return heights, source.window_transform(window), tuple(notes)
-
-
-def _check_known(heights: FloatArray, name: str) -> None:
-    if not np.isfinite(heights).any():
-        sentence = "has no height near the cloud. Check its CRS and its nodata value."
-        raise bad_file(name, "water.raster_empty", sentence)
-
-
-def _check_size(cells: float, name: str) -> None:
-    if not 0.0 < cells <= MOST_CELLS:  # more than memory should hold
-        sentence = f"has {cells:,.0f} cells, {MOST_CELLS:,} at most. Resample it to coarser cells."
-        raise bad_file(name, "water.raster_size", sentence, cells=cells)
-
-
-def _resampled(
-    given: FloatArray, transform: Affine, to_cloud: Points, from_cloud: Points,
-    bounds: Bounds | None, names: tuple[str, str],
-) -> WaterRaster:  # fmt: skip
-    """Resample to a grid in the cloud's CRS with square cells as small as the raster's smallest.
-
-    `from_cloud` transforms the plan only; `bounds` are in the cloud's CRS; `names` are the
-    raster's for messages and its title.
-    """
-    from pcfix.water.surface import Field, heights_above
-
-    # where the raster is, from points all over it, and the sides of its middle cell
-    high, wide = given.shape
-    share = np.linspace(0.0, 1.0, _EDGE_POINTS)
-    c, r = (grid.ravel() for grid in np.meshgrid(share * wide, share * high))
-    amid = wide / 2.0 + np.array([0.0, 1.0, 0.0]), high / 2.0 + np.array([0.0, 0.0, 1.0])
-    x, y = place_of(transform, np.append(c, amid[0]), np.append(r, amid[1]))
-    placed = to_cloud(np.column_stack([x, y, np.full(len(x), np.nanmean(given))]))
-    if not np.isfinite(placed).all():
-        sentence = "extends beyond the area of use of the cloud's CRS. Clip it."
-        raise bad_file(names[0], "water.raster_place", sentence)
-    cell = np.hypot(*(placed[-2:] - placed[-3])[:, :2].T).min()
-    (west, south, _), (east, north, _) = placed.min(axis=0), placed.max(axis=0)
-    if bounds is not None:
-        west, south = max(west, bounds[0]), max(south, bounds[1])
-        east, north = min(east, bounds[2]), min(north, bounds[3])
-    left, top = np.floor(west / cell) * cell, np.ceil(north / cell) * cell
-    sides = np.maximum(np.ceil([(east - left) / cell, (top - south) / cell]), 2.0)
-    _check_size(float(sides.prod()), names[0])
-    columns, rows = sides.astype(np.int64).tolist()
-    size, frame = np.array([[0, high, wide]]), np.array([[0.5, -0.5, 1.0, 1.0]])
-    field = Field(given.ravel(), size, frame, 0)
-    heights = np.empty((rows, columns))
-    x = left + (np.arange(columns) + 0.5) * cell
-    for first in range(0, rows, max(1, _AT_ONCE // columns)):
-        strip = heights[first : first + max(1, _AT_ONCE // columns)]
-        y = top - (first + np.arange(len(strip)) + 0.5) * cell
-        plan = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x)), np.zeros(strip.size)])
-        places = from_cloud(plan)
-        column, row = place_of(~transform, places[:, 0], places[:, 1])
-        height, _ = heights_above(
-            None, field, np.ascontiguousarray(column), np.ascontiguousarray(-row)
-        )
-        known = np.isfinite(height)
-        height[known] = to_cloud(np.column_stack([places[known, :2], height[known]]))[:, 2]
-        height[~np.isfinite(height)] = np.nan
-        strip[:] = height.reshape(strip.shape)
-    _check_known(heights, names[0])
-    return WaterRaster(heights, float(left), float(top), (float(cell), float(cell)), names[1])

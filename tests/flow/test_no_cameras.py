@@ -8,7 +8,7 @@ import pytest
 
 import pcfix
 from pcfix.errors import PcfixWarning, SettingError
-from pcfix.io.regressions import read_regression
+from pcfix.io.saved import read_regression
 from pcfix.options.correct import WITHOUT_CAMERAS
 from tests.pdal_stage.test_arrays import arrays_of, metadata_of
 from tests.pdal_stage.test_arrays import run as stage

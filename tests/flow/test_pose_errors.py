@@ -13,7 +13,7 @@ from pcfix.adjust.precision import Members
 from pcfix.adjust.transfer import CloudTransfer
 from pcfix.flow.pose_errors import variances
 from pcfix.flow.surfaces import Points
-from pcfix.io.members import FILE, write_members
+from pcfix.io.saved import ENSEMBLE, write_members
 from pcfix.model import Cameras, Lens, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Survey
@@ -187,7 +187,7 @@ def test_other_ensemble(files):
         "ensemble.npz: belongs to other cameras" in note["message"] for note in told.warnings
     )
     np.testing.assert_array_equal(las.SigmaZ, bare.SigmaZ)
-    (where / FILE).write_bytes(b"nothing of use")
+    (where / ENSEMBLE).write_bytes(b"nothing of use")
     told, las = corrected(files)
     assert any("is not an ensemble of an adjustment" in note["message"] for note in told.warnings)
     np.testing.assert_array_equal(las.SigmaZ, bare.SigmaZ)

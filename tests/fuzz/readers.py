@@ -21,9 +21,8 @@ from pcfix.io.cameras.colmap import place_text, write_colmap
 from pcfix.io.clouds import read_cloud
 from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.ground_control import read_ground_control
-from pcfix.io.members import FILE, find_members, write_members
 from pcfix.io.photographs import read_photograph, size_of
-from pcfix.io.regressions import read_regression, write_regression
+from pcfix.io.saved import ENSEMBLE, find_members, read_regression, write_members, write_regression
 from pcfix.io.tables import read_check_depths
 from pcfix.io.tides import read_image_times, read_tide
 from pcfix.io.tiles import open_cloud, part_of
@@ -262,7 +261,7 @@ def vector(name: str) -> Seed:
 def members(folder: Path) -> Path:
     (folder / "cameras.csv").write_text("label,x,y,z\n")
     write_members(folder, members_of(cameras(), 0.1))
-    return folder / FILE
+    return folder / ENSEMBLE
 
 
 def picture(name: str) -> Seed:

@@ -279,7 +279,7 @@ def test_cameras_that_do_not_fit(tmp_path):
         (bare, "cameras.no_lens"),
         (film, "gcps.lens_unit"),
         (block("local"), "crs.local"),
-        (block("ENU:1,2,3"), "crs.topocentric"),
+        (block("ENU:1,2,3"), "crs.local"),
     ):
         fails(tmp_path, ROWS, code, {"cameras": cameras})
     assert read(tmp_path, *ROWS, cameras=block("local"), crs="local").crs == "local"

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from pcfix.io.regressions import read_regression, write_regression
+from pcfix.io.saved import read_regression, write_regression
 from pcfix.io.tables import read_check_depths
 from pcfix.refract.regression import fit_depths
 from tests.utils.codes import refused

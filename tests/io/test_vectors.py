@@ -152,7 +152,7 @@ def test_long_edges(tmp_path):
     """The middle of an edge along a parallel is off the straight line on the map."""
     polygon = "POLYGON((-0.4 39,0 39,0 39.4,-0.4 39.4,-0.4 39))"
     path = write_text(tmp_path / "a.wkt", "# crs: EPSG:4326", polygon)
-    area = read_water_polygons(path, UTM30).area
+    area = read_water_polygons(path, UTM30).geometries[0]
     x, y = Transformer.from_crs("EPSG:4326", UTM30, always_xy=True).transform(-0.2, 39.0)
     assert area.exterior.distance(shapely.Point(x, y)) < 0.01
 
@@ -238,7 +238,13 @@ def test_mask(tmp_path):
     path = write(tmp_path / "lake.gpkg", [lake, shapely.box(8, 8, 20, 20)], kind="Polygon")
     found = read_water_polygons(path, UTM30)
     x, y = np.array([1.0, 5.0, 9.0, 15.0, 25.0]), np.array([1.0, 5.0, 9.0, 15.0, 25.0])
-    assert shapely.contains_xy(found.area, x, y).tolist() == [True, False, True, True, False]
+    assert shapely.contains_xy(found.geometries[0], x, y).tolist() == [
+        True,
+        False,
+        True,
+        True,
+        False,
+    ]
     assert found.notes == ()
 
 
@@ -251,7 +257,7 @@ def test_repaired_mask(tmp_path):
         "POINT(1 2)",
     )
     found = read_water_polygons(path)
-    assert found.area.is_valid
-    assert found.area.area == pytest.approx(50.0 + 96.0 + 100.0)  # the hole stays a hole
+    assert found.geometries[0].is_valid
+    assert found.geometries[0].area == pytest.approx(50.0 + 96.0 + 100.0)  # the hole stays a hole
     assert codes(found) == ["mask.repaired"]
     assert found.notes[0].values == {"count": 2, "area_m2": pytest.approx(146.0)}

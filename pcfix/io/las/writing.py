@@ -51,84 +51,70 @@ _SEAL = "sha256"
 """Of the rest of what it says: what is not as it was written leads to another cloud."""
 
 
-def corrected_header(
+def output_header(
     source: LasSource,
-    columns: tuple[Column, ...],
+    kind: str,
     content: dict[str, Any],
+    columns: tuple[Column, ...] = (),
     steps: tuple[int, ...] = (0, 0, 0),
 ) -> laspy.LasHeader:
-    """Return the header of a corrected file: LAS 1.4, the input's records, and pcfix's own.
+    """Return the header of an output cloud: LAS 1.4, the input's records, and pcfix's own.
 
-    The `columns` are added as extra dimensions, and a VLR with `content` and what the file was
-    before. Each integer axis will be moved by its `steps`, for which the offsets make up. An
-    `InputError` if the cloud already has a dimension of one of these names, or was corrected
-    before.
+    That is of a `kind` (see `NOTES`) with `content`; of a correction also with what the file was
+    before. The `columns` are added as extra dimensions. Each integer axis will be moved by its
+    `steps`, for which the offsets make up. An `InputError` if a cloud to be corrected already has a
+    dimension of one of these names, or was corrected before.
     """
-    if any(is_ours(v) for v in source.vlrs):
+    old, is_correction = source.header, kind == "settings"
+    if is_correction and any(is_ours(v) for v in source.vlrs):
         sentence = "was already corrected by pcfix. Use the original, or undo it: 'pcfix restore'."
         raise bad_file(source.path, "cloud.corrected", sentence)
-    there = set(source.header.point_format.dimension_names)
-    twice = next((column.name for column in columns if column.name in there), None)
-    if twice is not None:
-        sentence = f"already has a dimension {twice}. Rename it, or use --dimensions none."
-        raise bad_file(source.path, "cloud.dimension_exists", sentence, dimension=twice)
-    part = part_report(source.part)
-
-    def note(before: dict[str, Any]) -> VLR:
-        """Return the VLR of the correction."""
-        settings = {**content, **({} if part is None else {"part": part})}
-        settings["before"] = {**before, "steps": list(steps)}
-        return _note("settings", {**settings, _SEAL: _seal_of(settings)})
-
-    header = _upgraded(source, columns, note)
-    header.offsets = source.header.offsets - np.array(steps) * source.header.scales
-    return header
-
-
-def noted_header(source: LasSource, kind: str, content: dict[str, Any]) -> laspy.LasHeader:
-    """Return the header of a file with other classes or flags: LAS 1.4, its records, and a note."""
-    return _upgraded(source, (), lambda before: _note(kind, content))
-
-
-def _upgraded(
-    source: LasSource, columns: tuple[Column, ...], note: Callable[[dict[str, Any]], VLR]
-) -> laspy.LasHeader:
-    """Return the input's header in LAS 1.4 with dimensions added, and a note of what it was."""
-    old = source.header
     point_format = laspy.PointFormat(UPGRADE[old.point_format.id])
     point_format.dimensions.extend(old.point_format.extra_dimensions)
     described, undescribed = _described(source)
     for dimension in undescribed:
-        size, name = dimension.num_bits // 8, dimension.name.encode()
-        described.append(_EXTRA.pack(0, size, name, 0.0, 0.0, b""))
+        size = dimension.num_bits // 8
+        described.append(_EXTRA.pack(0, size, dimension.name.encode(), 0.0, 0.0, b""))
     for column in columns:
+        name, description, dtype = column.name, column.description, column.dtype
+        if name in old.point_format.dimension_names:
+            sentence = f"already has a dimension {name}. Rename it, or use --dimensions none."
+            raise bad_file(source.path, "cloud.dimension_exists", sentence, dimension=name)
         scale = column_scale(column, old.scales)
         scaled, offset = (None, None) if scale == 1.0 else (np.array([scale]), np.zeros(1))
-        point_format.add_extra_dimension(
-            laspy.ExtraBytesParams(column.name, column.dtype, column.description, offset, scaled)
-        )
-        number, texts = _TYPES.index(column.dtype) + 1, (column.name, column.description)
-        name, description = (text.encode() for text in texts)
+        extra = laspy.ExtraBytesParams(name, dtype, description, offset, scaled)
+        point_format.add_extra_dimension(extra)
+        number = _TYPES.index(dtype) + 1
         options, step = (0, 0.0) if scaled is None else (_SCALED, scale)
-        described.append(_EXTRA.pack(number, options, name, step, 0.0, description))
+        described.append(
+            _EXTRA.pack(number, options, name.encode(), step, 0.0, description.encode())
+        )
     vlrs, crs = list(source.vlrs), None
     if old.point_format.id < 6 and not old.global_encoding.wkt:  # formats 6 and up want WKT
         crs = stated_crs(source)
     if crs is not None:
         wkt = WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL")).record_data_bytes()
         vlrs.append(VLR("LASF_Projection", 2112, "OGC COORDINATE SYSTEM WKT", wkt))
-    before = {
-        "version": str(old.version),
-        "point_format": old.point_format.id,
-        "identity": source.identity.decode("latin-1"),
-        "global_encoding": old.global_encoding.value,
-        "offsets": old.offsets.tolist(),
-        "added_wkt": crs is not None,
-        "undescribed": [dimension.name for dimension in undescribed],
-    }
+    if source.part is not None:
+        content = {**content, "part": part_report(source.part)}
+    if is_correction:
+        before = {
+            "version": str(old.version),
+            "point_format": old.point_format.id,
+            "identity": source.identity.decode("latin-1"),
+            "global_encoding": old.global_encoding.value,
+            "offsets": old.offsets.tolist(),
+            "added_wkt": crs is not None,
+            "undescribed": [dimension.name for dimension in undescribed],
+            "steps": list(steps),
+        }
+        content = {**content, "before": before}
+        content[_SEAL] = _seal_of(content)
+    vlrs.append(VLR(USER_ID, NOTES[kind], f"pcfix {kind} (JSON)", _json(content)))
     version = max(old.version, laspy.header.Version(1, 4))
-    header = _header(source, version, point_format, [*vlrs, note(before)], described)
+    header = _header(source, version, point_format, vlrs, described)
     header.global_encoding.wkt = header.global_encoding.wkt or crs is not None
+    header.offsets = old.offsets - np.array(steps) * old.scales
     return header
 
 
@@ -203,10 +189,6 @@ def _is_extra_bytes(vlr: VLR) -> bool:
 def is_ours(vlr: VLR) -> bool:
     """Whether a VLR is the one that says how a file was corrected."""
     return bool(vlr.user_id == USER_ID and vlr.record_id == NOTES["settings"])
-
-
-def _note(kind: str, content: dict[str, Any]) -> VLR:
-    return VLR(USER_ID, NOTES[kind], f"pcfix {kind} (JSON)", _json(content))
 
 
 def _json(content: dict[str, Any]) -> bytes:

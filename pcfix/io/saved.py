@@ -1,22 +1,30 @@
-"""Write and read the line of a depth regression, so that another cloud can be corrected with it.
+"""Files that one command leaves for another: the line of a regression, the ensemble of a block.
 
-JSON, metres: `format`, `version` and `unit`; `intercept`, `slope`, their standard errors
-`intercept_se`, `slope_se` and their `covariance`; `count` of the check depths, `shallowest` and
-`deepest` of their apparent depths; `r2`, `rmse`, `cv_rmse` (cross-validated; null if unknown);
-`source`, where the line comes from, in words; `pcfix`, the version that wrote it.
+The line of a depth regression corrects other clouds too. JSON, metres: `format`, `version` and
+`unit`; `intercept`, `slope`, their standard errors `intercept_se`, `slope_se` and their
+`covariance`; `count` of the check depths, `shallowest` and `deepest` of their apparent depths;
+`r2`, `rmse`, `cv_rmse` (cross-validated; null if unknown); `source`, where the line comes from, in
+words; `pcfix`, the version that wrote it.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from typing import Any
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from pcfix.errors import bad_file
 from pcfix.io.files import check_input, read_json, refusing, write_text
 from pcfix.options.declare import File
 from pcfix.refract.regression import LEAST_COUNT, DepthRegression, notes_of
 from pcfix.version import __version__
+
+if TYPE_CHECKING:
+    from pcfix.adjust.precision import Members
 
 HEADER = {"format": "pcfix depth regression", "version": 1, "unit": "m"}
 _FIELDS = {
@@ -58,14 +66,50 @@ def read_regression(path: File) -> DepthRegression:
     for name in _FIELDS:
         value: Any = content.get(name)
         if name != "cv_rmse" or value is not None or name not in content:
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            check(name, "a finite number", number and math.isfinite(value))
+            check(name, "a finite number", type(value) in (int, float) and math.isfinite(value))
             check(name, "at least 0", name not in _NOT_NEGATIVE or value >= 0.0)
     count = content["count"]
-    check("slope", "above 0", content["slope"] > 0.0)
     whole = count >= LEAST_COUNT and count == int(count)
+    check("slope", "above 0", content["slope"] > 0.0)
     check("count", f"a whole number of at least {LEAST_COUNT}", whole)
     check("deepest", "above shallowest", content["deepest"] > content["shallowest"])
     values = {field: content[name] for name, field in _FIELDS.items()}
-    notes = notes_of(count, content["slope"])
-    return DepthRegression(**values, source=str(content.get("source", "")), notes=notes)
+    source = str(content.get("source", ""))
+    return DepthRegression(**values, source=source, notes=notes_of(count, content["slope"]))
+
+
+ENSEMBLE = "ensemble.npz"
+"""The file beside an adjusted model with the members of its ensemble."""
+
+
+def write_members(folder: Path, members: Members) -> None:
+    """Write members into a folder, as the arrays of `Members`, for ``numpy.load``."""
+    np.savez_compressed(folder / ENSEMBLE, **vars(members))
+
+
+def find_members(cameras: File) -> tuple[Path, Members] | None:
+    """Return the members beside a camera file, and their file; None if there is none.
+
+    It is in the folder of the adjustment: a model's own folder, or one of the two above it.
+    """
+    path = Path(cameras).resolve()
+    places = (at / ENSEMBLE for at in (path, *path.parents[:2]))
+    found = next((place for place in places if place.is_file()), None)
+    if found is None:
+        return None
+    from pcfix.adjust.precision import Members  # not quick to load
+
+    sentence = "is not an ensemble of an adjustment. Adjust again, or remove the file."
+    with refusing(found, "ensemble.damaged", sentence):
+        with np.load(found) as arrays:
+            values = {one.name: np.asarray(arrays[one.name]) for one in fields(Members)}
+        labels, lens_names = (tuple(values.pop(n).tolist()) for n in ("labels", "lens_names"))
+        m, k, p = len(values["turn"]), len(labels), len(lens_names)
+        shapes = {
+            **{"centres": (k, 3), "focal": (k,), "turn": (m, k, 3), "shift_m": (m, k, 3)},
+            **{"lens": (m, k, p), "water": (m, 7)},
+        }
+        for name, shape in shapes.items():
+            if values[name].shape != shape or not np.isfinite(values[name]).all():
+                raise ValueError(name)
+    return found, Members(labels=labels, lens_names=lens_names, **values)
