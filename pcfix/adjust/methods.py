@@ -14,9 +14,7 @@ import numpy as np
 
 from pcfix.adjust.block import (
     FIRST_SIGMA_PX,
-    Block,
     Material,
-    Progress,
     Unknowns,
     block_of,
     check_datum,
@@ -27,14 +25,14 @@ from pcfix.adjust.block import (
     ties_of_cloud,
     well_seen,
 )
-from pcfix.adjust.from_cloud import CloudBlock, adjust_cloud
+from pcfix.adjust.from_cloud import adjust_cloud
 from pcfix.adjust.from_ties import adjust_ties, default_lens
-from pcfix.adjust.precision import correlated, shape_notes, undetermined
+from pcfix.adjust.precision import undetermined
 from pcfix.adjust.problem import intersect_fixed
 from pcfix.adjust.result import Adjusted
-from pcfix.adjust.solve import reduced_at, solver
+from pcfix.adjust.solve import Progress, reduced_at, solver
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
-from pcfix.model import Cameras, FloatArray, GroundControl, IntArray, TiePoints, WaterSurface
+from pcfix.model import Cameras, FloatArray, GroundControl, TiePoints, WaterSurface
 from pcfix.options.survey import AdjustRules
 from pcfix.refract.choice import views_in_frame
 from pcfix.water.surface import surface_above
@@ -70,12 +68,7 @@ def adjust_block(
     cloud_xyz : array, shape (m, 3)
         Points of the cloud, in place of tie points.
     """
-    original, chooses_lens = material.original, False
-    lens: tuple[str, ...] = ()
-    if rules.lens_unknowns is not None:
-        lens = rules.lens_unknowns
-    elif material.calibrated is None:
-        lens, chooses_lens = default_lens(original.lenses or ()), True
+    original, water = material.original, material.water
     if cloud_xyz is not None:
         ties = ties_of_cloud(cloud_xyz, views_in_frame(cloud_xyz, original), original)
     if ties is None or len(ties.xyz) < LEAST_TIES:
@@ -84,16 +77,23 @@ def adjust_block(
             " --cloud'."
         )
         raise GeometryError("cameras.no_overlap", words, path=material.name)
+    # 1. What is free
+    lens: tuple[str, ...] = rules.lens_unknowns or ()
+    chooses_lens = rules.lens_unknowns is None and material.calibrated is None
+    if chooses_lens:
+        lens = default_lens(original.lenses or ())
     tilt = None if rules.sigma_tilt is None else float(np.tan(np.radians(rules.sigma_tilt)))
     stated = {"level": rules.sigma_level, "tilt": tilt, "index": rules.sigma_index}
     surface: dict[str, float] = dict.fromkeys(rules.free, np.inf)
     surface |= {name: sigma for name, sigma in stated.items() if sigma is not None}
     is_free = rules.datum == "free"
     unknowns = Unknowns(rules.poses, rules.fixed_images, lens, surface, free_network=is_free)
-    sigma_px, level_sigma_m = rules.sigma_image or FIRST_SIGMA_PX, surface.get("level", 0.0)
-    block = block_of(material, ties, sigma_px, level_sigma_m)
+
+    # 2. The block, without images that have too few observations
+    level_sigma_m = surface.get("level", 0.0)
+    block = block_of(material, ties, rules.sigma_image or FIRST_SIGMA_PX, level_sigma_m)
     check_datum(block, unknowns, material.no_gnss)
-    xyz, water = block.xyz[: len(ties.xyz)], material.water
+    xyz = block.xyz[: len(ties.xyz)]
     wet = len(xyz) if water is None else int((surface_above(water, xyz).height_m > xyz[:, 2]).sum())
     if wet < SMALL_WATER:
         words = (
@@ -101,8 +101,23 @@ def adjust_block(
             " adjust. Check the water level, or use an ordinary bundle adjustment."
         )
         raise GeometryError("water.below_points", words, wet=wet, points=len(xyz))
-    rows, notes = _well_seen(material.name, block)
+    rows, count, notes = well_seen(block), len(block.cameras), list[PcfixWarning]()
+    if len(rows) < 2:
+        words = (
+            f"{material.name}: only {len(rows)} of {count} images have enough observations for a"
+            " pose. Give a model with more tie points."
+        )
+        raise GeometryError("ties.few_images", words, path=material.name, images=len(rows))
+    if len(rows) < count:
+        lost = np.setdiff1d(np.arange(count), rows)
+        words = (
+            f"{len(lost)} of {count} images (first {block.cameras.labels[lost[0]]}) have too few"
+            " observations for a pose and were excluded."
+        )
+        notes.append(PcfixWarning("ties.few_in_image", words, images=len(lost)))
     block = restricted(block, rows)
+
+    # 3. The adjustment, and what its user should know
     if cloud_xyz is None:
         found = adjust_ties(
             block, unknowns, progress, sigma_px=rules.sigma_image, outliers=rules.outliers,
@@ -111,44 +126,23 @@ def adjust_block(
     else:
         surveyed = [] if material.control is None else [material.control.xyz]
         apparent = np.vstack([ties.xyz, *surveyed])
-        sets = [lens]
-        if chooses_lens:
-            sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), lens]))
-        given = CloudBlock(block, some_cameras(original, rows), apparent)
-        found = adjust_cloud(given, unknowns, sets, progress)
-    notes += [*_check_dry(water, found), *found.notes]
-    notes += [*undetermined(found.precision), *correlated(found.precision)]
+        sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), lens])) if chooses_lens else [lens]
+        cameras = some_cameras(original, rows)
+        found = adjust_cloud(block, cameras, apparent, unknowns, sets, progress)
+    notes += [*_land_notes(water, found), *found.notes]
+    bed_xy = found.xyz[found.is_wet & found.is_observed, :2]
+    reach_m = float(np.sqrt(np.var(bed_xy, axis=0).sum())) if len(bed_xy) else 0.0
+    notes += undetermined(found.precision, reach_m)
     if found.precision.members is None:
         words = (
             f"The block is too large ({len(block.cameras):,} images) for covariances of its points,"
             " so the correction cannot use the errors of the poses."
         )
         notes.append(PcfixWarning("adjust.too_large", words, images=len(block.cameras)))
-    on_bed = found.is_wet & np.isfinite(found.xyz).all(axis=1)
-    notes += shape_notes(found.precision, (found.xyz - found.problem.origin)[on_bed, :2])
     return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])
 
 
 # Checks of what goes in
-
-
-def _well_seen(name: str, block: Block) -> tuple[IntArray, list[PcfixWarning]]:
-    """Return the rows of the images that can be adjusted, and a warning about others."""
-    rows, count = well_seen(block), len(block.cameras)
-    if len(rows) < 2:
-        words = (
-            f"{name}: only {len(rows)} of {count} images have enough observations for a pose. Give"
-            " a model with more tie points."
-        )
-        raise GeometryError("ties.few_images", words, path=name, images=len(rows))
-    lost = np.setdiff1d(np.arange(count), rows)
-    if not len(lost):
-        return rows, []
-    words = (
-        f"{len(lost)} of {count} images (first {block.cameras.labels[lost[0]]}) have too few"
-        " observations for a pose and were excluded."
-    )
-    return rows, [PcfixWarning("ties.few_in_image", words, images=len(lost))]
 
 
 def check_images(
@@ -226,8 +220,8 @@ def check_marks(
 # Checks of what comes out
 
 
-def _check_dry(water: WaterSurface | None, found: Adjusted) -> list[PcfixWarning]:
-    """Check that there is land, which a free water surface needs."""
+def _land_notes(water: WaterSurface | None, found: Adjusted) -> list[PcfixWarning]:
+    """Return a warning if there is hardly any land; refuse that for a free water surface."""
     if water is None:
         return []
     above, count = int((found.is_observed & ~found.is_wet).sum()), int(found.is_observed.sum())
