@@ -22,7 +22,7 @@ from pcfix.adjust.normal import CAUCHY, HUBER, SQUARES, residuals
 from pcfix.adjust.precision import Precision, precision_of
 from pcfix.adjust.problem import Problem, Solution, prepare
 from pcfix.adjust.result import Adjusted, adjusted_of, sigma0_of
-from pcfix.adjust.shared_errors import common_errors, disagreement_of, weighed
+from pcfix.adjust.shared_errors import common_errors, disagreement_of
 from pcfix.adjust.solve import Progress, reduced_at, solve, solver
 from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.model import FloatArray, Lens
@@ -141,7 +141,7 @@ def _settled(
     points, whose standard deviations are given, get the right weight relative to the images.
     """
     if estimate:
-        problem = weighed(with_noise(problem, now, robust=False), now)
+        problem = with_noise(problem, now, robust=False)
     now = solve(problem, now, progress=progress)
     return problem, now, precision_of(problem, now, sigma0_of(problem, now), only_poses=True)
 

@@ -2,8 +2,7 @@
 
 An antenna's lever arm, another height datum or a wrong water level offset all GNSS positions from
 the projection centres alike. The block follows them, focal length and heights absorb the offset,
-and residuals hardly show it. The water level, control points and strips flown in both directions
-reveal it.
+and residuals hardly show it. The water level and control points reveal an offset of the heights.
 """
 
 from __future__ import annotations
@@ -285,47 +284,37 @@ FEW = 6
 BED_GSD = 1.5
 """Standard error of the heights of the bed, in ground pixels, that is worth a warning."""
 
-SIDES = (("to the right of", "to the left of"), ("ahead of", "behind"), ("above", "below"))
-"""Relative to the projection centres, with the top of the image ahead."""
 
+def height_offset(found: Adjusted) -> tuple[float, float] | None:
+    """Return how far the GNSS positions lie too high for a block, and the standard error, metres.
 
-def offset_of(found: Adjusted) -> tuple[FloatArray, FloatArray] | None:
-    """Return the offset of the GNSS with which a block would fit best, and its standard errors.
-
-    Both are to the right, ahead and up, shape (3,), metres. It is one more unknown of all
-    positions, estimated by one step from the solution. None if nothing is free.
+    It is one more unknown of all positions, estimated by one step from the solution. None if
+    nothing is free.
     """
-    problem, now, weight = found.problem, found.solution, found.block.gnss_weights
-    # axes of each image in the world: right, ahead, up
-    right = np.asarray(found.cameras.rotations)[:, 0] * [1.0, 1.0, 0.0]
-    right /= np.maximum(np.linalg.norm(right, axis=1), 1e-9)[:, None]
-    up = np.broadcast_to([0.0, 0.0, 1.0], right.shape)
-    axes = np.stack([right, np.cross(up, right), up], axis=1)
-    with_centres = np.zeros((len(weight), 6, 3))
-    with_centres[:, 3:] = weight[:, :, None] * axes.transpose(0, 2, 1)
-    matrix, right_side = reduced_at(problem, now)
-    others = np.zeros((problem.given.shared, 3))
-    taken_up = problem.spread(now.state).T @ np.vstack([with_centres.reshape(-1, 3), others])
+    problem, now, weight = found.problem, found.solution, found.block.gnss_weights[:, 2]
+    with_poses = np.zeros((len(weight), 6))
+    with_poses[:, 5] = weight
+    spread = problem.spread(now.state)
+    border = spread.T @ np.append(with_poses, np.zeros(problem.given.shared))
+    matrix, right = reduced_at(problem, now)
     solve_for = solver(matrix)
-    if solve_for is None or not taken_up.any():
+    if solve_for is None or not border.any():
         return None
-    own = np.einsum("kij,kj,klj->il", axes, weight, axes) + np.eye(3) / UNKNOWN_M**2
-    covariance = np.linalg.inv(own - taken_up.T @ solve_for(taken_up))
-    side = -np.einsum("kij,kj->i", axes, weight * np.nan_to_num(found.gnss_residual_m))
-    step = covariance @ (side - taken_up.T @ solve_for(right_side))
-    return step, max(found.sigma0, 1.0) * np.sqrt(np.diag(covariance))
+    # the poses and shared unknowns are eliminated
+    by_border, by_right = border @ solve_for(np.column_stack([border, right]))
+    variance = 1.0 / (weight.sum() + 1.0 / UNKNOWN_M**2 - by_border)
+    pull = -weight @ np.nan_to_num(found.gnss_residual_m[:, 2]) - by_right
+    return float(variance * pull), max(found.sigma0, 1.0) * float(np.sqrt(variance))
 
 
 def datum_notes(found: Adjusted) -> list[PcfixWarning]:
-    """Return warnings if GNSS positions are few for a cloud, or have a significant offset."""
+    """Return a warning if GNSS positions are few for a cloud, or too high or low for the block."""
     known = np.isfinite(found.gnss_residual_m)
     if not known.any() or found.unknowns.poses != "free" or found.unknowns.free_network:
         return []
     if found.source == "cloud":
-        count, control = (
-            int(known.all(axis=1).sum()),
-            sum(r.role == "control" for r in found.control),
-        )
+        control = sum(row.role == "control" for row in found.control)
+        count = int(known.all(axis=1).sum())
         if count + control >= FEW:
             return []
         words = (
@@ -334,24 +323,17 @@ def datum_notes(found: Adjusted) -> list[PcfixWarning]:
         )
         return [PcfixWarning("gnss.few", words, gnss=count, control=control)]
     stated_m = float(np.median(found.block.gnss_sigma_m[known]))
-    offset_m, sigma_m = offset_of(found) or (np.zeros(3), np.zeros(3))
-    is_off = np.abs(offset_m) > np.maximum(SIGMAS * sigma_m, OF_GNSS * stated_m)
-    if not is_off.any():
+    offset_m, sigma_m = height_offset(found) or (0.0, 0.0)
+    if abs(offset_m) <= max(SIGMAS * sigma_m, OF_GNSS * stated_m):
         return []
-    parts = [
-        f"{abs(m):.2f} m {side[int(m < 0.0)]} the projection centres (standard error {sigma:.2f} m)"
-        for m, sigma, side, off in zip(offset_m, sigma_m, SIDES, is_off, strict=True)
-        if off
-    ]
-    level = ""
-    if is_off[2] and found.water is not None:
-        level = f", or a water level that is too {'low' if offset_m[2] > 0.0 else 'high'}"
+    side, level = ("above", "low") if offset_m > 0.0 else ("below", "high")
+    water = "" if found.water is None else f", or a water level that is too {level}"
     words = (
-        f"The GNSS positions lie {' and '.join(parts)}: an antenna lever arm, another datum{level}."
-        " The block followed them. Correct them, or omit them if there are control points."
+        f"The GNSS positions lie {abs(offset_m):.2f} m {side} the projection centres (standard"
+        f" error {sigma_m:.2f} m): an antenna lever arm, another height datum{water}. The block"
+        " followed them. Correct them, or omit them if there are control points."
     )
-    more = {"offset_m": offset_m.tolist(), "sigma_m": sigma_m.tolist()}
-    return [PcfixWarning("gnss.offset_found", words, **more)]
+    return [PcfixWarning("gnss.offset_found", words, offset_m=offset_m, sigma_m=sigma_m)]
 
 
 def bed_notes(found: Adjusted) -> list[PcfixWarning]:
