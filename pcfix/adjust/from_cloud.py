@@ -85,8 +85,9 @@ def adjust_cloud(
     original: Cameras,
     apparent_xyz: FloatArray,
     unknowns: Unknowns,
-    lens_sets: list[tuple[str, ...]],
     progress: Progress | None = None,
+    *,
+    choose_lens: bool = False,
 ) -> Adjusted:
     """Adjust a block by the cloud that its original poses made.
 
@@ -98,10 +99,9 @@ def adjust_cloud(
         Those that made the cloud, in the same order.
     apparent_xyz : array, shape (m, 3)
         Where the cloud has the points of the block; control points as surveyed.
-    unknowns : Unknowns
-        Their lens parameters are replaced by one of `lens_sets`.
-    lens_sets : list
-        Each contains the one before it.
+    choose_lens : bool
+        Whether of the lens only the focal length is free, unless all parameters of the unknowns
+        lower the misfit of GNSS and control points by more than chance does.
     """
     _check(block, unknowns)
 
@@ -113,24 +113,25 @@ def adjust_cloud(
         except GeometryError:
             return None
 
-    chosen: Trial | None = None
+    lens, chosen, more = ("f",) if choose_lens else unknowns.lens, None, None
     for sigma_px in SIGMAS_PX:
-        chosen = trial(lens_sets[0], sigma_px) or chosen
+        chosen = trial(lens, sigma_px) or chosen
         if chosen is not None and chosen.misfit <= FITS * chosen.redundancy:
             break
     if chosen is None:
         raise _unsolved("no weight of the cloud gives a solution")
-    for lens in lens_sets[1:]:
-        more = trial(lens, chosen.sigma_px)
-        if more is not None:
-            extra = (len(lens) - len(chosen.problem.unknowns.lens)) * len(chosen.problem.groups)
-            gain = (chosen.misfit - more.misfit) / max(chosen.misfit / chosen.redundancy, 1.0)
-            chosen = more if gain > chdtri(extra, SURE) else chosen
+    if lens != unknowns.lens:
+        more = trial(unknowns.lens, chosen.sigma_px)
+    if more is not None:
+        extra = (len(unknowns.lens) - len(lens)) * len(chosen.problem.groups)
+        gain = (chosen.misfit - more.misfit) / max(chosen.misfit / chosen.redundancy, 1.0)
+        chosen = more if gain > chdtri(extra, SURE) else chosen
     # only GNSS and control points have noise; the precision is about that with tie points of the
     # standard deviation of the cloud
     sigma0 = float(np.sqrt(chosen.misfit / chosen.redundancy))
     known = precision_of(chosen.problem, chosen.found, max(sigma0, 1.0))
-    found = adjusted_of(chosen.problem, chosen.found, known, _notes(chosen, lens_sets), "cloud")
+    notes = _notes(chosen, unknowns.lens)
+    found = adjusted_of(chosen.problem, chosen.found, known, notes, "cloud")
     return replace(found, sigma0=sigma0, redundancy=chosen.redundancy)
 
 
@@ -150,10 +151,10 @@ def _check(block: Block, unknowns: Unknowns) -> None:
     raise GeometryError(f"adjust.cloud_{code}", words)
 
 
-def _notes(chosen: Trial, lens_sets: list[tuple[str, ...]]) -> list[PcfixWarning]:
+def _notes(chosen: Trial, lens: tuple[str, ...]) -> list[PcfixWarning]:
     """Return what was decided, and a warning if the points stand poorly for tie points."""
     count, free = int(chosen.problem.block.start[-1]), chosen.problem.unknowns.lens
-    fixed = [name for name in lens_sets[-1] if name not in free]
+    fixed = [name for name in lens if name not in free]
     words = (
         f"No tie points: {count:,} images of points of the cloud were used with a standard"
         f" deviation of {chosen.sigma_px:g} px. Lens parameters free: {', '.join(free) or 'none'}."

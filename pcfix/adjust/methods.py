@@ -125,9 +125,10 @@ def adjust_block(
     else:
         surveyed = [] if material.control is None else [material.control.xyz]
         apparent = np.vstack([ties.xyz, *surveyed])
-        sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), lens])) if chooses_lens else [lens]
-        cameras = some_cameras(original, rows)
-        found = adjust_cloud(block, cameras, apparent, unknowns, sets, progress)
+        found = adjust_cloud(
+            block, some_cameras(original, rows), apparent, unknowns, progress,
+            choose_lens=chooses_lens,
+        )  # fmt: skip
     notes += [*_land_notes(water, found), *found.notes]
     bed_xy = found.xyz[found.is_wet & found.is_observed, :2]
     reach_m = float(np.sqrt(np.var(bed_xy, axis=0).sum())) if len(bed_xy) else 0.0

@@ -342,30 +342,26 @@ def _on_surfaces(problem: Problem, now: Solution) -> list[Plain]:
 
 
 def _poses(a: Adjusted) -> Plain:
-    moved = a.cameras.centres - a.block.cameras.centres
-    far = np.linalg.norm(moved, axis=1)
+    far = np.linalg.norm(a.cameras.centres - a.block.cameras.centres, axis=1)
     before, after = np.asarray(a.block.cameras.rotations), np.asarray(a.cameras.rotations)
-    turned = np.degrees(Rotation.from_matrix(after @ before.transpose(0, 2, 1)).magnitude())
+    turned = Rotation.from_matrix(after @ before.transpose(0, 2, 1)).magnitude()
     return {
-        "moved_mean_m": moved.mean(axis=0),
         "moved_rms_m": rms(far),
         "moved_largest_m": far.max(),
         "moved_largest_image": a.cameras.labels[int(far.argmax())],
-        "turned_rms_deg": rms(turned),
-        "turned_largest_deg": turned.max(),
+        "turned_rms_deg": rms(np.degrees(np.asarray(turned))),
     }
 
 
 def _precision(p: Precision) -> Plain:
     moves = p.pose_covariance.any(axis=(1, 2))
-    found: Plain = {"images": moves.sum()}
-    for name, values in (("centre", p.centre_sigma_m), ("angle", p.angle_sigma_deg)):
-        unit, known = "m" if name == "centre" else "deg", values[moves]
-        found[f"{name}_mean_{unit}"] = known.mean(axis=0) if len(known) else None
-        found[f"{name}_largest_{unit}"] = known.max(axis=0) if len(known) else None
-    found["shared"] = [row._asdict() for row in p.shared]
-    found["correlation"] = p.correlation
-    return found
+    return {
+        "images": moves.sum(),
+        "centre_mean_m": mean(p.centre_sigma_m[moves]),
+        "angle_mean_deg": mean(p.angle_sigma_deg[moves]),
+        "shared": [row._asdict() for row in p.shared],
+        "correlation": p.correlation,
+    }
 
 
 def _gnss(a: Adjusted) -> Plain | None:

@@ -138,11 +138,11 @@ def test_values(adjusted):
     assert values["precision"]["images"] == 2
     # standard errors 1, 2, 3 cm of one pose, twice these of the other
     assert values["precision"]["centre_mean_m"] == pytest.approx([0.015, 0.03, 0.045])
-    assert values["precision"]["angle_largest_deg"] == pytest.approx(
-        np.degrees([0.002, 0.004, 0.006])
+    assert values["precision"]["angle_mean_deg"] == pytest.approx(
+        np.degrees([0.0015, 0.003, 0.0045])
     )
     assert values["poses"]["moved_rms_m"] == pytest.approx(0.3)
-    assert values["poses"]["turned_largest_deg"] == 0.0
+    assert values["poses"]["turned_rms_deg"] == 0.0
 
 
 def bare(adjusted):
