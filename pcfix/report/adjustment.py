@@ -31,7 +31,7 @@ _FACTS: RowTable = (
      " ({poses[moved_largest_image]}), rotated by {poses[turned_rms_deg]:.4f} deg (RMS)", "moved"),
     ("", "centres known to {precision[centre_mean_m]:z.4f} m (X, Y, Z), angles to"
      " {precision[angle_mean_deg]:z.4f} deg (mean standard errors)", "is_precise"),
-    ("Bed", "heights known to {bed_m:.3f} m (standard error)", "bed_m"),
+    ("Bed", "heights known to {bed_m:.3f} m (standard error{bed_if})", "bed_m"),
     ("Observations", "{o[used]:,} {kind} used, {o[left_out]:,} excluded ({o_share})", "o"),
     ("Fit", "sigma0 {sigma0:.3f}, redundancy {redundancy:,}, {rounds} rounds, {steps} steps",
      "images"),
@@ -125,6 +125,8 @@ def _facts(d: Plain) -> Rows:
         "free": f"free{fixed_images}{network}", "fixed": "fixed",
         "similarity": "shifted, rotated and scaled together",
     }  # fmt: skip
+    bed_if = ", if the fixed poses are right" if d["images_fixed"] else ""
+    bed_if = ", if the block is not bent" if poses == "similarity" else bed_if
     return filled(_FACTS, d | {
         "poses_words": words[poses], "o": o, "kind": kinds[d["source"]],
         "o_share": share(o["left_out"], o["used"] + o["left_out"]),
@@ -132,6 +134,7 @@ def _facts(d: Plain) -> Rows:
         "lens_is_fixed": not d["lens"], "held": held, "no_water": water is None,
         "moved": poses != "fixed" and d["poses"]["moved_rms_m"],
         "is_precise": poses != "fixed" and d["precision"]["images"],
+        "bed_if": bed_if,
         "bed_m": (d["residuals"]["water"]["sigma_xyz_m"] or [None])[-1],
         "surveyed": [
             {"role": role.capitalize(), "count": len(d[role]["points"]), **d[role]}
