@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -95,25 +95,6 @@ both."""
 
 FEW_IMAGES = 5.0
 """Images per lens, on average, below which the lenses of one sensor share their corrections."""
-
-
-class LogRow(NamedTuple):
-    """An adjustment after some steps of a round."""
-
-    round: int
-    steps: int
-    observations: int
-    rms_px: float
-
-    def __str__(self) -> str:
-        return (
-            f"round {self.round}, step {self.steps}, {self.observations:,} observations,"
-            f" {self.rms_px:.3f} px"
-        )
-
-
-Progress = Callable[[LogRow], None]
-"""Is called after each step."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,8 +50,6 @@ LEAST_POINTS = 30
 """Tie points under water that are needed."""
 PARTS = 5
 """Of the area, along x and along y, for the jackknife."""
-LEAST_BEND = 1e-3
-"""Refraction that straight rays cannot fit, as a share of the squared residuals."""
 OUTLIERS = 0.05
 """Share of the tie points that is excluded, those with the worst residuals."""
 SHARE, MOST_SHARE, MOST_SIGMA = 0.4, 2.0, 0.15
@@ -167,29 +165,25 @@ def tie_point_sign(straight: Intersected, refracted: Intersected, depth_m: Float
     is noise. So b = -(r . d) / (d . d) is 0 or 1, whatever the noise. Its standard error is that of
     a jackknife over parts of the area, as errors of a pose are common to neighbours.
     """
-    name, redundancy = "tie points", straight.redundancy
+    redundancy = straight.redundancy
     worst = np.maximum(straight.squares, refracted.squares) / np.maximum(redundancy, 1)
     good = np.isfinite(worst) & (redundancy > 0) & np.isfinite(depth_m)
     if good.any():
         good &= worst <= np.quantile(worst[good], 1.0 - OUTLIERS)
     wet = good & (depth_m > 0.0)
     if wet.sum() < LEAST_POINTS:
-        return Sign(name, None, f"only {wet.sum()} tie points under water")
+        return Sign("tie points", None, f"only {wet.sum()} tie points under water")
     d = straight.residual_px - refracted.residual_px
     over = straight.sums(-(refracted.residual_px * d).sum(axis=1))[wet]
     under = straight.sums((d * d).sum(axis=1))[wet]
-    if under.sum() < LEAST_BEND * straight.squares[wet].sum():
-        why = "straight rays fit as well as refracted ones: too shallow, or only nadir rays"
-        return Sign(name, None, why)
     # as many points in each part of the area along x and along y; each is left out in turn
     ranks = np.argsort(np.argsort(straight.xyz[wet, :2], axis=0, kind="stable"), axis=0)
     x, y = (ranks * PARTS // len(ranks)).T
     part = np.unique(x * PARTS + y, return_inverse=True)[1].ravel()
-    a, b = np.bincount(part, over), np.bincount(part, under)
-    without, g = (a.sum() - a) / np.maximum(b.sum() - b, 1e-300), len(a)
-    share, sigma = float(a.sum() / b.sum()), np.inf
-    if g > 1:
-        sigma = float(np.sqrt((g - 1) / g * ((without - without.mean()) ** 2).sum()))
+    a, b, g = np.bincount(part, over), np.bincount(part, under), int(part.max()) + 1
+    without = (a.sum() - a) / np.maximum(b.sum() - b, 1e-300)
+    share = float(a.sum() / max(b.sum(), 1e-300))
+    sigma = float(np.sqrt((g - 1) / g * ((without - without.mean()) ** 2).sum()))
     # standard deviations of an image coordinate
     free = redundancy[wet].sum()
     s_px, r_px = (float(np.sqrt(one.squares[wet].sum() / free)) for one in (straight, refracted))
@@ -202,7 +196,7 @@ def tie_point_sign(straight: Intersected, refracted: Intersected, depth_m: Float
         f" {sigma:.2f} (limit {SHARE:g})"
     )
     speaks = None if sigma > MOST_SIGMA else _exceeds(share, sigma, SHARE)
-    return Sign(name, speaks, words, figures)
+    return Sign("tie points", speaks, words, figures)
 
 
 # GNSS
@@ -228,9 +222,14 @@ def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, undon
     centres, off_m = centres[undone.row], off_m[undone.row]
     rows = np.isfinite(off_m)
     y, base = off_m[rows], similarity_gradients(centres - centres.mean(axis=0))[rows]
-    clear = _rest((centres - undone.cameras.centres)[rows], base)
+
+    def rest(values: FloatArray, columns: FloatArray) -> FloatArray:
+        """Return the residuals of a least squares fit."""
+        return np.asarray(values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0])
+
+    clear = rest((centres - undone.cameras.centres)[rows], base)
     share = float(clear @ y) / max(float(clear @ clear), 1e-300)
-    left = _rest(y, np.column_stack([base, clear]))
+    left = rest(y, np.column_stack([base, clear]))
     noise = float(np.linalg.norm(left) / np.sqrt(max(len(y) - 8, 1)))
     stated = sigma_m[undone.row][rows]
     if np.isfinite(stated).any() and np.nanmedian(stated) < MOST_STATED_M:
@@ -245,11 +244,6 @@ def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, undon
     speaks = _exceeds(share, sigma, SHARE) if is_useful else None
     figures = {"share": share, "sigma_share": sigma, "rms_m": rms}
     return Sign("GNSS", speaks, words, figures, undone.error_m)
-
-
-def _rest(y: FloatArray, columns: FloatArray) -> FloatArray:
-    """Return the residuals of a least squares fit."""
-    return np.asarray(y - columns @ np.linalg.lstsq(columns, y, rcond=None)[0])
 
 
 # Surveys, and the cloud itself
@@ -376,20 +370,22 @@ def _signs_of_rays(
     signs, apparent = _sign_of_ties(cameras, water, n, ties)
     off = np.full((len(cameras), 3), np.nan) if gnss is None else cameras.centres - gnss.xyz
     is_known = int(np.isfinite(off).sum()) >= LEAST_COORDINATES
-    is_open = not in_passing or all(sign.speaks is None for sign in signs)
-    if not any(sign.speaks for sign in signs) and not (is_known and is_open):
+    is_absorbed, is_decided = any(s.speaks for s in signs), any(s.speaks is False for s in signs)
+    if not is_absorbed and (not is_known or (in_passing and is_decided)):
         return signs
     from pcfix.adjust.from_cloud import undo_absorption  # not quick to load
 
     count, most = len(cameras), QUICK_IMAGES if in_passing else MOST_IMAGES
     wanted = max(CLOUD_POINTS, POINTS_PER_IMAGE * count)
+    if (
+        apparent is None and view is not None and count <= most
+    ):  # points of the cloud, evenly spread over it
+        every = max(1, view.points // wanted)
+        apparent = np.vstack([np.zeros((0, 3)), *(one.xyz[::every] for one in view.chunks())])
     try:
-        if count > most or (apparent is None and view is None):
+        if count > most or apparent is None:
             why = f"{count} images (limit {most})" if count > most else "no cloud"
             raise GeometryError("adjust.no_pattern", why)
-        if apparent is None:  # points of the cloud, evenly spread over it
-            every = max(1, view.points // wanted)
-            apparent = np.vstack([np.zeros((0, 3)), *(one.xyz[::every] for one in view.chunks())])
         true = undo_absorption(apparent[:: max(1, len(apparent) // wanted)], cameras, water, n)
     except GeometryError as error:
         words = f"the pattern of absorbed refraction is unknown ({error})"

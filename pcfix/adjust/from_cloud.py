@@ -31,15 +31,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from pcfix.adjust.block import (
-    Block,
-    Progress,
-    Unknowns,
-    plain_block,
-    some_cameras,
-    ties_of_cloud,
-    true_start,
-)
+from pcfix.adjust.block import Block, Unknowns, plain_block, some_cameras, ties_of_cloud, true_start
 from pcfix.adjust.collinearity import SHARED
 from pcfix.adjust.normal import UNDAMPED, linearised, point_steps, residuals
 from pcfix.adjust.precision import precision_of
@@ -47,13 +39,12 @@ from pcfix.adjust.problem import (
     Problem,
     Solution,
     intersect_fixed,
-    log_row,
     prepare,
     solved_cameras,
     survey_cost,
 )
 from pcfix.adjust.result import Adjusted, adjusted_of
-from pcfix.adjust.solve import moved_by, reduced_at
+from pcfix.adjust.solve import Progress, moved_by, reduced_at, show
 from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.model import Cameras, FloatArray, IntArray, WaterSurface
 from pcfix.refract.choice import views_in_frame
@@ -76,18 +67,6 @@ CLOSE_M = 1e-7
 LARGE_STEP_M = 1e4
 
 
-class CloudBlock(NamedTuple):
-    """A block whose tie points are points of the cloud.
-
-    `original` are the cameras that made the cloud; those of the block are the start. `apparent_xyz`
-    has a row per point of the block, control points included.
-    """
-
-    block: Block
-    original: Cameras
-    apparent_xyz: FloatArray
-
-
 class Trial(NamedTuple):
     """The adjustment with one weight of the cloud, and how GNSS and control points fit it.
 
@@ -102,43 +81,56 @@ class Trial(NamedTuple):
 
 
 def adjust_cloud(
-    given: CloudBlock,
+    block: Block,
+    original: Cameras,
+    apparent_xyz: FloatArray,
     unknowns: Unknowns,
-    lens_sets: list[tuple[str, ...]],
     progress: Progress | None = None,
+    *,
+    choose_lens: bool = False,
 ) -> Adjusted:
     """Adjust a block by the cloud that its original poses made.
 
-    The lens parameters of the unknowns are replaced by one of `lens_sets`, each of which contains
-    the one before it.
+    Parameters
+    ----------
+    block : Block
+        Its tie points are points of the cloud; its cameras are the start.
+    original : Cameras
+        Those that made the cloud, in the same order.
+    apparent_xyz : array, shape (m, 3)
+        Where the cloud has the points of the block; control points as surveyed.
+    choose_lens : bool
+        Whether of the lens only the focal length is free, unless all parameters of the unknowns
+        lower the misfit of GNSS and control points by more than chance does.
     """
-    _check(given.block, unknowns)
-    unknowns = replace(unknowns, lens=lens_sets[0])
-    trials: list[Trial] = []
-    for sigma in SIGMAS_PX:
+    _check(block, unknowns)
+
+    def trial(lens: tuple[str, ...], sigma_px: float) -> Trial | None:
+        """Return an adjustment; None if it fails."""
         try:
-            trials.append(_trial(given, unknowns, sigma, progress))
+            of_lens = replace(unknowns, lens=lens)
+            return _trial(block, original, apparent_xyz, of_lens, sigma_px, progress)
         except GeometryError:
-            if not trials and sigma == SIGMAS_PX[-1]:
-                raise
-        else:
-            if trials[-1].misfit / trials[-1].redundancy <= FITS:
-                break
-    chosen = trials[-1]
-    for names in lens_sets[1:]:
-        try:
-            more = _trial(given, replace(unknowns, lens=names), chosen.sigma_px, progress)
-        except GeometryError:
-            continue
-        extra = len(names) - len(chosen.problem.unknowns.lens)
+            return None
+
+    lens, chosen, more = ("f",) if choose_lens else unknowns.lens, None, None
+    for sigma_px in SIGMAS_PX:
+        chosen = trial(lens, sigma_px) or chosen
+        if chosen is not None and chosen.misfit <= FITS * chosen.redundancy:
+            break
+    if chosen is None:
+        raise _unsolved("no weight of the cloud gives a solution")
+    if lens != unknowns.lens:
+        more = trial(unknowns.lens, chosen.sigma_px)
+    if more is not None:
+        extra = (len(unknowns.lens) - len(lens)) * len(chosen.problem.groups)
         gain = (chosen.misfit - more.misfit) / max(chosen.misfit / chosen.redundancy, 1.0)
-        if gain > chdtri(extra * len(chosen.problem.groups), SURE):
-            chosen = more
+        chosen = more if gain > chdtri(extra, SURE) else chosen
     # only GNSS and control points have noise; the precision is about that with tie points of the
     # standard deviation of the cloud
     sigma0 = float(np.sqrt(chosen.misfit / chosen.redundancy))
     known = precision_of(chosen.problem, chosen.found, max(sigma0, 1.0))
-    notes = _notes(chosen, lens_sets)
+    notes = _notes(chosen, unknowns.lens)
     found = adjusted_of(chosen.problem, chosen.found, known, notes, "cloud")
     return replace(found, sigma0=sigma0, redundancy=chosen.redundancy)
 
@@ -159,15 +151,15 @@ def _check(block: Block, unknowns: Unknowns) -> None:
     raise GeometryError(f"adjust.cloud_{code}", words)
 
 
-def _notes(chosen: Trial, lens_sets: list[tuple[str, ...]]) -> list[PcfixWarning]:
+def _notes(chosen: Trial, lens: tuple[str, ...]) -> list[PcfixWarning]:
     """Return what was decided, and a warning if the points stand poorly for tie points."""
     count, free = int(chosen.problem.block.start[-1]), chosen.problem.unknowns.lens
-    fixed = dict.fromkeys(name for names in lens_sets for name in names if name not in free)
+    fixed = [name for name in lens if name not in free]
     words = (
         f"No tie points: {count:,} images of points of the cloud were used with a standard"
         f" deviation of {chosen.sigma_px:g} px. Lens parameters free: {', '.join(free) or 'none'}."
     )
-    values = {"free": list(free), "fixed": list(fixed), "sigma_px": chosen.sigma_px}
+    values = {"free": list(free), "fixed": fixed, "sigma_px": chosen.sigma_px}
     notes = [PcfixWarning("adjust.by_cloud", words, **values)]
     if chosen.sigma_px >= POOR_PX:
         words = (
@@ -180,16 +172,17 @@ def _notes(chosen: Trial, lens_sets: list[tuple[str, ...]]) -> list[PcfixWarning
 
 
 def _trial(
-    given: CloudBlock, unknowns: Unknowns, sigma_px: float, progress: Progress | None
-) -> Trial:
-    m, owner = given.block.tie_points, given.block.owner
-    block = replace(given.block, sigma_px=np.where(owner < m, sigma_px, given.block.sigma_px))
+    block: Block, original: Cameras, apparent_xyz: FloatArray, unknowns: Unknowns, sigma_px: float,
+    progress: Progress | None = None,
+) -> Trial:  # fmt: skip
+    m, owner = block.tie_points, block.owner
+    block = replace(block, sigma_px=np.where(owner < m, sigma_px, block.sigma_px))
     problem, start = prepare(block, unknowns)
     # the Jacobians of the straight collinearity at the original solution
-    before, at_rest = prepare(replace(block, cameras=given.original), unknowns)
+    before, at_rest = prepare(replace(block, cameras=original), unknowns)
     o, nowhere = len(owner), np.zeros(len(block.xyz), np.bool_)
     dry = before.given._replace(wet=nowhere, weight=np.ones(o))
-    apparent = np.ascontiguousarray(given.apparent_xyz - before.origin)
+    apparent = np.ascontiguousarray(apparent_xyz - before.origin)
     rows = linearised(at_rest.state._replace(xyz=apparent), dry, UNDAMPED, 0, len(apparent))
     tests = np.zeros((o, 2, SHARED + dry.shared))
     tests[rows.observation[rows.is_image]] = rows.columns[rows.is_image]
@@ -223,8 +216,8 @@ def solve_unaware(
     """
     given = problem.given._replace(tests=tests)
     tested = replace(problem, given=given)
-    now, log, size = start, list(start.log), np.inf
-    for number in range(1, MAX_STEPS + 1):
+    now, size = replace(start, rounds=1), np.inf
+    for step_number in range(1, MAX_STEPS + 1):
         # the matrix is not symmetric
         matrix, right = reduced_at(tested, now)
         scale = 1.0 / np.sqrt(np.maximum(np.abs(matrix.diagonal()), 1e-300))
@@ -237,13 +230,10 @@ def solve_unaware(
         size = float(np.abs(points).max(initial=0.0)) if np.isfinite(points).all() else np.inf
         if moved is None or not size < LARGE_STEP_M:
             break
-        now = moved
-        row = log_row(problem, now.state, 1, number)
-        log.append(row)
-        if progress is not None:
-            progress(row)
+        now = replace(moved, steps=step_number)
+        show(progress, problem, now)
         if size < CLOSE_M:
-            return replace(now, cost=survey_cost(problem, now), log=log)
+            return replace(now, cost=survey_cost(problem, now))
     raise _unsolved(f"the steps do not converge (last step {size:.2g} m)")
 
 
@@ -299,7 +289,7 @@ def undo_absorption(
         gnss_xyz=cameras.centres,
         gnss_sigma_m=np.full((len(cameras), 3), OWN_SIGMA_M),
     )
-    trial = _trial(CloudBlock(block, cameras, ties.xyz), Unknowns(lens=("f",)), SIGMA_PX, None)
+    trial = _trial(block, cameras, ties.xyz, Unknowns(lens=("f",)), SIGMA_PX)
     problem, found = trial.problem, trial.found
     higher = found.state.xyz[:, 2] + problem.origin[2] - intersect_fixed(block).xyz[:, 2]
     is_land = ~wet if (~wet & np.isfinite(higher)).any() else wet

@@ -17,15 +17,15 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
-from pcfix.adjust.block import CODES, LEAST_VIEWS, NAMES, Block, Progress, Unknowns, usable_codes
+from pcfix.adjust.block import CODES, LEAST_VIEWS, NAMES, Block, Unknowns, usable_codes
 from pcfix.adjust.normal import CAUCHY, HUBER, SQUARES, residuals
 from pcfix.adjust.precision import Precision, precision_of
 from pcfix.adjust.problem import Problem, Solution, prepare
 from pcfix.adjust.result import Adjusted, adjusted_of, sigma0_of
-from pcfix.adjust.shared_errors import common_errors, disagreement_of, weighed
-from pcfix.adjust.solve import reduced_at, solve, solver
+from pcfix.adjust.shared_errors import common_errors, disagreement_of
+from pcfix.adjust.solve import Progress, reduced_at, solve, solver
 from pcfix.errors import GeometryError, PcfixWarning
-from pcfix.model import BoolArray, FloatArray, Lens
+from pcfix.model import FloatArray, Lens
 
 ROUGHLY = 1e-4
 """Relative gain of a step that ends the first, robust rounds."""
@@ -34,7 +34,7 @@ OUTLIER_SIGMAS = 4.0
 """Longer residuals are outliers: three good ones in 10,000."""
 
 LEAST_SHARE = 0.5
-"""Share of the observations that must fit."""
+"""Share of the observations that must be in front of their cameras, and no outliers."""
 
 MAD_TO_SIGMA = 1.4826
 OUTLIER_ROUNDS = 3
@@ -64,18 +64,26 @@ def adjust_ties(
         the residuals freed; else exactly those of the unknowns are free.
     """
     problem, now = prepare(block, unknowns)
-    in_front = np.asarray(np.isfinite(residuals(now.state, problem.given)).all(axis=1))
-    _check_most(
-        problem, in_front, "adjust.behind",
-        "tie point observations are in front of their cameras at the start. Check that poses and"
-        " tie points belong to one model, and the camera axes.",
-    )  # fmt: skip
+    counted = np.isfinite(block.sigma_px) & problem.of_ties
+    is_ahead = np.isfinite(residuals(now.state, problem.given)).all(axis=1)
+    ahead, total = int((counted & is_ahead).sum()), int(counted.sum())
+    if ahead < LEAST_SHARE * total:
+        words = (
+            f"Only {ahead:,} of {total:,} tie point observations are in front of their cameras at"
+            " the start. Check that poses and tie points belong to one model, and the camera axes."
+        )
+        raise GeometryError("adjust.behind", words, good=ahead, observations=total)
     estimate, notes = sigma_px is None, list[PcfixWarning]()
     clean, now = _cleaned(problem, now, estimate, outliers, progress)
+    if clean.used[counted].mean() < LEAST_SHARE:
+        words = (
+            "Most tie point observations fit no poses near the given ones. Check that tie points"
+            " and poses belong to one model, and the water level; or align the images again."
+        )
+        raise GeometryError("adjust.not_converged", words)
     problem, now, precision = _settled(clean, now, estimate, progress)
     if choose_lens:
         weak = weak_lens_parameters(problem, now, precision)
-        kept = [name for name in unknowns.lens if name not in weak]
         more = missing_lens_parameters(problem, now, sigma0_of(problem, now))
         if more:
             words = f"Tests of the residuals freed {', '.join(more)} of the lens."
@@ -84,11 +92,11 @@ def adjust_ties(
             words = f"The block does not determine {', '.join(weak)} of the lens; they were fixed."
             notes.append(PcfixWarning("adjust.weak_lens", words, fixed=weak))
         if weak or more:
-            clean, now = _with_lens(clean, now, (*kept, *more), outliers, progress)
+            lens = (*(name for name in unknowns.lens if name not in weak), *more)
+            clean, now = _with_lens(clean, now, lens, outliers, progress)
             problem, now, precision = _settled(clean, now, estimate, progress)
     factor = disagreement_of(problem, now, precision) * common_errors(problem, precision)
     precision = precision_of(problem, now, precision.sigma0, factor)
-    counted = np.isfinite(block.sigma_px) & problem.of_ties
     share = 1.0 - float(problem.used[counted].mean())
     if share >= MANY_OUT:
         words = (
@@ -101,6 +109,9 @@ def adjust_ties(
     return adjusted_of(problem, now, precision, notes, "tie points")
 
 
+# The robust rounds
+
+
 def _cleaned(
     problem: Problem, now: Solution, estimate: bool, outliers: bool, progress: Progress | None
 ) -> tuple[Problem, Solution]:
@@ -109,31 +120,16 @@ def _cleaned(
         now = solve(problem, now, HUBER, progress, close=ROUGHLY)
     if estimate:
         problem = with_noise(problem, now)
-    if not outliers:
-        return problem, now
-    for number in range(OUTLIER_ROUNDS):
+    for number in range(OUTLIER_ROUNDS if outliers else 0):
         loss = CAUCHY if number == 0 else SQUARES
         now = solve(problem, now, loss, progress, close=ROUGHLY)
         before = problem.used
         problem = without_outliers(problem, now)
-        _check_most(
-            problem, problem.used, "adjust.not_converged",
-            "tie point observations fit any poses near the given ones. Check that tie points and"
-            " poses belong to one model, and the water level; or align the images again.",
-        )  # fmt: skip
         if estimate:
             problem = with_noise(problem, now)
         if number and (problem.used == before).all():
             break
     return problem, now
-
-
-def _check_most(problem: Problem, good: BoolArray, code: str, what: str) -> None:
-    """Refuse a block in which too few observations of tie points are good."""
-    counts = np.isfinite(problem.block.sigma_px) & problem.of_ties
-    n, total = int((counts & good).sum()), int(counts.sum())
-    if n < LEAST_SHARE * total:
-        raise GeometryError(code, f"Only {n:,} of {total:,} {what}", good=n, observations=total)
 
 
 def _settled(
@@ -145,7 +141,7 @@ def _settled(
     points, whose standard deviations are given, get the right weight relative to the images.
     """
     if estimate:
-        problem = weighed(with_noise(problem, now, robust=False), now)
+        problem = with_noise(problem, now, robust=False)
     now = solve(problem, now, progress=progress)
     return problem, now, precision_of(problem, now, sigma0_of(problem, now), only_poses=True)
 
@@ -185,16 +181,16 @@ def _with_lens(
     progress: Progress | None,
 ) -> tuple[Problem, Solution]:  # fmt: skip
     """Return the problem with other lens parameters, and its outliers chosen again."""
+    weight = problem.given.weight
     wide, start = prepare(problem.block, replace(problem.unknowns, lens=lens))
-    wide = wide.weighted(problem.given.weight)
-    start = replace(start, state=start.state._replace(xyz=now.state.xyz), log=now.log)
-    start = solve(wide, start, progress=progress, close=ROUGHLY)
-    if not outliers:
-        return wide, start
-    used = problem.given.weight[problem.of_ties].max(initial=0.0)
-    ties = problem.of_ties & np.isfinite(problem.block.sigma_px)
-    wide = wide.weighted(np.where(ties, used, wide.given.weight))
-    return without_outliers(wide, start), start
+    state = start.state._replace(xyz=now.state.xyz)
+    start = replace(start, state=state, rounds=now.rounds, steps=now.steps)
+    now = solve(wide.weighted(weight), start, progress=progress, close=ROUGHLY)
+    if outliers:
+        ties = problem.of_ties & np.isfinite(problem.block.sigma_px)
+        weight = np.where(ties, weight[problem.of_ties].max(initial=0.0), weight)
+        return without_outliers(wide.weighted(weight), now), now
+    return wide.weighted(weight), now
 
 
 # Which lens parameters are free

@@ -2,8 +2,7 @@
 
 An antenna's lever arm, another height datum or a wrong water level offset all GNSS positions from
 the projection centres alike. The block follows them, focal length and heights absorb the offset,
-and residuals hardly show it. The water level, control points and strips flown in both directions
-reveal it.
+and residuals hardly show it. The water level and control points reveal an offset of the heights.
 """
 
 from __future__ import annotations
@@ -14,9 +13,7 @@ import numpy as np
 
 from pcfix.adjust.block import (
     FIRST_SIGMA_PX,
-    Block,
     Material,
-    Progress,
     Unknowns,
     block_of,
     check_datum,
@@ -27,14 +24,14 @@ from pcfix.adjust.block import (
     ties_of_cloud,
     well_seen,
 )
-from pcfix.adjust.from_cloud import CloudBlock, adjust_cloud
+from pcfix.adjust.from_cloud import adjust_cloud
 from pcfix.adjust.from_ties import adjust_ties, default_lens
-from pcfix.adjust.precision import correlated, shape_notes, undetermined
+from pcfix.adjust.precision import undetermined
 from pcfix.adjust.problem import intersect_fixed
 from pcfix.adjust.result import Adjusted
-from pcfix.adjust.solve import reduced_at, solver
+from pcfix.adjust.solve import Progress, reduced_at, solver
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
-from pcfix.model import Cameras, FloatArray, GroundControl, IntArray, TiePoints, WaterSurface
+from pcfix.model import Cameras, FloatArray, GroundControl, TiePoints, WaterSurface
 from pcfix.options.survey import AdjustRules
 from pcfix.refract.choice import views_in_frame
 from pcfix.water.surface import surface_above
@@ -70,12 +67,7 @@ def adjust_block(
     cloud_xyz : array, shape (m, 3)
         Points of the cloud, in place of tie points.
     """
-    original, chooses_lens = material.original, False
-    lens: tuple[str, ...] = ()
-    if rules.lens_unknowns is not None:
-        lens = rules.lens_unknowns
-    elif material.calibrated is None:
-        lens, chooses_lens = default_lens(original.lenses or ()), True
+    original, water = material.original, material.water
     if cloud_xyz is not None:
         ties = ties_of_cloud(cloud_xyz, views_in_frame(cloud_xyz, original), original)
     if ties is None or len(ties.xyz) < LEAST_TIES:
@@ -84,16 +76,23 @@ def adjust_block(
             " --cloud'."
         )
         raise GeometryError("cameras.no_overlap", words, path=material.name)
+    # 1. What is free
+    lens: tuple[str, ...] = rules.lens_unknowns or ()
+    chooses_lens = rules.lens_unknowns is None and material.calibrated is None
+    if chooses_lens:
+        lens = default_lens(original.lenses or ())
     tilt = None if rules.sigma_tilt is None else float(np.tan(np.radians(rules.sigma_tilt)))
     stated = {"level": rules.sigma_level, "tilt": tilt, "index": rules.sigma_index}
     surface: dict[str, float] = dict.fromkeys(rules.free, np.inf)
     surface |= {name: sigma for name, sigma in stated.items() if sigma is not None}
     is_free = rules.datum == "free"
     unknowns = Unknowns(rules.poses, rules.fixed_images, lens, surface, free_network=is_free)
-    sigma_px, level_sigma_m = rules.sigma_image or FIRST_SIGMA_PX, surface.get("level", 0.0)
-    block = block_of(material, ties, sigma_px, level_sigma_m)
+
+    # 2. The block, without images that have too few observations
+    level_sigma_m = surface.get("level", 0.0)
+    block = block_of(material, ties, rules.sigma_image or FIRST_SIGMA_PX, level_sigma_m)
     check_datum(block, unknowns, material.no_gnss)
-    xyz, water = block.xyz[: len(ties.xyz)], material.water
+    xyz = block.xyz[: len(ties.xyz)]
     wet = len(xyz) if water is None else int((surface_above(water, xyz).height_m > xyz[:, 2]).sum())
     if wet < SMALL_WATER:
         words = (
@@ -101,8 +100,23 @@ def adjust_block(
             " adjust. Check the water level, or use an ordinary bundle adjustment."
         )
         raise GeometryError("water.below_points", words, wet=wet, points=len(xyz))
-    rows, notes = _well_seen(material.name, block)
+    rows, count, notes = well_seen(block), len(block.cameras), list[PcfixWarning]()
+    if len(rows) < 2:
+        words = (
+            f"{material.name}: only {len(rows)} of {count} images have enough observations for a"
+            " pose. Give a model with more tie points."
+        )
+        raise GeometryError("ties.few_images", words, path=material.name, images=len(rows))
+    if len(rows) < count:
+        lost = np.setdiff1d(np.arange(count), rows)
+        words = (
+            f"{len(lost)} of {count} images (first {block.cameras.labels[lost[0]]}) have too few"
+            " observations for a pose and were excluded."
+        )
+        notes.append(PcfixWarning("ties.few_in_image", words, images=len(lost)))
     block = restricted(block, rows)
+
+    # 3. The adjustment, and what its user should know
     if cloud_xyz is None:
         found = adjust_ties(
             block, unknowns, progress, sigma_px=rules.sigma_image, outliers=rules.outliers,
@@ -111,44 +125,24 @@ def adjust_block(
     else:
         surveyed = [] if material.control is None else [material.control.xyz]
         apparent = np.vstack([ties.xyz, *surveyed])
-        sets = [lens]
-        if chooses_lens:
-            sets = list(dict.fromkeys([("f",), ("f", "cx", "cy"), lens]))
-        given = CloudBlock(block, some_cameras(original, rows), apparent)
-        found = adjust_cloud(given, unknowns, sets, progress)
-    notes += [*_check_dry(water, found), *found.notes]
-    notes += [*undetermined(found.precision), *correlated(found.precision)]
+        found = adjust_cloud(
+            block, some_cameras(original, rows), apparent, unknowns, progress,
+            choose_lens=chooses_lens,
+        )  # fmt: skip
+    notes += [*_land_notes(water, found), *found.notes]
+    bed_xy = found.xyz[found.is_wet & found.is_observed, :2]
+    reach_m = float(np.sqrt(np.var(bed_xy, axis=0).sum())) if len(bed_xy) else 0.0
+    notes += undetermined(found.precision, reach_m)
     if found.precision.members is None:
         words = (
             f"The block is too large ({len(block.cameras):,} images) for covariances of its points,"
             " so the correction cannot use the errors of the poses."
         )
         notes.append(PcfixWarning("adjust.too_large", words, images=len(block.cameras)))
-    on_bed = found.is_wet & np.isfinite(found.xyz).all(axis=1)
-    notes += shape_notes(found.precision, (found.xyz - found.problem.origin)[on_bed, :2])
     return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])
 
 
 # Checks of what goes in
-
-
-def _well_seen(name: str, block: Block) -> tuple[IntArray, list[PcfixWarning]]:
-    """Return the rows of the images that can be adjusted, and a warning about others."""
-    rows, count = well_seen(block), len(block.cameras)
-    if len(rows) < 2:
-        words = (
-            f"{name}: only {len(rows)} of {count} images have enough observations for a pose. Give"
-            " a model with more tie points."
-        )
-        raise GeometryError("ties.few_images", words, path=name, images=len(rows))
-    lost = np.setdiff1d(np.arange(count), rows)
-    if not len(lost):
-        return rows, []
-    words = (
-        f"{len(lost)} of {count} images (first {block.cameras.labels[lost[0]]}) have too few"
-        " observations for a pose and were excluded."
-    )
-    return rows, [PcfixWarning("ties.few_in_image", words, images=len(lost))]
 
 
 def check_images(
@@ -226,8 +220,8 @@ def check_marks(
 # Checks of what comes out
 
 
-def _check_dry(water: WaterSurface | None, found: Adjusted) -> list[PcfixWarning]:
-    """Check that there is land, which a free water surface needs."""
+def _land_notes(water: WaterSurface | None, found: Adjusted) -> list[PcfixWarning]:
+    """Return a warning if there is hardly any land; refuse that for a free water surface."""
     if water is None:
         return []
     above, count = int((found.is_observed & ~found.is_wet).sum()), int(found.is_observed.sum())
@@ -291,47 +285,37 @@ FEW = 6
 BED_GSD = 1.5
 """Standard error of the heights of the bed, in ground pixels, that is worth a warning."""
 
-SIDES = (("to the right of", "to the left of"), ("ahead of", "behind"), ("above", "below"))
-"""Relative to the projection centres, with the top of the image ahead."""
 
+def height_offset(found: Adjusted) -> tuple[float, float] | None:
+    """Return how far the GNSS positions lie too high for a block, and the standard error, metres.
 
-def offset_of(found: Adjusted) -> tuple[FloatArray, FloatArray] | None:
-    """Return the offset of the GNSS with which a block would fit best, and its standard errors.
-
-    Both are to the right, ahead and up, shape (3,), metres. It is one more unknown of all
-    positions, estimated by one step from the solution. None if nothing is free.
+    It is one more unknown of all positions, estimated by one step from the solution. None if
+    nothing is free.
     """
-    problem, now, weight = found.problem, found.solution, found.block.gnss_weights
-    # axes of each image in the world: right, ahead, up
-    right = np.asarray(found.cameras.rotations)[:, 0] * [1.0, 1.0, 0.0]
-    right /= np.maximum(np.linalg.norm(right, axis=1), 1e-9)[:, None]
-    up = np.broadcast_to([0.0, 0.0, 1.0], right.shape)
-    axes = np.stack([right, np.cross(up, right), up], axis=1)
-    with_centres = np.zeros((len(weight), 6, 3))
-    with_centres[:, 3:] = weight[:, :, None] * axes.transpose(0, 2, 1)
-    matrix, right_side = reduced_at(problem, now)
-    others = np.zeros((problem.given.shared, 3))
-    taken_up = problem.spread(now.state).T @ np.vstack([with_centres.reshape(-1, 3), others])
+    problem, now, weight = found.problem, found.solution, found.block.gnss_weights[:, 2]
+    with_poses = np.zeros((len(weight), 6))
+    with_poses[:, 5] = weight
+    spread = problem.spread(now.state)
+    border = spread.T @ np.append(with_poses, np.zeros(problem.given.shared))
+    matrix, right = reduced_at(problem, now)
     solve_for = solver(matrix)
-    if solve_for is None or not taken_up.any():
+    if solve_for is None or not border.any():
         return None
-    own = np.einsum("kij,kj,klj->il", axes, weight, axes) + np.eye(3) / UNKNOWN_M**2
-    covariance = np.linalg.inv(own - taken_up.T @ solve_for(taken_up))
-    side = -np.einsum("kij,kj->i", axes, weight * np.nan_to_num(found.gnss_residual_m))
-    step = covariance @ (side - taken_up.T @ solve_for(right_side))
-    return step, max(found.sigma0, 1.0) * np.sqrt(np.diag(covariance))
+    # the poses and shared unknowns are eliminated
+    by_border, by_right = border @ solve_for(np.column_stack([border, right]))
+    variance = 1.0 / (weight.sum() + 1.0 / UNKNOWN_M**2 - by_border)
+    pull = -weight @ np.nan_to_num(found.gnss_residual_m[:, 2]) - by_right
+    return float(variance * pull), max(found.sigma0, 1.0) * float(np.sqrt(variance))
 
 
 def datum_notes(found: Adjusted) -> list[PcfixWarning]:
-    """Return warnings if GNSS positions are few for a cloud, or have a significant offset."""
+    """Return a warning if GNSS positions are few for a cloud, or too high or low for the block."""
     known = np.isfinite(found.gnss_residual_m)
     if not known.any() or found.unknowns.poses != "free" or found.unknowns.free_network:
         return []
     if found.source == "cloud":
-        count, control = (
-            int(known.all(axis=1).sum()),
-            sum(r.role == "control" for r in found.control),
-        )
+        control = sum(row.role == "control" for row in found.control)
+        count = int(known.all(axis=1).sum())
         if count + control >= FEW:
             return []
         words = (
@@ -340,24 +324,17 @@ def datum_notes(found: Adjusted) -> list[PcfixWarning]:
         )
         return [PcfixWarning("gnss.few", words, gnss=count, control=control)]
     stated_m = float(np.median(found.block.gnss_sigma_m[known]))
-    offset_m, sigma_m = offset_of(found) or (np.zeros(3), np.zeros(3))
-    is_off = np.abs(offset_m) > np.maximum(SIGMAS * sigma_m, OF_GNSS * stated_m)
-    if not is_off.any():
+    offset_m, sigma_m = height_offset(found) or (0.0, 0.0)
+    if abs(offset_m) <= max(SIGMAS * sigma_m, OF_GNSS * stated_m):
         return []
-    parts = [
-        f"{abs(m):.2f} m {side[int(m < 0.0)]} the projection centres (standard error {sigma:.2f} m)"
-        for m, sigma, side, off in zip(offset_m, sigma_m, SIDES, is_off, strict=True)
-        if off
-    ]
-    level = ""
-    if is_off[2] and found.water is not None:
-        level = f", or a water level that is too {'low' if offset_m[2] > 0.0 else 'high'}"
+    side, level = ("above", "low") if offset_m > 0.0 else ("below", "high")
+    water = "" if found.water is None else f", or a water level that is too {level}"
     words = (
-        f"The GNSS positions lie {' and '.join(parts)}: an antenna lever arm, another datum{level}."
-        " The block followed them. Correct them, or omit them if there are control points."
+        f"The GNSS positions lie {abs(offset_m):.2f} m {side} the projection centres (standard"
+        f" error {sigma_m:.2f} m): an antenna lever arm, another height datum{water}. The block"
+        " followed them. Correct them, or omit them if there are control points."
     )
-    more = {"offset_m": offset_m.tolist(), "sigma_m": sigma_m.tolist()}
-    return [PcfixWarning("gnss.offset_found", words, **more)]
+    return [PcfixWarning("gnss.offset_found", words, offset_m=offset_m, sigma_m=sigma_m)]
 
 
 def bed_notes(found: Adjusted) -> list[PcfixWarning]:

@@ -14,7 +14,7 @@ covariance. Whatever is computed with each of them in turn scatters by all error
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -168,9 +168,6 @@ def _point_sigma(problem: Problem, found: Solution, inverse: FloatArray) -> Floa
 # What is known poorly
 
 
-STRONG = 0.95
-"""Correlation of two unknowns that are hardly separated."""
-
 LIMITS = {
     "level": 0.02, "tilt_x": 0.0005, "tilt_y": 0.0005, "index": 0.005, "scale": 0.001,
     "distance": 0.002, "centre_x": 0.002, "centre_y": 0.002, "centre_z": 0.002,
@@ -178,69 +175,42 @@ LIMITS = {
 """Standard errors beyond which an unknown counts as undetermined."""
 
 LEAST_BEND_M = 0.02
-"""Standard error of the curvature of the water from which it is undetermined, as the level's."""
+"""The same for the height by which curved water departs from a plane, as for its level."""
+
+STRONG = 0.95
+"""Correlation of two unknowns that are hardly separated."""
 
 
-def correlated(precision: Precision) -> list[PcfixWarning]:
-    """Return a warning for each two unknowns that are hardly separated, the strongest first.
+def undetermined(precision: Precision, reach_m: float = 0.0) -> list[PcfixWarning]:
+    """Return a warning for each unknown whose standard error is too large to be useful.
 
-    Pairs of k1, k2, ... are always correlated, which does no harm.
-    """
-    names, notes = [row.name for row in precision.shared], []
-    rows, columns = np.nonzero(np.tril(np.abs(precision.correlation) > STRONG, -1))
-    for i, j in zip(rows.tolist(), columns.tolist(), strict=True):
-        r, pair = float(precision.correlation[i, j]), [names[j], names[i]]
-        if pair[0][0] == pair[1][0] == "k":
-            continue
-        one, other = (f"the {words_of(name)[0]}" for name in pair)
-        words = (
-            f"{one} and {other} are strongly correlated (r = {r:.3f}). Fix one of them, or give"
-            " control points at several heights."
-        )
-        notes.append(PcfixWarning("adjust.correlated", words, unknowns=[one, other], correlation=r))
-    return sorted(notes, key=lambda note: -abs(note.values["correlation"]))
-
-
-def undetermined(precision: Precision) -> list[PcfixWarning]:
-    """Return a warning for each unknown whose standard error is too large to be useful."""
-    notes = []
-    for row in precision.shared:
-        (what, unit), limit = words_of(row.name), LIMITS.get(row.name, np.inf)
-        if row.sigma > limit:
-            words = (
-                f"the {what} is undetermined: standard error {row.sigma:.2g}{unit} (limit"
-                f" {limit:g}{unit}). Fix it to a measured value."
-            )
-            values = {"unknown": row.name, "sigma": row.sigma}
-            notes.append(PcfixWarning("adjust.undetermined", words, **values))
-    return notes
-
-
-def shape_notes(precision: Precision, wet_xy: FloatArray) -> list[PcfixWarning]:
-    """Return a warning if a free shape of the water is undetermined.
+    It names the unknown from which this one is hardly separated, if there is one.
 
     Parameters
     ----------
-    wet_xy : array, shape (m, 2)
-        Points under water, about the origin of the block, metres. The curvature over them is what
-        a plane cannot represent.
+    reach_m : float
+        RMS distance of the points under water from their middle.
     """
-    rows = [i for i, row in enumerate(precision.shared) if row.name.startswith("shape_")]
-    if not rows or len(wet_xy) < 6:
-        return []
-    x, y = wet_xy.T
-    terms, plane = np.column_stack([x * x, x * y, y * y]), np.column_stack([np.ones(len(x)), x, y])
-    terms = terms - plane @ np.linalg.lstsq(plane, terms, rcond=None)[0]
-    sigma = np.array([precision.shared[i].sigma for i in rows])
-    covariance = precision.correlation[np.ix_(rows, rows)] * sigma * sigma[:, None]
-    error = float(np.sqrt(np.mean(np.einsum("mi,ij,mj->m", terms, covariance, terms))))
-    if error <= LEAST_BEND_M:
-        return []
-    words = (
-        "the shape of the water is undetermined: the curvature over the bed has a standard error of"
-        f" {1000.0 * error:.2g} mm. Remove shape from --free, or mark waterline points."
-    )
-    return [PcfixWarning("adjust.shape_undetermined", words, sigma_m=error)]
+    notes, shared = [], precision.shared
+    for i, row in enumerate(shared):
+        (what, unit), limit = words_of(row.name), LIMITS.get(row.name, np.inf)
+        if row.name.startswith("shape") and reach_m:
+            limit = LEAST_BEND_M / reach_m**2
+        if row.sigma <= limit:
+            continue
+        words = (
+            f"the {what} is undetermined: standard error {row.sigma:.2g}{unit} (limit"
+            f" {limit:.2g}{unit})."
+        )
+        values: dict[str, Any] = {"unknown": row.name, "sigma": row.sigma}
+        r = np.where(np.arange(len(shared)) == i, 0.0, precision.correlation[i])
+        other = int(np.abs(r).argmax())
+        if abs(r[other]) > STRONG:
+            pair, values["correlated_with"] = words_of(shared[other].name)[0], shared[other].name
+            words += f" It is strongly correlated with the {pair} (r = {r[other]:.3f})."
+        words += " Fix it to a measured value, or give control points at several heights."
+        notes.append(PcfixWarning("adjust.undetermined", words, **values))
+    return notes
 
 
 # The ensemble

@@ -21,7 +21,6 @@ from pcfix.adjust.block import (
     WATER,
     WATER_NAMES,
     Block,
-    LogRow,
     Unknowns,
     effect_at_corner,
     inverse_variances,
@@ -132,8 +131,9 @@ class Solution:
     state: State
     lenses: tuple[Lens, ...]  # of the k cameras
     shared: FloatArray  # (g,), corrections of the shared unknowns
-    cost: float  # sum of weighted squares, including prior knowledge
-    log: list[LogRow]
+    cost: float = np.inf  # sum of weighted squares, including prior knowledge
+    rounds: int = 0  # with different weights
+    steps: int = 0  # of all rounds
 
 
 def prepare(
@@ -198,7 +198,7 @@ def prepare(
         centres, np.ascontiguousarray(cameras.rotations, np.float64), table, block.xyz - origin,
         np.concatenate([numbers, planes]), port_row(block.port),
     )  # fmt: skip
-    return problem, Solution(state, lenses, np.zeros(len(names)), np.inf, [])
+    return problem, Solution(state, lenses, np.zeros(len(names)))
 
 
 def surface_numbers(block: Block, origin: FloatArray) -> FloatArray:
@@ -399,13 +399,6 @@ def off_surfaces(problem: Problem, state: State) -> tuple[IntArray, FloatArray]:
     rows = linearised(state, problem.given, UNDAMPED, problem.block.tie_points, len(state.xyz))
     is_condition = ~rows.is_image & rows.columns[:, 0, POINT:SHARED].any(axis=1)
     return problem.block.owner[rows.observation[is_condition]], rows.r[is_condition, 0]
-
-
-def log_row(problem: Problem, state: State, number: int, steps: int) -> LogRow:
-    """Return the number of observations that count and the RMS of their residuals, for the log."""
-    r = residuals(state, problem.given)[problem.used]
-    rms = float(np.sqrt(np.nansum(r * r) / max(2 * len(r), 1)))
-    return LogRow(number, steps, len(r), rms)
 
 
 # Intersection with fixed poses

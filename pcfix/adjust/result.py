@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -18,7 +17,6 @@ from pcfix.adjust.block import (
     WATER,
     WATER_NAMES,
     Block,
-    LogRow,
     Unknowns,
     lens_parameter,
 )
@@ -49,7 +47,7 @@ class ControlRow(NamedTuple):
     """A surveyed point: adjusted minus surveyed in metres, and its residuals in the images."""
 
     name: str
-    role: Literal["control", "check"]
+    role: str  # control or check
     dx_m: float
     dy_m: float
     dz_m: float
@@ -73,7 +71,6 @@ class Adjusted:
     is_wet: BoolArray  # (m,), points below the water; behind a port all of them
     sigma0: float  # a-posteriori standard deviation of unit weight
     redundancy: int  # observations, with those of the unknowns, minus unknowns
-    rounds: list[LogRow]
     source: Source  # what was observed: tie points, or images of the apparent cloud
     precision: Precision
     gnss_residual_m: FloatArray  # (k, 3), adjusted centres minus GNSS positions; NaN if unknown
@@ -135,7 +132,6 @@ def adjusted_of(
         is_wet=np.asarray((xyz[:, 2] < level) & block.wet),
         sigma0=sigma0_of(problem, now),
         redundancy=redundancy_of(problem),
-        rounds=now.log,
         source=source,
         precision=precision,
         gnss_residual_m=np.where(block.gnss_weights > 0.0, off, np.nan),
@@ -156,26 +152,9 @@ def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlR
         if (check and len(marks) < LEAST_VIEWS) or np.isnan(block.surveyed_xyz[p]).any():
             continue
         dx, dy, dz = (xyz[p] - block.surveyed_xyz[p]).tolist()
-        rms = float(np.sqrt((marks * marks).mean())) if len(marks) else float("nan")
-        rows.append(ControlRow(name, "check" if check else "control", dx, dy, dz, rms, len(marks)))
+        rms_px, role = float(rms(marks.ravel())), "check" if check else "control"
+        rows.append(ControlRow(name, role, dx, dy, dz, rms_px, len(marks)))
     return rows
-
-
-def _on_surfaces(problem: Problem, now: Solution) -> list[Plain]:
-    """Return the stated and found distances of marked points from each surface, metres."""
-    given, (points, left) = problem.block.conditions, off_surfaces(problem, now.state)
-    sigma_m = given.sigma_m[points]
-    rows = [(name, given.on[points] == i) for i, name in enumerate((WATER, *given.names))]
-    return [
-        {
-            "surface": name,
-            "points": is_on.sum(),
-            "sigma_m": rms(sigma_m[is_on]),
-            "rms_m": rms((left * sigma_m)[is_on]),
-        }
-        for name, is_on in rows
-        if is_on.any()
-    ]
 
 
 # Plain values
@@ -200,50 +179,6 @@ def before_of(adjusted: Adjusted) -> Intersected:
     return Intersected(np.where(met, found.xyz, np.nan), residual_px, found.start)
 
 
-def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
-    """Return the content of adjustment.json; pcfix/cli/README.md lists its keys.
-
-    `before` are the residuals before the adjustment, of `before_of`.
-    """
-    a, block, u = adjusted, adjusted.block, adjusted.unknowns
-    kept = len(block.cameras) if u.poses == "fixed" else 0
-    lenses = block.cameras.lenses or ()
-    found = {
-        "source": a.source,
-        "image_unit": lenses[0].unit,
-        "images": len(block.cameras),
-        "images_fixed": kept or sum(label in u.fixed_images for label in block.cameras.labels),
-        "poses_are": u.poses,
-        "port": block.port is not None,
-        "unknowns": {
-            "lens": u.lens,
-            "surface": dict(u.surface),
-            "free_network": u.free_network,
-            "parallel": block.conditions.parallel,
-        },
-        **_counts(a),
-        "sigma0": a.sigma0,
-        "redundancy": int(a.redundancy),
-        "residuals": {
-            "land": _residuals(a, before, ~a.is_wet),
-            "water": _residuals(a, before, a.is_wet),
-        },
-        "lens": _lens(a),
-        "water": _water(a),
-        "port_found": _port(a),
-        "on_surfaces": _on_surfaces(a.problem, a.solution),
-        "poses": _poses(a),
-        "precision": _precision(a.precision),
-        "gnss": _gnss(a),
-        "control": _surveyed([row for row in a.control if row.role == "control"]),
-        "check": _surveyed([row for row in a.control if row.role == "check"]),
-        "rounds": len({row.round: row for row in a.rounds}),
-        "steps": len(a.rounds),
-        "notes": [one.as_dict() for one in {str(one): one for one in a.notes}.values()],
-    }
-    return dict(plain(found))
-
-
 def mean(values: FloatArray) -> FloatArray:
     """Return the mean of the finite values, of each column; NaN if there is none."""
     known = np.isfinite(values)
@@ -257,12 +192,30 @@ def rms(values: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(mean(values * values)))
 
 
-def _counts(a: Adjusted) -> Plain:
-    """Return the numbers of points and of observations."""
-    roles, observed, block = [row.role for row in a.control], a.is_observed, a.block
-    is_check = np.zeros(len(a.xyz), np.bool_)
-    is_check[len(a.xyz) - len(block.is_check) :] = block.is_check
-    return {
+def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
+    """Return the content of adjustment.json; pcfix/cli/README.md lists its keys.
+
+    `before` are the residuals before the adjustment, of `before_of`.
+    """
+    a, block, u = adjusted, adjusted.block, adjusted.unknowns
+    k, observed = len(block.cameras), a.is_observed
+    roles = [row.role for row in a.control]
+    is_check = np.append(np.zeros(len(a.xyz) - len(block.is_check), np.bool_), block.is_check)
+    fixed = k if u.poses == "fixed" else len(set(u.fixed_images) & set(block.cameras.labels))
+    lenses = block.cameras.lenses or ()
+    found = {
+        "source": a.source,
+        "image_unit": lenses[0].unit,
+        "images": k,
+        "images_fixed": fixed,
+        "poses_are": u.poses,
+        "port": block.port is not None,
+        "unknowns": {
+            "lens": u.lens,
+            "surface": dict(u.surface),
+            "free_network": u.free_network,
+            "parallel": block.conditions.parallel,
+        },
         "points": {
             "all": observed.sum(),
             "land": (observed & ~a.is_wet).sum(),
@@ -275,10 +228,30 @@ def _counts(a: Adjusted) -> Plain:
             "used": a.used.sum(),
             "left_out": (~a.used & ~is_check[block.owner]).sum(),
         },
+        "sigma0": a.sigma0,
+        "redundancy": a.redundancy,
+        "residuals": {
+            "land": _residuals(a, before, ~a.is_wet),
+            "water": _residuals(a, before, a.is_wet),
+        },
+        "lens": _lens(a),
+        "water": _water(a),
+        "port_found": _port(a),
+        "on_surfaces": _on_surfaces(a.problem, a.solution),
+        "poses": _poses(a),
+        "precision": _precision(a.precision),
+        "gnss": _gnss(a),
+        "control": _surveyed(a, "control"),
+        "check": _surveyed(a, "check"),
+        "rounds": a.solution.rounds,
+        "steps": a.solution.steps,
+        "notes": [one.as_dict() for one in {str(one): one for one in a.notes}.values()],
     }
+    return dict(plain(found))
 
 
 def _residuals(a: Adjusted, before: Intersected, points: BoolArray) -> Plain:
+    """Return residuals and standard errors on land or under water, as in Mulsow 2024."""
     points = points & a.is_observed
     rows = a.used & points[a.block.owner]
     sigma = a.precision.point_sigma_m
@@ -298,24 +271,20 @@ def _residuals(a: Adjusted, before: Intersected, points: BoolArray) -> Plain:
 
 
 def _lens(a: Adjusted) -> list[Plain]:
-    original, adjusted, groups = (
-        a.block.cameras.lenses or (),
-        a.cameras.lenses or (),
-        a.problem.groups,
-    )
-    rows = []
-    for i, (images, codes) in enumerate(zip(groups, a.problem.codes, strict=True), start=1):
-        first, after = original[images[0]], adjusted[images[0]]
-        for code in codes:
-            unknown = NAMES[code] if len(groups) == 1 else f"{NAMES[code]} of sensor {i}"
-            rows.append({
-                "sensor": first.sensor or f"sensor {i}",
-                "name": NAMES[code],
-                "before": lens_parameter(first, code),
-                "after": lens_parameter(after, code),
-                "sigma": a.precision.sigma_of(unknown),
-            })  # fmt: skip
-    return rows
+    """Return the free parameters of each lens: the first of the shared unknowns."""
+    original, adjusted = a.block.cameras.lenses or (), a.cameras.lenses or ()
+    sensors = enumerate(zip(a.problem.groups, a.problem.codes, strict=True), start=1)
+    free = [(i, images[0], code) for i, (images, codes) in sensors for code in codes]
+    return [
+        {
+            "sensor": original[image].sensor or f"sensor {i}",
+            "name": NAMES[code],
+            "before": lens_parameter(original[image], code),
+            "after": lens_parameter(adjusted[image], code),
+            "sigma": unknown.sigma,
+        }
+        for (i, image, code), unknown in zip(free, a.precision.shared, strict=False)
+    ]
 
 
 def _water(a: Adjusted) -> Plain | None:
@@ -340,7 +309,7 @@ def _port(a: Adjusted) -> Plain | None:
     return {"port": str(a.port), **_numbers(a, names)}
 
 
-def _numbers(a: Adjusted, names: Sequence[str]) -> dict[str, Plain]:
+def _numbers(a: Adjusted, names: list[str]) -> dict[str, Plain]:
     """Return parameters of the refracting surface, block frame."""
     start = surface_numbers(a.block, a.problem.origin)
     return {
@@ -350,36 +319,49 @@ def _numbers(a: Adjusted, names: Sequence[str]) -> dict[str, Plain]:
             "sigma": a.precision.sigma_of(name),
             "free": bool(a.unknowns.water_sigma[i]),
         }
-        for name in names
-        for i in [WATER_NAMES.index(name)]
+        for i, name in enumerate(WATER_NAMES)
+        if name in names
     }
 
 
+def _on_surfaces(problem: Problem, now: Solution) -> list[Plain]:
+    """Return the stated and found distances of marked points from each surface, metres."""
+    given, (points, left) = problem.block.conditions, off_surfaces(problem, now.state)
+    sigma_m = given.sigma_m[points]
+    rows = [(name, given.on[points] == i) for i, name in enumerate((WATER, *given.names))]
+    return [
+        {
+            "surface": name,
+            "points": is_on.sum(),
+            "sigma_m": rms(sigma_m[is_on]),
+            "rms_m": rms((left * sigma_m)[is_on]),
+        }
+        for name, is_on in rows
+        if is_on.any()
+    ]
+
+
 def _poses(a: Adjusted) -> Plain:
-    moved = a.cameras.centres - a.block.cameras.centres
-    far = np.linalg.norm(moved, axis=1)
+    far = np.linalg.norm(a.cameras.centres - a.block.cameras.centres, axis=1)
     before, after = np.asarray(a.block.cameras.rotations), np.asarray(a.cameras.rotations)
-    turned = np.degrees(Rotation.from_matrix(after @ before.transpose(0, 2, 1)).magnitude())
+    turned = Rotation.from_matrix(after @ before.transpose(0, 2, 1)).magnitude()
     return {
-        "moved_mean_m": moved.mean(axis=0),
         "moved_rms_m": rms(far),
         "moved_largest_m": far.max(),
         "moved_largest_image": a.cameras.labels[int(far.argmax())],
-        "turned_rms_deg": rms(turned),
-        "turned_largest_deg": turned.max(),
+        "turned_rms_deg": rms(np.degrees(np.asarray(turned))),
     }
 
 
 def _precision(p: Precision) -> Plain:
     moves = p.pose_covariance.any(axis=(1, 2))
-    found: Plain = {"images": moves.sum()}
-    for name, values in (("centre", p.centre_sigma_m), ("angle", p.angle_sigma_deg)):
-        unit, known = "m" if name == "centre" else "deg", values[moves]
-        found[f"{name}_mean_{unit}"] = known.mean(axis=0) if len(known) else None
-        found[f"{name}_largest_{unit}"] = known.max(axis=0) if len(known) else None
-    found["shared"] = [row._asdict() for row in p.shared]
-    found["correlation"] = p.correlation
-    return found
+    return {
+        "images": moves.sum(),
+        "centre_mean_m": mean(p.centre_sigma_m[moves]),
+        "angle_mean_deg": mean(p.angle_sigma_deg[moves]),
+        "shared": [row._asdict() for row in p.shared],
+        "correlation": p.correlation,
+    }
 
 
 def _gnss(a: Adjusted) -> Plain | None:
@@ -398,16 +380,15 @@ def _gnss(a: Adjusted) -> Plain | None:
     }
 
 
-def _surveyed(rows: Sequence[ControlRow]) -> Plain | None:
+def _surveyed(a: Adjusted, role: str) -> Plain | None:
+    """Return the control or the check points."""
+    rows = [row for row in a.control if row.role == role]
     if not rows:
         return None
-    off = np.array([[row.dx_m, row.dy_m, row.dz_m] for row in rows], np.float64)
-    points = [row._asdict() for row in rows]
-    for point in points:
-        del point["role"]
+    off = np.array([[row.dx_m, row.dy_m, row.dz_m] for row in rows])
     return {
         "rms_m": rms(off),
         "mean_m": mean(off),
-        "rms_px": rms(np.array([row.rms_px for row in rows], np.float64)),
-        "points": points,
+        "rms_px": rms(np.array([row.rms_px for row in rows])),
+        "points": [row._asdict() for row in rows],
     }

@@ -1,4 +1,4 @@
-"""Errors that observations share, and observations of different quality.
+"""Errors that observations share, which make standard errors larger.
 
 Standard errors from the inverse normal matrix hold for independent errors. Errors of matching and
 of the lens model are shared: by neighbouring points, by one image, by one place in the frame. A
@@ -24,12 +24,11 @@ import numpy as np
 from scipy.special import fdtri
 
 from pcfix.adjust.block import CX, CY, FOCAL
-from pcfix.adjust.normal import UNDAMPED, residuals, sparse_matrix, sparse_rows_of
+from pcfix.adjust.normal import UNDAMPED, sparse_matrix, sparse_rows_of
 from pcfix.adjust.precision import Precision
-from pcfix.adjust.problem import Problem, Solution, water_of
+from pcfix.adjust.problem import Problem, Solution
 from pcfix.adjust.solve import reduced_at, solver
 from pcfix.model import FloatArray, IntArray
-from pcfix.water.surface import surface_above
 
 SURE = 0.99
 """Probability with which equal groups would not differ by as much."""
@@ -191,41 +190,3 @@ def _likely_field(problem: Problem, tile: IntArray, sigma0: float, rest: FloatAr
     s2_of = (weight * square).sum(axis=1) / weight.sum()
     of_all = np.sum([s2 * half @ half.T for s2, half in zip(s2_of, halves, strict=True)], axis=0)
     return np.asarray(np.linalg.cholesky(of_all + 1e-12 * one).T)
-
-
-# Observations of different quality
-
-
-LEAST_POINTS = 30
-"""Points of a group; its degrees of freedom, as residuals of one point are correlated."""
-
-LEAST_RATIO = 1.2
-"""Of standard deviations; below it other weights would gain a fiftieth of a standard error."""
-
-
-def weighed(problem: Problem, now: Solution) -> Problem:
-    """Weight tie points on land and under water by the noise of their group, if it differs.
-
-    Each group has its own variance of unit weight: weighted squares over its share of the
-    redundancy, of which each point takes three. Groups whose variances differ (F-test), and by
-    enough to matter, are weighted by their own (Foerstner 1979, one step).
-    """
-    given, block, water = problem.given, problem.block, water_of(problem, now.state)
-    if water is None:
-        return problem
-    weight, owner, xyz = given.weight, block.owner, now.state.xyz + problem.origin
-    wet = (block.wet & (surface_above(water, xyz).height_m > xyz[:, 2]))[owner]
-    r = residuals(now.state, given)
-    used = problem.of_ties & problem.used & np.isfinite(r).all(axis=1)
-    rows = [used & ~wet, used & wet]
-    points = np.array([len(np.unique(owner[row])) for row in rows])
-    if points.min() < LEAST_POINTS:
-        return problem
-    square = (np.where(used[:, None], r, 0.0) ** 2).sum(axis=1) * weight**2
-    redundancy = 2.0 - 3.0 / np.maximum(np.bincount(owner, used)[owner], 2.0)
-    each = np.array([square[row].sum() / redundancy[row].sum() for row in rows])
-    worst, best = int(np.argmax(each)), int(np.argmin(each))
-    limit = max(fdtri(points[worst], points[best], SURE), LEAST_RATIO**2)
-    if each[worst] < limit * each[best]:
-        return problem
-    return problem.weighted(weight / np.where(used, np.sqrt(each)[wet.astype(np.int64)], 1.0))

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import INDEX, Progress, moved_lens, words_of
+from pcfix.adjust.block import INDEX, moved_lens, words_of
 from pcfix.adjust.collinearity import State
-from pcfix.adjust.normal import SQUARES, UNDAMPED, Rule, normal_equations, point_steps
-from pcfix.adjust.problem import Problem, Solution, cost_at, log_row, port_of, port_row, prior_rows
+from pcfix.adjust.normal import SQUARES, UNDAMPED, Rule, normal_equations, point_steps, residuals
+from pcfix.adjust.problem import Problem, Solution, cost_at, port_of, port_row, prior_rows
 from pcfix.errors import GeometryError, PcfixError
 from pcfix.lens.imaging import lens_table
 from pcfix.model import FloatArray
@@ -30,9 +30,14 @@ EXACT = 1e-10
 """Squared residual, in variances, of an observation that is met exactly."""
 
 ROUNDING = 1e-12
+"""Share of the cost by which it may rise at the minimum."""
 
 WEAK = 1e-11
 """Eigenvalue of the matrix with unit diagonal below which a combination is undetermined."""
+
+
+Progress = Callable[[str], None]
+"""Called with a line after each step."""
 
 
 # Steps
@@ -55,38 +60,38 @@ def solve(
         Two steps in a row that lower the cost by less than this share end the round.
     """
     rule = Rule(loss)
-    now = replace(start, cost=cost_at(problem, start, rule))
+    now = replace(start, cost=cost_at(problem, start, rule), rounds=start.rounds + 1)
     if not np.isfinite(now.cost):
         raise GeometryError(
             "adjust.no_start", "The adjustment has no finite start. Check the poses and the water."
         )
     damping, up, calm = FIRST_DAMPING, 2.0, 0
+    # with exact observations the cost ends at zero, of which there is no share
     least_cost = EXACT * max(int(problem.used.sum()), 1)
-    log, number = list(start.log), 1 + max((row.round for row in start.log), default=0)
-    for step in range(MOST_STEPS):
-        # raise the damping until a step lowers the cost
-        while (
-            trial := _trial(problem, now, rule._replace(damping=damping))
-        ) is None or not trial.cost <= now.cost:
-            if trial is not None and trial.cost - now.cost < ROUNDING * max(now.cost, least_cost):
-                return replace(now, log=log)  # the cost is rounding
-            damping, up = damping * up, 2.0 * up
-            if damping > MOST_DAMPING:
-                if trial is None and step == 0:
-                    raise singular(problem, now)
-                return replace(now, log=log)
-        # with exact observations the cost ends at zero, of which there is no share
-        gain = (now.cost - trial.cost) / max(now.cost, least_cost)
-        now, up = trial, 2.0
-        damping = max(damping / 10.0, LEAST_DAMPING)
-        row = log_row(problem, now.state, number, step + 1)
-        log.append(row)
-        if progress is not None:
-            progress(row)
-        calm = calm + 1 if gain < close else 0
-        if calm == 2:
+    last = start.steps + MOST_STEPS
+    while now.steps < last and calm < 2 and damping <= MOST_DAMPING:
+        trial = _trial(problem, now, rule._replace(damping=damping))
+        gain = np.nan if trial is None else (now.cost - trial.cost) / max(now.cost, least_cost)
+        if trial is not None and gain >= 0.0:
+            now = replace(trial, steps=now.steps + 1)
+            damping, up = max(damping / 10.0, LEAST_DAMPING), 2.0
+            calm = calm + 1 if gain < close else 0
+            show(progress, problem, now)
+        elif gain > -ROUNDING:
             break
-    return replace(now, log=log)
+        else:
+            damping, up = damping * up, 2.0 * up  # a shorter step
+    if trial is None and now.steps == start.steps:
+        raise singular(problem, now)
+    return now
+
+
+def show(progress: Progress | None, problem: Problem, now: Solution) -> None:
+    """Describe the last step to whoever follows the progress."""
+    if progress is not None:
+        r = residuals(now.state, problem.given)[problem.used]
+        rms_px = np.sqrt(np.nansum(r * r) / max(r.size, 1))
+        progress(f"round {now.rounds}, step {now.steps}, {len(r):,} observations, {rms_px:.3f} px")
 
 
 def _trial(problem: Problem, now: Solution, rule: Rule) -> Solution | None:

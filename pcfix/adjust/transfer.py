@@ -23,16 +23,7 @@ from pcfix.errors import GeometryError
 from pcfix.kernels import Span, device, in_tiles, kernel, most_between
 from pcfix.lens.algebra import dot, minus, plus, plus_square, row_of, scaled, solved, times, vector
 from pcfix.lens.imaging import image_in_world, image_of
-from pcfix.model import (
-    BoolArray,
-    Cameras,
-    Correction,
-    FloatArray,
-    IntArray,
-    Outcome,
-    TiePoints,
-    Views,
-)
+from pcfix.model import BoolArray, Cameras, Correction, FloatArray, IntArray, Outcome, Views
 from pcfix.refract.batch import Optics, optics_of
 from pcfix.refract.choice import views_in_frame
 from pcfix.refract.tiling import spatial_order
@@ -144,7 +135,6 @@ def transfer_of(original: Cameras, adjusted: Cameras, place: IntArray) -> CloudT
     """Return the transfer between two models, given the original row of each adjusted image."""
     row = np.full(len(original), -1)
     row[place] = np.arange(len(adjusted))
-    left_out = tuple(label for label, at in zip(original.labels, row, strict=True) if at < 0)
     original = some_cameras(original, place)
     pairs = zip(original.labels, original.lenses or (), adjusted.lenses or (), strict=True)
     for label, before, after in pairs:
@@ -156,7 +146,7 @@ def transfer_of(original: Cameras, adjusted: Cameras, place: IntArray) -> CloudT
                 " cameras. Give the model from which the cameras were adjusted."
             )
             raise GeometryError("adjusted_from.shape", words, image=label)
-    return CloudTransfer(original, adjusted, row, left_out)
+    return CloudTransfer(original, adjusted, row)
 
 
 def renumbered(views: Views, row: IntArray) -> tuple[Views, IntArray]:
@@ -226,7 +216,6 @@ class CloudTransfer:
     original: Cameras  # in the cloud's CRS, with angles and lenses
     adjusted: Cameras  # the same, row by row; both lenses of an image have one unit
     row: IntArray  # (o,), row here of each original camera as read, -1 if it was not adjusted
-    left_out: tuple[str, ...]  # images of the original model that were not adjusted
 
     def step(self, xyz: FloatArray, listed: Views | None) -> Transferred:
         """Transfer points.
@@ -251,13 +240,6 @@ class CloudTransfer:
             in_frame = views_in_frame(xyz[rows], original)
             shift[rows], moved[rows] = transfer(xyz[rows], in_frame, original, adjusted)
         return Transferred(xyz, xyz + shift, moved, views)
-
-    def back(self, ties: TiePoints) -> TiePoints:
-        """Return tie points of the adjusted block, transferred to the original cameras."""
-        known = np.flatnonzero(np.isfinite(ties.xyz).all(axis=1))
-        xyz, views = ties.xyz.copy(), ties.views.take(known)
-        xyz[known] += transfer(xyz[known], views, self.adjusted, self.original)[0]
-        return replace(ties, xyz=xyz)
 
     def check_models(self, xyz: FloatArray) -> None:
         """Refuse models in different places, given points of the cloud."""
@@ -296,7 +278,6 @@ class CloudTransfer:
             "not_transferred": counts.not_moved,
             "not_transferred_reason": REASON,
             "shift_m": {name: round(float(value), 4) for name, value in shift.items()},
-            "cameras_left_out": list(self.left_out),
         }
 
     def provenance(self) -> dict[str, Any]:

@@ -15,7 +15,6 @@ from pcfix.adjust.block import (
     LEAST_VIEWS,
     WATER,
     Material,
-    Progress,
     gnss_with_sigma,
     usable_ties,
     with_places,
@@ -23,6 +22,7 @@ from pcfix.adjust.block import (
 from pcfix.adjust.block import taken as taken_ties
 from pcfix.adjust.methods import LEAST_TIES, adjust_block, check_control, check_images, check_marks
 from pcfix.adjust.result import Adjusted, adjustment_dict, before_of
+from pcfix.adjust.solve import Progress
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.diagnosis import flags_of, water_word
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
@@ -102,7 +102,7 @@ def adjust_cameras(
         some of its points replace missing tie points), gcps, gnss, lens (fixed unless
         lens_unknowns are given) and others.
     progress : callable, optional
-        Called with the `LogRow` of each step.
+        Called with a line of text after each step.
 
     Raises
     ------
@@ -270,17 +270,16 @@ def _calibration(path: File, cameras: Cameras) -> Lens:
 
 def _write(folder: Path, found: Adjusted, model: str) -> None:
     """Write an adjusted block: model, camera files, summary, report; all or nothing."""
-    before = before_of(found)
     with temporary_output(folder, is_folder=True) as draft:
         _write_models(draft, found)
         if found.unknowns.surface.get("shape") and isinstance(found.water, WaterRaster):
             write_water_raster(draft / WATER_FILE, found.water, found.cameras.crs)
         if found.precision.members is not None:
             write_members(draft, found.precision.members)
-        summary = {"model": model, **adjustment_dict(found, before)}
+        summary = {"model": model, **adjustment_dict(found, before_of(found))}
         text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
         write_text(draft / SUMMARY, text, overwrite=False)
-        write_text(draft / "report.html", adjustment_page(found, before), overwrite=False)
+        write_text(draft / "report.html", adjustment_page(summary), overwrite=False)
 
 
 def _write_models(folder: Path, found: Adjusted) -> None:

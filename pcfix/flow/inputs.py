@@ -219,18 +219,12 @@ def _without(both: list[Inputs], kept: Sequence[bool], **changes: Any) -> list[I
 def original_ties(
     inputs: Inputs, transfer: CloudTransfer | None, cloud_crs: str | CRS | None
 ) -> TiePoints | None:
-    """Return the tie points of the model that made the cloud, with the cameras of a transfer.
-
-    Those of the original model show best which images made the cloud; second best are the adjusted
-    ones, transferred back.
-    """
+    """Return the tie points of the model that made the cloud, with the cameras of a transfer."""
     if transfer is None:
         return ties_of(inputs, cloud_crs)
-    original, adjusted = both_models(inputs)
-    ties = original.tie_points(cloud_crs)
+    ties = both_models(inputs)[0].tie_points(cloud_crs)
     if ties is None:
-        ties = adjusted.tie_points(cloud_crs)
-        return None if ties is None else transfer.back(ties)
+        return None
     views, entry = renumbered(ties.views, transfer.row)
     return replace(ties, views=views, image_xy=ties.image_xy[entry])
 

@@ -55,7 +55,7 @@ def pose_errors(
     if those of the survey were adjusted since.
     """
     k = len(survey.cameras)
-    transfer = transfer or CloudTransfer(survey.cameras, survey.cameras, np.arange(k), ())
+    transfer = transfer or CloudTransfer(survey.cameras, survey.cameras, np.arange(k))
     step = transfer.step(sample.xyz, sample.views)
     above = surface_above(survey.water, step.xyz, sample.heights)
     wet = is_submerged(step.xyz[:, 2], above) & step.moved & ~np.isin(sample.classes, NOISE_CLASSES)

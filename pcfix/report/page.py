@@ -197,10 +197,10 @@ class Report:
     lead: str
     head: Table  # beside the map
     warnings: list[str]
-    maps: Maps
-    layers: list[Layer]
-    pictures: list[Picture]  # the first `FIGURES` are shown, the others folded
     tables: list[Table]  # the first is shown, the others folded
+    maps: Maps | None = None  # None for a page without a map
+    layers: Sequence[Layer] = ()
+    pictures: Sequence[Picture] = ()  # the first `FIGURES` are shown, the others folded
     provenance: list[Table] = field(default_factory=list)
     tiles: Sequence[Tile] = ()
     place: str = ""  # CRS and vertical datum of the map
@@ -233,7 +233,7 @@ def render(report: Report) -> str:
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, finalize=_as_read,
     ).get_template("page.html.j2")  # fmt: skip
-    data = Markup(map_json(report.maps, report.layers))
+    data = None if report.maps is None else Markup(map_json(report.maps, report.layers))
     return template.render(report=report, figures=FIGURES, map_data=data)
 
 
@@ -248,7 +248,7 @@ SMOOTH_CELLS = 1.5
 """Single cells are noisy: the shade is of a surface smoothed by this."""
 
 
-def map_json(maps: Maps, layers: list[Layer]) -> str:
+def map_json(maps: Maps, layers: Sequence[Layer]) -> str:
     """Return the data as JSON without "<", so that no text in it can end the script element.
 
     Layers are differences of 16-bit integers, compressed by zlib, in base 64.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.adjust.methods import offset_of
+from pcfix.adjust.methods import height_offset
 from pcfix.flow.adjust import adjust_cameras
 from tests.utils.adjust_files import write_block, write_gnss
 from tests.utils.block_kinds import write_kind
@@ -40,18 +40,18 @@ def test_offset(files, adjust):
     """The water level shows it; a free focal length absorbs it."""
     lens = files.folder / "lens.csv"
     right, moved = adjust(lens=lens), adjust(UP_M, lens=lens)
-    (first, sigma), (second, sigma_m) = offset_of(right), offset_of(moved)
-    assert second - first == pytest.approx([0.0, 0.0, UP_M], abs=0.02)
+    (first, sigma), (second, sigma_m) = height_offset(right), height_offset(moved)
+    assert second - first == pytest.approx(UP_M, abs=0.02)
     # as well as the level is known where it is free, which is the same question
     level = adjust(lens=lens, free=("level",)).precision.sigma_of("level")
-    assert sigma_m[2] == pytest.approx(level, rel=0.05)
-    assert abs(first[2]) < 3.0 * sigma[2]
+    assert sigma_m == pytest.approx(level, rel=0.05)
+    assert abs(first) < 3.0 * sigma
     note = note_of(moved, "gnss.offset_found")
-    assert note.values["offset_m"][2] == pytest.approx(UP_M, abs=0.1)
-    assert note.values["sigma_m"][2] == pytest.approx(0.04, abs=0.005)
+    assert note.values["offset_m"] == pytest.approx(UP_M, abs=0.1)
+    assert note.values["sigma_m"] == pytest.approx(0.04, abs=0.005)
     assert "a water level that is too low" in str(note)
     assert note_of(right, "gnss.offset_found") is None
-    assert offset_of(adjust(UP_M))[1][2] > 2.0 * sigma_m[2]
+    assert height_offset(adjust(UP_M))[1] > 2.0 * sigma_m
 
 
 def test_few_positions_and_the_cloud(files, adjust):

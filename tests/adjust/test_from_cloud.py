@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 
 from pcfix.adjust.block import Material, Unknowns, block_of, ties_of_cloud
-from pcfix.adjust.from_cloud import CloudBlock, adjust_cloud
+from pcfix.adjust.from_cloud import adjust_cloud
 from pcfix.adjust.from_ties import adjust_ties
 from pcfix.model import GnssPositions
 from tests.utils.codes import refused
 from tests.utils.tie_points import simulate_tie_points
 from tests.utils.unaware_blocks import unaware
 
-FOCAL = (("f",),)
 SMALL = {"area_m": (50, 40), "greatest_depth_m": 5, "position_noise_m": 0.5,
          "attitude_noise_deg": 0.3}  # fmt: skip
 
@@ -40,7 +39,7 @@ def cloud_block(made, *, gnss=True, control=None, exact=True):
     material = Material("model", old, scene.water, scene.refractive_index, datum, control)
     whole = block_of(material, ties, 1.0)
     apparent = ties.xyz if control is None else np.vstack([ties.xyz, control.xyz])
-    return CloudBlock(whole, old, apparent)
+    return whole, old, apparent
 
 
 def centre_error_m(made, cameras):
@@ -55,7 +54,7 @@ def centre_error_m(made, cameras):
 def test_comes_home(settings):
     made = block(**settings)
     assert centre_error_m(made, made.cameras) > 0.1
-    found = adjust_cloud(cloud_block(made), Unknowns(), FOCAL)
+    found = adjust_cloud(*cloud_block(made), Unknowns())
     assert centre_error_m(made, found.cameras) < HOME_M
     # px; a micrometre of 50 m is that of 3648 px in the focal length
     assert abs(found.cameras.lenses[0].focal - made.scene.true_cameras.lenses[0].focal) < 1e-4
@@ -68,7 +67,7 @@ def test_control_points():
     control = replace(
         made.scene.control, xyz=made.scene.control_truth, image_xy=made.scene.control_exact_xy
     )
-    found = adjust_cloud(cloud_block(made, gnss=False, control=control), Unknowns(), FOCAL)
+    found = adjust_cloud(*cloud_block(made, gnss=False, control=control), Unknowns())
     assert centre_error_m(made, found.cameras) < 10 * HOME_M  # four points hold six strips
     assert {row.role for row in found.control} == {"control", "check"}
     for row in found.control:
@@ -80,7 +79,7 @@ def test_noise():
     """As the old columns are nearly those of light through the water, so are the estimates."""
     made = block(400, exact=False)
     scene = made.scene
-    mended = adjust_cloud(cloud_block(made, exact=False), Unknowns(), FOCAL)
+    mended = adjust_cloud(*cloud_block(made, exact=False), Unknowns())
     gnss = scene.cameras.gnss
     material = Material("model", scene.cameras, scene.water, scene.refractive_index, gnss)
     whole = block_of(material, scene.ties, scene.noise.image_px)
@@ -104,4 +103,4 @@ def test_noise():
 def test_refused(unknowns, code):
     one = cloud_block(block(40), gnss=unknowns.poses == "similarity" or bool(unknowns.surface))
     with refused(code):
-        adjust_cloud(one, unknowns, FOCAL)
+        adjust_cloud(*one, unknowns)

@@ -144,23 +144,6 @@ def test_weak_lens():
     assert not named.notes
 
 
-def test_noise_differs():
-    """Noise of 0.3 px and of 0.9 px under water, each found to a tenth; a given one is kept."""
-    made = scene(0.3)
-    wet = np.repeat(made.is_wet, np.diff(made.views.start))
-    more = np.random.default_rng(5).normal(0.0, np.sqrt(0.9**2 - 0.3**2), (len(wet), 2))
-    ties = replace(made.ties, image_xy=made.ties.image_xy + np.where(wet[:, None], more, 0.0))
-    found = adjust_ties(block(made, ties), FOCAL)
-    weight = found.problem.given.weight
-    for group, noise_px in ((~wet, 0.3), (wet, 0.9)):
-        assert np.median(1.0 / weight[group & found.used]) == pytest.approx(noise_px, rel=0.1)
-    for equal in (
-        adjust_ties(block(made, ties), FOCAL, sigma_px=0.7),
-        adjust_ties(block(made), FOCAL),
-    ):
-        assert len(np.unique(equal.problem.given.weight[equal.used])) == 1
-
-
 # px: what distortion may hide in the noise, and what a block of so few points sees of it
 NOISE_PX = 0.3
 

@@ -57,7 +57,7 @@ def speed(given):
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
         if points > 1000:  # the first block compiles the kernels
             print(
-                f"{points:<8} {len(block.camera):>12} {wall:>8.1f} {cpu:>8.1f} {len(found.log):>6}"
+                f"{points:<8} {len(block.camera):>12} {wall:>8.1f} {cpu:>8.1f} {found.steps:>6}"
                 f" {1e6 * cpu / len(block.camera):>7.1f} {peak:>5.0f}"
                 f" {np.sqrt((off**2).sum(axis=1).mean()):>10.4f}",
                 flush=True,

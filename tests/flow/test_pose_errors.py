@@ -121,7 +121,7 @@ def test_same_as_twin(moved):
     views = Views(np.arange(0, 13, 3), np.arange(12) % 3)
     sample = Points(xyz, None, np.zeros(4, np.uint8), views=views)
     survey = Survey(WaterPlane(LEVEL_M), new, replace(EXACT, index=N))
-    found = variances(sample, survey, members, CloudTransfer(old, new, np.arange(3), ()))
+    found = variances(sample, survey, members, CloudTransfer(old, new, np.arange(3)))
     assert np.sqrt(wanted).min() > 0.05
     # the twin is of first order, the members are not
     np.testing.assert_allclose(np.sqrt(found), np.sqrt(wanted), rtol=0.01)

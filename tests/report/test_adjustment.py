@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcfix.adjust.block import Block, LogRow, Unknowns
+from pcfix.adjust.block import Block, Unknowns
 from pcfix.adjust.precision import Precision, SharedUnknown
 from pcfix.adjust.problem import Intersected, prepare
 from pcfix.adjust.result import Adjusted, ControlRow, adjustment_dict, before_of
 from pcfix.errors import PcfixWarning
 from pcfix.model import Cameras, Lens, WaterPlane
-from pcfix.report.adjustment import adjustment_page
+from pcfix.report.adjustment import adjustment_page, adjustment_text
 from tests.report.test_report import Elements
 from tests.utils.shared import ROOT
 
@@ -78,8 +78,6 @@ def adjusted():
     used = np.ones(72, bool)
     used[[1, 40]] = False
     residual[~used] = 30.0
-    rounds = [LogRow(1, 1, 72, 2.5), LogRow(1, 2, 72, 0.9),
-              LogRow(2, 1, 70, 0.37)]  # fmt: skip
     control = [
         ControlRow("G1", "control", 0.010, -0.020, 0.030, 0.5, 3),
         ControlRow("G2", "control", 0.010, 0.020, -0.050, 0.7, 2),
@@ -95,9 +93,9 @@ def adjusted():
     numbers = np.array([LEVEL + 0.02 - origin[2], 0.0, 0.0, 1.34, *[0.0] * 7])
     return Adjusted(
         block, unknowns, after, WaterPlane(LEVEL + 0.02), 1.34, xyz, residual, used, is_wet, 1.234,
-        60, rounds, "tie points", make_precision(len(xyz)), gnss, control,
+        60, "tie points", make_precision(len(xyz)), gnss, control,
         [PcfixWarning("adjust.lens", "something <decided>")], problem,
-        replace(start, state=start.state._replace(water=numbers)),
+        replace(start, state=start.state._replace(water=numbers), rounds=2, steps=3),
     )  # fmt: skip
 
 
@@ -140,11 +138,11 @@ def test_values(adjusted):
     assert values["precision"]["images"] == 2
     # standard errors 1, 2, 3 cm of one pose, twice these of the other
     assert values["precision"]["centre_mean_m"] == pytest.approx([0.015, 0.03, 0.045])
-    assert values["precision"]["angle_largest_deg"] == pytest.approx(
-        np.degrees([0.002, 0.004, 0.006])
+    assert values["precision"]["angle_mean_deg"] == pytest.approx(
+        np.degrees([0.0015, 0.003, 0.0045])
     )
     assert values["poses"]["moved_rms_m"] == pytest.approx(0.3)
-    assert values["poses"]["turned_largest_deg"] == 0.0
+    assert values["poses"]["turned_rms_deg"] == 0.0
 
 
 def bare(adjusted):
@@ -153,21 +151,33 @@ def bare(adjusted):
     return replace(
         adjusted, block=block, water=None, is_wet=np.zeros(len(adjusted.xyz), bool), control=[],
         gnss_residual_m=np.full((3, 3), np.nan), notes=[],
-        rounds=adjusted.rounds[:1], unknowns=Unknowns(poses="fixed", lens=()),
+        unknowns=Unknowns(poses="fixed", lens=()),
     )  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", ["whole", "bare"])
 def test_page(adjusted, kind):
     before, it = before_px(adjusted), adjusted if kind == "whole" else bare(adjusted)
-    elements = Elements(adjustment_page(it, before))
-    said = " ".join(elements.said)
-    assert not re.search(r"\bnan\b|\bNone\b|\binf\b", said)
-    assert "70 observations fit within 0." in said
-    assert all(len(p["alt"]) > 20 and p["src"].startswith("data:") for p in elements.all("img"))
-    assert len(elements.all("img")) == (kind == "whole")
-    if kind == "whole":
-        assert "Something <decided>" in said
+    values = adjustment_dict(it, before)
+    said = " ".join(Elements(adjustment_page(values)).said)
+    assert not re.search(r"\bnan\b|\bNone\b|\binf\b", said + adjustment_text(values))
+    assert "Adjusted 3 images and 24 points" in said
+    assert ("Something <decided>" in said) == (kind == "whole")
+
+
+def test_text(adjusted):
+    """Before and after: lens and level with standard errors, residuals, GNSS; what is known."""
+    lines = adjustment_text(adjustment_dict(adjusted, before_px(adjusted))).splitlines()
+    rows = [re.split(r"  +", line.strip()) for line in lines[1:7]]
+    table = {label: numbers for label, *numbers in rows}
+    assert table["Focal length (px)"] == ["1000", "1002", "0.25"]
+    assert table["Water level (m)"] == ["0.5", "0.52", "0.004"]
+    assert table["Residuals on land (px)"] == ["1.200", "0.300"]
+    assert table["Residuals under water (px)"] == ["2.400", "0.400"]
+    # of differences of 1, 2, 3 and 5, 2, 9 cm
+    wanted = np.sqrt((0.01**2 + 0.02**2 + 0.03**2 + 0.05**2 + 0.02**2 + 0.09**2) / 2.0)
+    assert float(table["Centres minus GNSS (m)"][1]) == pytest.approx(wanted, abs=5e-4)
+    assert "  Bed               heights known to 0.030 m (standard error)" in lines
 
 
 def test_check_points(adjusted):
