@@ -18,18 +18,17 @@ from pcfix.io.files import read_json, sha256, write_bytes, write_text
 from pcfix.io.las.source import coordinates, stated_crs
 from pcfix.io.rasters import preview
 from pcfix.io.tiles import Tiles, open_cloud
-from pcfix.model import NOISE_CLASSES
+from pcfix.model import NOISE_CLASSES, Cameras
 from pcfix.report.adjustment import adjustment_tables
 from pcfix.report.comparison import evaluation
-from pcfix.report.page import Picture, Report, Table, render
-from pcfix.report.run import RunResults, in_short, run_report
+from pcfix.report.page import Report, Table, render
+from pcfix.report.run import CloudMaps, run_report
 from pcfix.report.summary import Summary
-from pcfix.report.text import uncertainty_sentence
+from pcfix.report.text import Plain, uncertainty_sentence
 
-Plain = dict[str, Any]
 COLUMNS = ("WaterDepth", "ShiftZ", "RayCount", "SigmaZ")
 SAMPLE_POINTS = 200_000
-"""Points in histogram and uncertainty figure, evenly spread over the file."""
+"""Points in the figure of uncertainty, evenly spread over the file."""
 PAGE = "report.html"
 RESULTS = {
     "corrected.laz": "all points, the bed corrected",
@@ -55,70 +54,79 @@ RESULTS = {
 def report_run(
     run: RunFolder, inputs: list[Path], first: Plain, corrected: Plain, compared: Plain
 ) -> Plain:
-    """Write the page of a run, and return what it says in short."""
-    pictures, tables, dod, verdict = list[Picture](), list[Table](), None, ""
+    """Write the page of a run, and return what it says in short.
+
+    `first`, `corrected` and `compared` are the results of these steps.
+    """
+    more: Plain = {"pictures": [], "tables": [], "compared": compared.get("figures", {})}
     if first["why"]:
         how = "not adjusted:" if first["model"] is None else "adjusted first, as"
-        verdict = f" The cameras were {how} {first['why']}."
+        more["verdict"] = f" The cameras were {how} {first['why']}."
     request, summary = run.request, Summary(**corrected)
     if compared:
         dod = preview(run.dod, MOST_CELLS) if request.has_surface else None
-        pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
+        figures = evaluation(compared["figures"], compared["sections"], dod)
+        more |= {"difference": dod, "pictures": figures[0], "tables": figures[1]}
     if first["model"] is not None:
-        figures = read_json(run.folder / FOLDER / SUMMARY)
-        tables += adjustment_tables(figures, f"{FOLDER}/report.html")
+        adjusted = read_json(run.folder / FOLDER / SUMMARY)
+        more["tables"] += adjustment_tables(adjusted, f"{FOLDER}/report.html")
     if (summary.water_fit or {}).get("model") == "auto":  # the water was sought in the cloud
-        pictures.append(found_picture(run.inputs.surface(view_of(request.source))))
-    results = RunResults(
-        summary, run.cameras, **read_cloud(run.cleaned_cloud, run.resolution_m),
-        project=request.project or "", date=request.date or "",
-        pictures=pictures, tables=tables, verdict=verdict, compared=compared.get("figures", {}),
-        difference=dod,
+        more["pictures"].append(found_picture(run.inputs.surface(view_of(request.source))))
+    page = write_report(
+        run.folder, summary, run.cameras, read_cloud(run.cleaned_cloud, run.resolution_m), inputs,
+        project=request.project or "", date=request.date or "", **more,
     )  # fmt: skip
-    page = write_report(results, inputs, run.folder)
+    shown = [
+        f"{tile.title}{f', {tile.tag}' if tile.tag else ''}: "
+        + ", ".join(f"{name} {value}" for name, value in tile.figures)
+        for tile in page.tiles
+        if tile.figures
+    ]
     return {
-        "in_short": in_short(page.tiles),
-        "uncertainty": uncertainty_sentence(summary, compared.get("figures", {}).get("tvu")),
+        "in_short": "; ".join(shown),
+        "uncertainty": uncertainty_sentence(summary, more["compared"].get("tvu")),
     }
 
 
-def write_report(run: RunResults, inputs: Sequence[Path], out_dir: Path) -> Report:
-    """Write ``report.html`` and ``figures/*.png`` of a run, into an existing folder.
+def write_report(
+    folder: Path, summary: Summary, cameras: Cameras, cloud: CloudMaps, inputs: Sequence[Path],
+    **more: Any,
+) -> Report:  # fmt: skip
+    """Write ``report.html`` and ``figures/*.png`` of a run, into its folder.
 
-    The page lists size and checksum of the files `inputs`.
+    The page lists size and checksum of the files `inputs`; `more` goes to `run_report`.
     """
     rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in inputs]
     table = Table("Input files", ["file", "bytes", "SHA-256"], rows)
     files = []
     for name, words in RESULTS.items():
-        tiles = out_dir / name.removesuffix(".laz")
-        if (out_dir / name).is_file():
+        tiles = folder / name.removesuffix(".laz")
+        if (folder / name).is_file():
             files.append((name, words))
         elif tiles.is_dir():  # of many files
             files.append((f"{tiles.name}/", words))
-    sections = sorted(out_dir.glob("compare/section_*.csv"))
+    sections = sorted(folder.glob("compare/section_*.csv"))
     files += [(f"compare/{one.name}", "a cross-section") for one in sections]
-    report = run_report(run, table, files)
-    figures = out_dir / "figures"
+    report = run_report(summary, cameras, cloud, inputs=[table], files=files, **more)
+    figures = folder / "figures"
     figures.mkdir(exist_ok=True)
     for picture in report.pictures:
         write_bytes(figures / f"{picture.name}.png", picture.png, overwrite=True)
-    write_text(out_dir / PAGE, render(report), overwrite=True)
+    write_text(folder / PAGE, render(report), overwrite=True)
     return report
 
 
-def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> Plain:
-    """Return maps, depths, a sample, CRS and vertical datum of a cloud, without noise.
+def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> CloudMaps:
+    """Return what the page shows of a cloud: maps, depths, a sample, CRS and vertical datum.
 
-    The cloud is from `correct_file` with all dimensions, cleaned or not. The names are those of
-    `RunResults`; `resolution_m` is that of the rasters.
+    The cloud is from `correct_file` with all dimensions, cleaned or not; `resolution_m` is that of
+    the rasters.
     """
     with open_cloud(path) as source:
-        builder = MapsBuilder(
-            source.header.mins[:2], source.header.maxs[:2], len(source), resolution_m
-        )
+        low, high = source.header.mins[:2], source.header.maxs[:2]
+        builder = MapsBuilder(low, high, len(source), resolution_m)
         every = max(1, len(source) // SAMPLE_POINTS)
-        sample, low, high, total, count = [], np.inf, -np.inf, 0.0, 0
+        sample, least, most, total, count = [], np.inf, -np.inf, 0.0, 0
         for points in source.chunks():
             good = ~np.isin(np.asarray(points["classification"]), NOISE_CLASSES)
             points = points[good & ~np.asarray(points["withheld"]).astype(bool)]
@@ -127,11 +135,8 @@ def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> Plain:
             builder.add(coordinates(points), moved, values)
             sample.append(values[-count % every :: every, [0, 3]])
             depth = values[:, 0]
-            low, high = depth.min(initial=low), depth.max(initial=high)
+            least, most = depth.min(initial=least), depth.max(initial=most)
             total, count = total + float(depth.sum()), count + len(depth)
-        crs, heights = crs_words(stated_crs(source))
-    depth_m = {"min": float(low), "mean": total / max(count, 1), "max": float(high)}
-    return {
-        "maps": builder.maps(), "depth_m": depth_m, "sample": np.vstack(sample), "crs": crs,
-        "heights": heights,
-    }  # fmt: skip
+        names = crs_words(stated_crs(source))
+    depth_m = {"min": float(least), "mean": total / max(count, 1), "max": float(most)}
+    return CloudMaps(builder.maps(), depth_m, np.vstack(sample), *names)

@@ -424,7 +424,7 @@ class RunResults:
         if not self.compared:
             return {}
         files = sorted((self.folder / "compare").glob("*.csv"))
-        rows = [{"of": name, **figures} for name, _, figures in signed_statistics(self.compared)]
+        rows = [{"of": name, **figures} for name, figures in signed_statistics(self.compared)]
         pandas = analysis_library("pandas")
         statistics = pandas.json_normalize(rows).set_index("of")
         return {"statistics": statistics, **{one.stem: pandas.read_csv(one) for one in files}}

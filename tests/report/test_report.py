@@ -14,7 +14,6 @@ import pcfix
 from pcfix.flow.report import read_cloud, write_report
 from pcfix.grid.maps import MapsBuilder
 from pcfix.report.page import Layer, Report, Table, Tile, render
-from pcfix.report.run import RunResults
 from tests.utils.browser import needs_browser, open_page
 from tests.utils.shared import SCENE
 
@@ -28,8 +27,7 @@ def report(tmp_path_factory):
         cloud, folder / "corrected.laz", cameras=cameras, water=0.37, method="snell", max_angle=None
     )
     found = read_cloud(folder / "corrected.laz")
-    run = RunResults(summary, pcfix.read_cameras(cameras), **found)
-    write_report(run, [cloud, cameras], folder)
+    write_report(folder, summary, pcfix.read_cameras(cameras), found, [cloud, cameras])
     return folder, summary
 
 
