@@ -8,10 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pcfix.compare.figures import Comparison, bins_table, figures_of
+from pcfix.compare.figures import Comparison, bins_table, figures_of, parse_line
 from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.compare.match import Match, SurveyCloud, match
-from pcfix.compare.sections import parse_line
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
 from pcfix.io.atomic import all_or_none
@@ -57,7 +56,7 @@ def compare_clouds(
         the cloud's surface is measured, not the reference's at each point of the cloud.
     options : CompareOptions, optional
         Or its attributes as keywords: the options of ``pcfix compare``. `section` takes texts
-        ``x1,y1,x2,y2`` or `pcfix.compare.sections.SectionLine`, `share` texts or pairs, `also`
+        ``x1,y1,x2,y2`` or `pcfix.compare.figures.SectionLine`, `share` texts or pairs, `also`
         texts, pairs or a dict of paths by name.
 
     """
