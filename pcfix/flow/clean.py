@@ -20,7 +20,7 @@ from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import noted_header, own_settings
 from pcfix.io.tiles import Clouds, open_cloud
-from pcfix.model import LOW_NOISE, NOISE_CLASSES, BoolArray
+from pcfix.model import LOW_NOISE, BoolArray
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CleanOptions, CleanRules
@@ -96,11 +96,8 @@ def find_noise(
     first = 0
     for points in view.chunks(water, set(WEAK).intersection(view.names)):
         rows = slice(first, first + len(points.xyz))
-        used = ~np.isin(points.classes, NOISE_CLASSES)
-        if points.withheld is not None:
-            used &= ~points.withheld
         above = None if water is None else surface_above(water, points.xyz, points.heights)
-        cloud.add(rows, points.xyz, used, above, points.dimensions or {}, rules)
+        cloud.add(rows, points.xyz, points.counts(), above, points.dimensions or {}, rules)
         first = rows.stop
         release()
         current().report(len(points.xyz))

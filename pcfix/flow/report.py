@@ -15,10 +15,10 @@ from pcfix.flow.water import found_picture
 from pcfix.grid.maps import MOST_CELLS, MapsBuilder
 from pcfix.io.crs import crs_words
 from pcfix.io.files import read_json, sha256, write_bytes, write_text
-from pcfix.io.las.source import coordinates, stated_crs
+from pcfix.io.las.source import stated_crs
 from pcfix.io.rasters import preview
 from pcfix.io.tiles import Tiles, open_cloud
-from pcfix.model import NOISE_CLASSES, Cameras
+from pcfix.model import Cameras
 from pcfix.report.adjustment import adjustment_tables
 from pcfix.report.comparison import evaluation
 from pcfix.report.page import Report, Table, render
@@ -122,21 +122,21 @@ def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> CloudMa
     The cloud is from `correct_file` with all dimensions, cleaned or not; `resolution_m` is that of
     the rasters.
     """
-    with open_cloud(path) as source:
-        low, high = source.header.mins[:2], source.header.maxs[:2]
-        builder = MapsBuilder(low, high, len(source), resolution_m)
-        every = max(1, len(source) // SAMPLE_POINTS)
-        sample, least, most, total, count = [], np.inf, -np.inf, 0.0, 0
-        for points in source.chunks():
-            good = ~np.isin(np.asarray(points["classification"]), NOISE_CLASSES)
-            points = points[good & ~np.asarray(points["withheld"]).astype(bool)]
-            moved = np.asarray(points["RayCount"]) > 0
-            values = np.column_stack([np.asarray(points[name])[moved] for name in COLUMNS])
-            builder.add(coordinates(points), moved, values)
-            sample.append(values[-count % every :: every, [0, 3]])
-            depth = values[:, 0]
-            least, most = depth.min(initial=least), depth.max(initial=most)
-            total, count = total + float(depth.sum()), count + len(depth)
-        names = crs_words(stated_crs(source))
+    view = view_of(path)
+    builder = MapsBuilder(view.low, view.high, view.points, resolution_m)
+    every = max(1, view.points // SAMPLE_POINTS)
+    sample, least, most, total, count = [], np.inf, -np.inf, 0.0, 0
+    for points in view.chunks(None, COLUMNS):
+        good, known = points.counts(), points.dimensions or {}
+        values = np.column_stack([known[name][good] for name in COLUMNS])
+        moved = values[:, 2] > 0.0
+        values = values[moved]
+        builder.add(points.xyz[good], moved, values)
+        sample.append(values[-count % every :: every, [0, 3]])
+        depth = values[:, 0]
+        least, most = depth.min(initial=least), depth.max(initial=most)
+        total, count = total + float(depth.sum()), count + len(depth)
     depth_m = {"min": float(least), "mean": total / max(count, 1), "max": float(most)}
+    with open_cloud(path) as source:
+        names = crs_words(stated_crs(source))
     return CloudMaps(builder.maps(), depth_m, np.vstack(sample), *names)

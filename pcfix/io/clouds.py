@@ -52,6 +52,11 @@ class Points(NamedTuple):
     views: Views | None = None
     dimensions: Mapping[str, FloatArray] | None = None  # (n,), those that were asked for, by name
 
+    def counts(self, skip_classes: Sequence[int] = NOISE_CLASSES) -> BoolArray:
+        """Return which points are neither withheld nor of some classes, shape (n,)."""
+        good = ~np.isin(self.classes, skip_classes)
+        return good if self.withheld is None else good & ~self.withheld
+
     def take(self, rows: IntArray | slice) -> Points:
         """Return some of the points, without dimensions."""
         some: list[Any] = [None if v is None else np.ascontiguousarray(v[rows]) for v in self[:-2]]
@@ -146,9 +151,7 @@ def survey_cloud(
     columns: list[npt.NDArray[Any]] = []
     first = count = 0
     for points in chunks:
-        known, keep = points.dimensions or {}, ~np.isin(points.classes, skip_classes)
-        if points.withheld is not None:
-            keep &= ~points.withheld
+        known, keep = points.dimensions or {}, points.counts(skip_classes)
         if not given and "WaterDepth" in known:
             depth = known["WaterDepth"]
             above = np.where(depth > 0.0, points.xyz[:, 2] + depth, np.nan)

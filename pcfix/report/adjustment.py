@@ -81,8 +81,8 @@ def adjustment_sentence(d: Plain) -> str:
 
 def adjustment_text(d: Plain) -> str:
     """Return the summary of an adjustment as text."""
-    surveyed = _survey_table(d)
-    lines = [f"{label:<18} {words}" for label, words in _facts(d)] + _residual_table(d).lines()
+    residuals, surveyed, _ = _tables(d)
+    lines = [f"{label:<18} {words}" for label, words in _facts(d)] + residuals.lines()
     lines += surveyed.lines()[: 1 + MOST_LISTED] if surveyed.rows else []
     return "\n".join([*lines, *(f"Note: {note}" for note in all_notes(d))])
 
@@ -101,7 +101,6 @@ def adjustment_page(adjusted: Adjusted, before: Intersected) -> str:
         f" {d['observations']['used']:,} observations fit within {_residuals(d)} (RMS of a"
         " coordinate)."
     )
-    tables = [_residual_table(d), _survey_table(d), _correlation_table(d)]
     report = Report(
         title="Refractive bundle adjustment",
         lead=lead,
@@ -110,7 +109,7 @@ def adjustment_page(adjusted: Adjusted, before: Intersected) -> str:
         maps=maps,
         layers=layers,
         pictures=[] if picture is None else [picture],
-        tables=[table for table in tables if table.rows],
+        tables=[table for table in _tables(d) if table.rows],
     )
     return render(report)
 
@@ -123,7 +122,7 @@ def adjustment_tables(d: Plain, page: str) -> list[Table]:
     rows: list[list[str]] = [["Note", note] for note in all_notes(d)]
     rows.append(["Full report", Markup('<a href="{0}">{0}</a>').format(page)])
     title = "Refractive bundle adjustment"
-    return [Table(title, [], [*facts.rows, *rows]), _residual_table(d)]
+    return [Table(title, [], [*facts.rows, *rows]), _tables(d)[0]]
 
 
 # Facts
@@ -215,36 +214,12 @@ def _map(a: Adjusted, before: Intersected) -> tuple[Maps, list[Layer]]:
     ]
 
 
-# Tables
+def _tables(d: Plain) -> tuple[Table, Table, Table]:
+    """Return residuals and precision, surveyed points, and correlations, each maybe without rows.
 
-
-def _correlation_table(d: Plain) -> Table:
-    p = d["precision"]
-    names = [row["name"].replace("_", " ") for row in p["shared"]]
-    rows = [
-        [name, *(fixed(value, 3, "+") for value in row)]
-        for name, row in zip(names, p["correlation"], strict=True)
-    ]
-    return Table("Correlations of the shared unknowns", ["", *names], rows if len(rows) > 1 else [])
-
-
-def _survey_table(d: Plain) -> Table:
-    """Return surveyed points, adjusted minus surveyed."""
-    header = ["surveyed points", "role", "dX (m)", "dY (m)", "dZ (m)", f"RMS ({d['image_unit']})"]
-    rows = [
-        [
-            row["name"], role, *(fixed(row[key], 3, "+") for key in ("dx_m", "dy_m", "dz_m")),
-            fixed(row["rms_px"], 2), str(row["images"]),
-        ]
-        for role in ("control", "check")
-        for row in (d[role] or {"points": []})["points"]
-    ]  # fmt: skip
-    return Table("Control and check points", [*header, "images"], rows)
-
-
-def _residual_table(d: Plain) -> Table:
-    """Return residuals and precision on land and under water, as in Mulsow 2024."""
-    unit = d["image_unit"]
+    The first is for land and water, as in Mulsow 2024; the second is adjusted minus surveyed.
+    """
+    unit, precision = d["image_unit"], d["precision"]
     header = [
         "residuals", "points", "observations", f"before ({unit})", f"RMS ({unit})",
         f"x / y ({unit})", "RMS (m)", "sigma X (m)", "sigma Y (m)", "sigma Z (m)",
@@ -259,7 +234,24 @@ def _residual_table(d: Plain) -> Table:
         for key, where in WHERE
         if (r := d["residuals"][key])["points"]
     ]  # fmt: skip
-    return Table("Residuals and precision on land and under water", header, rows)
+    residuals = Table("Residuals and precision on land and under water", header, rows)
+    header = ["surveyed points", "role", "dX (m)", "dY (m)", "dZ (m)", f"RMS ({unit})", "images"]
+    rows = [
+        [
+            row["name"], role, *(fixed(row[key], 3, "+") for key in ("dx_m", "dy_m", "dz_m")),
+            fixed(row["rms_px"], 2), str(row["images"]),
+        ]
+        for role in ("control", "check")
+        for row in (d[role] or {"points": []})["points"]
+    ]  # fmt: skip
+    surveyed = Table("Control and check points", header, rows)
+    names = [row["name"].replace("_", " ") for row in precision["shared"]]
+    rows = [
+        [name, *(fixed(value, 3, "+") for value in row)]
+        for name, row in zip(names, precision["correlation"], strict=True)
+    ]
+    rows = rows if len(rows) > 1 else []
+    return residuals, surveyed, Table("Correlations of the shared unknowns", ["", *names], rows)
 
 
 # Picture
