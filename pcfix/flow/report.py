@@ -19,7 +19,7 @@ from pcfix.io.las.source import stated_crs
 from pcfix.io.rasters import preview
 from pcfix.io.tiles import Tiles, open_cloud
 from pcfix.model import Cameras
-from pcfix.report.adjustment import adjustment_tables
+from pcfix.report.adjustment import adjustment_sentence
 from pcfix.report.comparison import evaluation
 from pcfix.report.page import Report, Table, render
 from pcfix.report.run import CloudMaps, run_report
@@ -68,8 +68,7 @@ def report_run(
         figures = evaluation(compared["figures"], compared["sections"], dod)
         more |= {"difference": dod, "pictures": figures[0], "tables": figures[1]}
     if first["model"] is not None:
-        adjusted = read_json(run.folder / FOLDER / SUMMARY)
-        more["tables"] += adjustment_tables(adjusted, f"{FOLDER}/report.html")
+        more["verdict"] += f" {adjustment_sentence(read_json(run.folder / FOLDER / SUMMARY))}."
     if (summary.water_fit or {}).get("model") == "auto":  # the water was sought in the cloud
         more["pictures"].append(found_picture(run.inputs.surface(view_of(request.source))))
     page = write_report(

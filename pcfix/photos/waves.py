@@ -43,7 +43,6 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError
 from pcfix.grid.lattice import Lattice
-from pcfix.lens.imaging import project, unproject
 from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.photos.calm import grey8
@@ -90,7 +89,7 @@ class Nodes(NamedTuple):
 
 def on_level(view: View, pixels: FloatArray) -> FloatArray:
     """Return where the straight rays of pixels meet the level, shape (n, 3)."""
-    ray = unproject(view.photo.lens, pixels) @ view.photo.rotation
+    ray = view.photo.rays(pixels)
     far = (view.level_m - view.photo.centre[2]) / ray[:, 2]
     return np.asarray(view.photo.centre + np.where(far > 0.0, far, np.nan)[:, None] * ray)
 
@@ -132,13 +131,9 @@ def nodes_of(view: View, cell_m: float | None) -> Nodes:
     x = lattice.left_m + (np.arange(columns) + 0.5) * cell
     y = lattice.top_m - (np.arange(rows) + 0.5) * cell
     xy = np.column_stack([np.tile(x, rows), np.repeat(y, columns)])
-    pixel = _pixels(view, np.column_stack([xy, np.full(len(xy), view.level_m)]))
+    pixel = view.photo.pixels(np.column_stack([xy, np.full(len(xy), view.level_m)]))
     inside = ((pixel > 0.0) & (pixel < [lens.width, lens.height])).all(axis=1)
     return Nodes(lattice, xy, np.asarray(inside))
-
-
-def _pixels(view: View, xyz: FloatArray) -> FloatArray:
-    return project(view.photo.lens, (xyz - view.photo.centre) @ view.photo.rotation.T)
 
 
 def displacements(
@@ -154,11 +149,11 @@ def displacements(
     weight = texture / (texture + np.median(texture[texture > 0.0]) + 1e-30)
     weight = weight.astype(np.float32)
     level = np.full(len(nodes.xy), view.level_m)
-    at = (_pixels(view, np.column_stack([nodes.xy, level])) - 0.5).astype(np.float32)
+    at = (view.photo.pixels(np.column_stack([nodes.xy, level])) - 0.5).astype(np.float32)
     # means over a cell, as seen in the middle of the raster
     centre = np.append(nodes.xy[len(nodes.xy) // 2], view.level_m)
     ends = centre + np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]) * nodes.lattice.resolution_m
-    side = int(np.hypot(*np.diff(_pixels(view, ends), axis=0)[0])) | 1
+    side = int(np.hypot(*np.diff(view.photo.pixels(ends), axis=0)[0])) | 1
     base = cv2.blur(weight, (side, side))
     weight_at = cv2.remap(base, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0]
     weight_at = np.where(nodes.seen, weight_at, 0.0).astype(np.float64)
@@ -181,7 +176,7 @@ def slopes_of(view: View, xy: FloatArray, height_m: FloatArray, shift_px: FloatA
     pierced = np.column_stack([xy, height_m])
     seen = pierced - view.photo.centre
     seen /= np.linalg.norm(seen, axis=1)[:, None]
-    wet = bed_places(view, _pixels(view, pierced) + shift_px) - pierced
+    wet = bed_places(view, view.photo.pixels(pierced) + shift_px) - pierced
     wet[~(wet[:, 2] < 0.0)] = np.nan
     wet /= np.linalg.norm(wet, axis=1)[:, None]
     normal = seen - view.refractive_index * wet

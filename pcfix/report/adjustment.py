@@ -101,10 +101,11 @@ def adjustment_page(adjusted: Adjusted, before: Intersected) -> str:
         f" {d['observations']['used']:,} observations fit within {_residuals(d)} (RMS of a"
         " coordinate)."
     )
+    facts = [[label[:1].upper() + label[1:], words] for label, words in _facts(d)]
     report = Report(
         title="Refractive bundle adjustment",
         lead=lead,
-        head=_fact_table(d),
+        head=Table("In short", [], facts),
         warnings=all_notes(d),
         maps=maps,
         layers=layers,
@@ -112,17 +113,6 @@ def adjustment_page(adjusted: Adjusted, before: Intersected) -> str:
         tables=[table for table in _tables(d) if table.rows],
     )
     return render(report)
-
-
-def adjustment_tables(d: Plain, page: str) -> list[Table]:
-    """Return what an adjustment changed, for the page of a run, with a link to its own page."""
-    from markupsafe import Markup
-
-    facts = _fact_table(d)
-    rows: list[list[str]] = [["Note", note] for note in all_notes(d)]
-    rows.append(["Full report", Markup('<a href="{0}">{0}</a>').format(page)])
-    title = "Refractive bundle adjustment"
-    return [Table(title, [], [*facts.rows, *rows]), _tables(d)[0]]
 
 
 # Facts
@@ -180,11 +170,6 @@ def _lens_row(d: Plain, row: Plain) -> Plain:
         label += f", {row['sensor']}"
     unit = f" {d['image_unit']}" if row["name"] in ("f", "cx", "cy", "b1", "b2") else ""
     return row | {"label": label, "unit": unit, "added": row["after"] - row["before"]}
-
-
-def _fact_table(d: Plain) -> Table:
-    rows = [[label[:1].upper() + label[1:], words] for label, words in _facts(d)]
-    return Table("In short", [], rows)
 
 
 # Map

@@ -214,13 +214,11 @@ def evaluation(
     pictures, words = [], "histograms with fitted Gaussians; the table has their figures."
     vertical = errors_of(compared, "vertical")
     if vertical:
-        figure = _histograms([vertical], "Cloud minus reference, Z (m)")
+        figure = _histograms([vertical], "Cloud minus reference, Z (m)", sharex=False)
         title = "Vertical error"
         pictures.append(Picture("histogram_vertical", title, f"{title}: {words}", figure))
-    title, sparse = "Distance to the nearest point (C2C)", ("cloud.sparse", "reference.sparse")
-    notes = (f" {one['message']}" for one in compared["notes"] if one["code"] in sparse)
-    alt = f"{title}: {words}{''.join(notes)}"
-    pictures.append(Picture("histogram_c2c", title, alt, c2c_figure(compared)))
+    title = "Distance to the nearest point (C2C)"
+    pictures.append(Picture("histogram_c2c", title, f"{title}: {words}", c2c_figure(compared)))
     if dod is not None:
         reach = float(np.nanpercentile(np.abs(dod[0]), 98.0))
         alt = (
@@ -245,7 +243,7 @@ def c2c_figure(compared: Plain) -> Figure:
     """Draw the histograms of all C2C: a column a direction, a row a cloud, one axis."""
     columns = [errors_of(compared, kind) for kind in ("c2c", "c2c_from_reference")]
     columns = [one for one in columns if one]
-    figure = _histograms(columns, "Distance to the nearest point (m)")
+    figure = _histograms(columns, "Distance to the nearest point (m)", sharex=True)
     reach = 0.0
     for column in columns:
         for one in column:
@@ -257,14 +255,14 @@ def c2c_figure(compared: Plain) -> Figure:
     return figure
 
 
-def _histograms(columns: list[list[Errors]], label: str) -> Figure:
+def _histograms(columns: list[list[Errors]], label: str, *, sharex: bool) -> Figure:
     """Draw distributions with the normal distributions of their means and standard deviations."""
     from scipy.stats import norm
 
     rows = len(columns[0])  # each direction has the same clouds
     size = 7.5 * len(columns) + 0.5, 2.4 * rows + 0.4
     figure, panels = new_figure(
-        *size, nrows=rows, ncols=len(columns), sharex=True, squeeze=False
+        *size, nrows=rows, ncols=len(columns), sharex=sharex, squeeze=False
     )  # fmt: skip
     for axes, one in zip(panels.T.flat, (one for some in columns for one in some), strict=True):
         s, histogram = one.found["statistics"], one.found["histogram"]

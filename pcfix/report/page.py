@@ -203,7 +203,6 @@ class Report:
     tables: list[Table]  # the first is shown, the others folded
     provenance: list[Table] = field(default_factory=list)
     tiles: Sequence[Tile] = ()
-    place: str = ""  # CRS and vertical datum of the map
     files: Sequence[tuple[str, str]] = ()  # path from the page, and its contents
 
 

@@ -88,11 +88,6 @@ def run_report(
         f" are under water and were moved, {abs(mean):.2f} m"
         f" {'higher' if mean > 0.0 else 'deeper'} on average."
     )
-    if s.transfer is not None:
-        lead += (
-            " Before that, the whole cloud was transferred to the adjusted poses, which moved it by"
-            f" {s.transfer['shift_m']['rms']:.2f} m (rms)."
-        )
     rows, notes = summary_rows(s), notes_of(s, cloud.heights, compared)
     head = [
         ["Images", date or "date not stated"],
@@ -105,11 +100,11 @@ def run_report(
         ("range", f"{depth['min']:.2f} to {depth['max']:.2f} m"),
         ("mean", f"{depth['mean']:.2f} m"),
     ]
-    # the rows of the terminal, with the detected reconstruction type in words
-    facts = {"Cloud": name_of(s.input), "Points": f"{s.points:,}", **dict(rows)}
-    facts |= {"Method": f"{s.made['method']}. {s.made['because']}"} if s.made else {}
-    # it names the order of S-44, by the measured differences where there are some
-    facts |= {"Uncertainty": uncertainty_sentence(s, compared.get("tvu")), "IHO S-44": ""}
+    # the rows of the terminal, and why; the order of S-44 is by measured differences where known
+    facts = [("Input cloud", name_of(s.input)), ("Points", f"{s.points:,}")]
+    facts += [row for row in rows if row[0] not in ("Uncertainty", "IHO S-44")]
+    facts.append(("Uncertainty", uncertainty_sentence(s, compared.get("tvu")) or "not known"))
+    facts += [("Reconstruction", s.made["because"])] if s.made else []
     settings = [
         [name.replace("_", " "), _worded(value)]
         for name, value in s.settings.items()
@@ -130,13 +125,12 @@ def run_report(
         ],
         warnings=notes,
         maps=cloud.maps,
-        place=f"{cloud.crs or 'CRS not stated'}; heights: {cloud.heights or UNKNOWN_DATUM}.",
         layers=_layers(cloud.maps, difference),
         pictures=sorted(pictures, key=lambda one: order.get(one.name, len(order))),
         tables=list(tables),
         files=files,
         provenance=[
-            Table("In short", [], [[label, words] for label, words in facts.items() if words]),
+            Table("In short", [], [list(row) for row in facts]),
             Table("Settings", ["setting", "value"], settings),
             *inputs,
             Table("Software", ["name", "version"], versions),

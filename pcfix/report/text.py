@@ -110,8 +110,8 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
          "neighbour_distance_m"),
         ("Not run", "{text}", "*not_run"),
     )),
-    "dsm": ("Gridded {input} -> {output}      {points_used:,} of {points:,}"
-            " ({is_bed:?bed, class 40|land and bed}) points in {seconds:.1f} s", (
+    "dsm": ("Gridded {input} -> {output}      {points_used:,} of {points:,} points"
+            " ({is_bed:?bed, class 40|land and bed}) in {seconds:.1f} s", (
         *_PART,
         ("Raster", "{width:,} x {height:,} cells of {settings[resolution]:g} m"
          "{is_chosen:?, chosen for 2 to 4 points each|}, {settings[method]}", ""),

@@ -159,7 +159,7 @@ def test_escaped():
     page = render(
         Report(
             evil, evil, table, [evil], built, [Layer(evil, evil, built.depth_m, plus_minus=evil)],
-            [], [table, table], [table], [Tile(evil, evil, [(evil, evil)], [evil])], evil,
+            [], [table, table], [table], [Tile(evil, evil, [(evil, evil)], [evil])],
             [(f"compare/{evil}.csv", evil)],
         )
     )  # fmt: skip
