@@ -63,15 +63,23 @@ _BIN_COLUMNS = {
 def bins_table(bins: Iterable[Figures]) -> str:
     """Return bins as CSV text; the columns of `before` are empty where it is not known."""
     head = [name.format(when) for when in ("after", "before") for name in _BIN_COLUMNS]
-    lines = [",".join(["from_m", "to_m", *head])]
+    rows: list[list[Any]] = [["from_m", "to_m", *head]]
     for one in bins:
-        fields = [f"{one.from_m:g}", f"{one.to_m:g}"]
+        rows.append([f"{one.from_m:g}", f"{one.to_m:g}"])
         for statistics in (one.after, one.before):
-            for name in _BIN_COLUMNS.values():
-                value = getattr(statistics, name, "")
-                fields.append(f"{value:.4f}" if isinstance(value, float) else str(value))
-        lines.append(",".join(fields))
-    return "\n".join(lines) + "\n"
+            rows[-1] += [getattr(statistics, name, None) for name in _BIN_COLUMNS.values()]
+    return _csv(rows)
+
+
+def _csv(rows: Iterable[Iterable[Any]]) -> str:
+    """Return rows as CSV text, fractions with four digits, unknown values as empty fields."""
+
+    def field(value: Any) -> str:
+        if value is None or value != value:  # NaN
+            return ""
+        return f"{value:.4f}" if isinstance(value, float) else str(value)
+
+    return "".join(",".join(map(field, row)) + "\n" for row in rows)
 
 
 BINS, TAIL_PERCENT = 64, 0.5
@@ -321,13 +329,8 @@ class Section:
 
     def table(self) -> str:
         """Return the section as CSV text; unknown heights are empty fields."""
-        columns = [self.distance_m, *self.heights_m.values()]
-        lines = [",".join(["distance_m", *(f"{name}_m" for name in self.heights_m)])]
-        lines += [
-            ",".join("" if np.isnan(value) else f"{value:.4f}" for value in row)
-            for row in zip(*columns, strict=True)
-        ]
-        return "\n".join(lines) + "\n"
+        head = ["distance_m", *(f"{name}_m" for name in self.heights_m)]
+        return _csv([head, *np.column_stack([self.distance_m, *self.heights_m.values()])])
 
 
 def parse_line(text: str) -> SectionLine:

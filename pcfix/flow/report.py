@@ -24,7 +24,7 @@ from pcfix.report.comparison import evaluation
 from pcfix.report.page import Report, Table, render
 from pcfix.report.run import CloudMaps, run_report
 from pcfix.report.summary import Summary
-from pcfix.report.text import Plain, uncertainty_sentence
+from pcfix.report.text import Plain
 
 COLUMNS = ("WaterDepth", "ShiftZ", "RayCount", "SigmaZ")
 SAMPLE_POINTS = 200_000
@@ -81,10 +81,7 @@ def report_run(
         for tile in page.tiles
         if tile.figures
     ]
-    return {
-        "in_short": "; ".join(shown),
-        "uncertainty": uncertainty_sentence(summary, more["compared"].get("tvu")),
-    }
+    return {"in_short": "; ".join(shown)}
 
 
 def write_report(

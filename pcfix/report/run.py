@@ -32,7 +32,7 @@ from pcfix.report.page import (
     relief,
 )
 from pcfix.report.summary import Summary
-from pcfix.report.text import FEWEST, formal_words, summary_rows, uncertainty_sentence
+from pcfix.report.text import FEWEST, formal_words, summary_rows
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
@@ -88,7 +88,8 @@ def run_report(
         f" are under water and were moved, {abs(mean):.2f} m"
         f" {'higher' if mean > 0.0 else 'deeper'} on average."
     )
-    rows, notes = summary_rows(s), notes_of(s, cloud.heights, compared)
+    rows = summary_rows(s, compared.get("tvu"))
+    notes = notes_of(s, cloud.heights, compared)
     head = [
         ["Images", date or "date not stated"],
         ["CRS", cloud.crs or "not stated by the cloud"],
@@ -100,10 +101,8 @@ def run_report(
         ("range", f"{depth['min']:.2f} to {depth['max']:.2f} m"),
         ("mean", f"{depth['mean']:.2f} m"),
     ]
-    # the rows of the terminal, and why; the order of S-44 is by measured differences where known
-    facts = [("Input cloud", name_of(s.input)), ("Points", f"{s.points:,}")]
-    facts += [row for row in rows if row[0] not in ("Uncertainty", "IHO S-44")]
-    facts.append(("Uncertainty", uncertainty_sentence(s, compared.get("tvu")) or "not known"))
+    # the rows of the terminal, and why the method was chosen
+    facts = [("Input cloud", name_of(s.input)), ("Points", f"{s.points:,}"), *rows]
     facts += [("Reconstruction", s.made["because"])] if s.made else []
     settings = [
         [name.replace("_", " "), _worded(value)]

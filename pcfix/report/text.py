@@ -81,7 +81,9 @@ _CORRECTED: RowTable = (
     *_SHORELINE,
     ("Uncertainty", "{uncertainty[tvu_95_m][mean]:.3f} m at 95 % (predicted)", "uncertainty"),
     ("Uncertainty", "not known: without cameras there are no rays", "no_uncertainty"),
-    ("IHO S-44", "{order}", "uncertainty"),
+    ("Measured", "{measured[tvu_95_m]:.3f} m at 95 %, at {measured[count]:,} points of the bed",
+     "measured"),
+    ("IHO S-44", "{order}", "order"),
     ("Check", "{check}", "check"),
     ("Poses", "{poses[words]}", "poses"),
     *_LABELLING,
@@ -260,8 +262,11 @@ def summary_text(summary: Summary) -> str:
     return aligned(head, summary_rows(summary), summary.told)
 
 
-def summary_rows(s: Summary) -> Rows:
-    """Return the facts of a correction, for the terminal and the report page."""
+def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
+    """Return the facts of a correction, for the terminal and the report page.
+
+    `measured` is the vertical uncertainty against a reference, `Comparison.tvu` in plain values.
+    """
     made, unused, check = s.made, s.cameras_unused, ""
     method = str(s.settings["method"])
     if made is not None and made.get("made_of", "") not in ("", method):
@@ -286,7 +291,8 @@ def summary_rows(s: Summary) -> Rows:
         "unused": ", ".join([*unused[:SHOWN_NAMES], *(["..."] if unused[SHOWN_NAMES:] else [])]),
         "no_uncertainty": s.uncertainty is None and s.settings["dimensions"] == "all"
         and not s.cameras,
-        "order": order_sentence(s),
+        "measured": measured,
+        "order": order_sentence(s, measured),
         "check": check,
     })  # fmt: skip
 
@@ -331,11 +337,18 @@ def formal_words(s: Summary) -> str:
     return words if poses_m is None else f"{words}. Adjusted poses: {poses_m:.3f} m"
 
 
-def order_sentence(s: Summary) -> str:
-    """Return which order of S-44 the standard errors allow, or why none is claimed."""
-    if s.uncertainty is None or s.why_no_order:
+def order_sentence(s: Summary, measured: Plain | None = None) -> str:
+    """Return which order of S-44 the errors of a run allow, or why none is claimed.
+
+    `measured` is `Comparison.tvu` in plain values; without it the standard errors decide. Empty
+    where neither is known.
+    """
+    if measured is not None and measured["count"] < FEWEST:
+        return f"fewer than {FEWEST} points were measured, too few for an order"
+    if measured is None and s.uncertainty is not None and s.why_no_order:
         return f"no order is claimed: {s.why_no_order}"
-    return tvu_sentence(s.uncertainty)
+    known = measured or s.uncertainty
+    return "" if known is None else tvu_sentence(known)
 
 
 def tvu_sentence(uncertainty: Plain) -> str:
@@ -347,19 +360,3 @@ def tvu_sentence(uncertainty: Plain) -> str:
         return f"fewer than 95 % of the points meet any order of IHO S-44 ({within:.0%} order 2)"
     name = f"order {order}" if order[0].isdigit() else f"{order} Order"
     return f"{100.0 * shares[order]:.4g} % of the points are within the TVU of IHO S-44 {name}"
-
-
-def uncertainty_sentence(s: Summary, measured: Plain | None = None) -> str:
-    """Return TVU and order of S-44 of a run: as `measured` against a reference, else as predicted.
-
-    `measured` is `Comparison.tvu` in plain values. Empty where neither is known.
-    """
-    mean = "" if s.uncertainty is None else f"{s.uncertainty['tvu_95_m']['mean']:.3f} m on average"
-    if measured is None:
-        return f"TVU at 95 % {mean}, predicted; {order_sentence(s)}" if mean else ""
-    few = f"fewer than {FEWEST} points, too few for an order of IHO S-44"
-    return (
-        f"TVU at 95 %{f' predicted {mean},' if mean else ''} measured"
-        f" {measured['tvu_95_m']:.3f} m at {measured['count']:,} points of the bed;"
-        f" {few if measured['count'] < FEWEST else tvu_sentence(measured)}"
-    )
