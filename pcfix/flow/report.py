@@ -1,7 +1,8 @@
-"""Read a corrected cloud once, and write its report page and figures."""
+"""Write the report page of a run and its figures, from the rasters and results of its steps."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,34 +10,35 @@ from typing import Any
 import numpy as np
 
 from pcfix.flow.adjust import FOLDER, SUMMARY
-from pcfix.flow.request import RunFolder
+from pcfix.flow.maps import DEPTH, UNCERTAINTY
+from pcfix.flow.request import SURFACE, RunFolder
 from pcfix.flow.surfaces import view_of
 from pcfix.flow.water import found_picture
-from pcfix.grid.maps import MOST_CELLS, MapsBuilder
+from pcfix.grid.lattice import Lattice
 from pcfix.io.crs import crs_words
 from pcfix.io.files import read_json, sha256, write_bytes, write_text
 from pcfix.io.las.source import stated_crs
-from pcfix.io.rasters import preview
-from pcfix.io.tiles import Tiles, open_cloud
+from pcfix.io.rasters import lattice_of, open_raster, read_onto
+from pcfix.io.tiles import open_cloud
 from pcfix.model import Cameras
 from pcfix.report.adjustment import adjustment_sentence
 from pcfix.report.comparison import evaluation
-from pcfix.report.page import Report, Table, render
-from pcfix.report.run import CloudMaps, run_report
+from pcfix.report.page import Report, Table, extent_of, render
+from pcfix.report.run import RunMaps, run_report
 from pcfix.report.summary import Summary
 from pcfix.report.text import Plain
 
-COLUMNS = ("WaterDepth", "ShiftZ", "RayCount", "SigmaZ")
-SAMPLE_POINTS = 200_000
-"""Points in the figure of uncertainty, evenly spread over the file."""
+DIFFERENCE = "compare/dod.tif"
+MOST_CELLS = 500_000
+"""Of a map, so that the page stays below 4 MB."""
 PAGE = "report.html"
 RESULTS = {
     "corrected.laz": "all points, the bed corrected",
     "cleaned.laz": "all points, with outliers flagged as noise",
-    "depth.tif": "depth below the water",
+    DEPTH: "depth below the water",
     "bed.tif": "heights of the bed",
-    "surface.tif": "heights of land and bed",
-    "uncertainty.tif": "vertical uncertainty at 95 %",
+    SURFACE: "heights of land and bed",
+    UNCERTAINTY: "vertical uncertainty at 95 %",
     "surface_counts.tif": "number of points in each cell, and their spread",
     "shaded.tif": "coloured, shaded relief",
     "map.gpkg": "contours, waterline and other layers for a GIS",
@@ -44,7 +46,7 @@ RESULTS = {
     "compare/compare.json": "all figures of the comparison",
     "compare/depth_bins.csv": "errors by depth",
     "compare/shore_bins.csv": "errors by distance from the shore",
-    "compare/dod.tif": "cloud minus reference",
+    DIFFERENCE: "cloud minus reference",
     "compare/reference_dsm.tif": "heights of the reference",
     "adjusted/report.html": "the adjustment of the cameras",
 }
@@ -63,16 +65,21 @@ def report_run(
         how = "not adjusted:" if first["model"] is None else "adjusted first, as"
         more["verdict"] = f" The cameras were {how} {first['why']}."
     request, summary = run.request, Summary(**corrected)
+    rasters = [SURFACE, DEPTH, *([] if summary.uncertainty is None else [UNCERTAINTY])]
+    rasters += [DIFFERENCE] if compared and request.has_surface else []
+    with open_cloud(run.cleaned_cloud) as source:
+        maps = read_maps(run.folder, rasters, *crs_words(stated_crs(source)))
     if compared:
-        dod = preview(run.dod, MOST_CELLS) if request.has_surface else None
-        figures = evaluation(compared["figures"], compared["sections"], dod)
-        more |= {"difference": dod, "pictures": figures[0], "tables": figures[1]}
+        figures = evaluation(
+            compared["figures"], compared["sections"], maps.difference_m, extent_of(maps.lattice)
+        )
+        more |= {"pictures": figures[0], "tables": figures[1]}
     if first["model"] is not None:
         more["verdict"] += f" {adjustment_sentence(read_json(run.folder / FOLDER / SUMMARY))}."
     if (summary.water_fit or {}).get("model") == "auto":  # the water was sought in the cloud
         more["pictures"].append(found_picture(run.inputs.surface(view_of(request.source))))
     page = write_report(
-        run.folder, summary, run.cameras, read_cloud(run.cleaned_cloud, run.resolution_m), inputs,
+        run.folder, summary, run.cameras, maps, inputs,
         project=request.project or "", date=request.date or "", **more,
     )  # fmt: skip
     shown = [
@@ -85,7 +92,7 @@ def report_run(
 
 
 def write_report(
-    folder: Path, summary: Summary, cameras: Cameras, cloud: CloudMaps, inputs: Sequence[Path],
+    folder: Path, summary: Summary, cameras: Cameras, maps: RunMaps, inputs: Sequence[Path],
     **more: Any,
 ) -> Report:  # fmt: skip
     """Write ``report.html`` and ``figures/*.png`` of a run, into its folder.
@@ -103,7 +110,7 @@ def write_report(
             files.append((f"{tiles.name}/", words))
     sections = sorted(folder.glob("compare/section_*.csv"))
     files += [(f"compare/{one.name}", "a cross-section") for one in sections]
-    report = run_report(summary, cameras, cloud, inputs=[table], files=files, **more)
+    report = run_report(summary, cameras, maps, inputs=[table], files=files, **more)
     figures = folder / "figures"
     figures.mkdir(exist_ok=True)
     for picture in report.pictures:
@@ -112,27 +119,20 @@ def write_report(
     return report
 
 
-def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> CloudMaps:
-    """Return what the page shows of a cloud: maps, depths, a sample, CRS and vertical datum.
+def read_maps(folder: Path, names: Sequence[str], crs: str = "", heights: str = "") -> RunMaps:
+    """Read rasters of a run by name, in cells of theirs, or of several where there are many.
 
-    The cloud is from `correct_file` with all dimensions, cleaned or not; `resolution_m` is that of
-    the rasters.
+    `crs` and `heights` name the CRS of the cloud and its vertical datum.
     """
-    view = view_of(path)
-    builder = MapsBuilder(view.low, view.high, view.points, resolution_m)
-    every = max(1, view.points // SAMPLE_POINTS)
-    sample, least, most, total, count = [], np.inf, -np.inf, 0.0, 0
-    for points in view.chunks(None, COLUMNS):
-        good, known = points.counts(), points.dimensions or {}
-        values = np.column_stack([known[name][good] for name in COLUMNS])
-        moved = values[:, 2] > 0.0
-        values = values[moved]
-        builder.add(points.xyz[good], moved, values)
-        sample.append(values[-count % every :: every, [0, 3]])
-        depth = values[:, 0]
-        least, most = depth.min(initial=least), depth.max(initial=most)
-        total, count = total + float(depth.sum()), count + len(depth)
-    depth_m = {"min": float(least), "mean": total / max(count, 1), "max": float(most)}
-    with open_cloud(path) as source:
-        names = crs_words(stated_crs(source))
-    return CloudMaps(builder.maps(), depth_m, np.vstack(sample), *names)
+    with open_raster(folder / SURFACE) as source:
+        fine = lattice_of(source)
+    k = max(1, math.ceil(math.sqrt(fine.width * fine.height / MOST_CELLS)))
+    column, row = fine.first_column // k, fine.first_row // k
+    width = (fine.first_column + fine.width - 1) // k - column + 1
+    height = (fine.first_row + fine.height - 1) // k - row + 1
+    lattice = Lattice(k * fine.resolution_m, column, row, width, height)
+    values = {name: read_onto(folder / name, lattice) for name in names}
+    uncertainty_m = values.get(UNCERTAINTY, np.full((height, width), np.nan))
+    return RunMaps(
+        lattice, values[SURFACE], values[DEPTH], uncertainty_m, values.get(DIFFERENCE), crs, heights
+    )

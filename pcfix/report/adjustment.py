@@ -11,13 +11,15 @@ from pcfix.adjust.block import words_of
 from pcfix.adjust.problem import Intersected
 from pcfix.adjust.result import Adjusted, Plain, adjustment_dict
 from pcfix.grid.colours import DIFFERENCE, UNCERTAINTY
-from pcfix.grid.maps import Maps, MapsBuilder
+from pcfix.grid.lattice import Lattice, lattice_over
 from pcfix.model import FloatArray
 from pcfix.report.page import Layer, Picture, Report, Table, label_plan, new_figure, render
 from pcfix.report.text import Rows, RowTable, filled, share
 from pcfix.sums import nice_step
 
 MOST_POINTS = 6000
+MOST_CELLS, POINTS_A_CELL = 360, 6.0
+"""Of the longer side of the map, and of a cell at least: a sparse block has larger cells."""
 ARROW = 0.07
 """Length of a large arrow, as a share of the longer side of the block."""
 
@@ -93,7 +95,7 @@ def adjustment_page(adjusted: Adjusted, before: Intersected) -> str:
     `before` are residuals and points before, of `before_of`.
     """
     d = adjustment_dict(adjusted, before)
-    (maps, layers), picture = _map(adjusted, before), block_picture(d, adjusted)
+    (lattice, layers), picture = _map(adjusted, before), block_picture(d, adjusted)
     how = "without refraction" if d["water"] is None else "with refraction at the water"
     lead = (
         f"{d['images']:,} images and {d['points']['all']:,} points were adjusted"
@@ -107,7 +109,8 @@ def adjustment_page(adjusted: Adjusted, before: Intersected) -> str:
         lead=lead,
         head=Table("In short", [], facts),
         warnings=all_notes(d),
-        maps=maps,
+        lattice=lattice,
+        height_m=layers[0].values,
         layers=layers,
         pictures=[] if picture is None else [picture],
         tables=[table for table in _tables(d) if table.rows],
@@ -175,27 +178,32 @@ def _lens_row(d: Plain, row: Plain) -> Plain:
 # Map
 
 
-def _map(a: Adjusted, before: Intersected) -> tuple[Maps, list[Layer]]:
+def _map(a: Adjusted, before: Intersected) -> tuple[Lattice, list[Layer]]:
     """Return the heights of the points and what changed, averaged in cells."""
-    plan = a.xyz[a.is_observed, :2]
+    low, high = (end(a.xyz[a.is_observed, :2], axis=0) for end in (np.min, np.max))
+    size = np.maximum(high - low, 1e-3)
+    sparse_m = np.sqrt(POINTS_A_CELL * size.prod() / np.count_nonzero(a.is_observed))
+    lattice = lattice_over(low, high, float(max(size.max() / MOST_CELLS, sparse_m)), "the points")
 
-    def means(values: FloatArray) -> Maps:
-        """Return maps whose heights are means of some values of the points."""
-        builder = MapsBuilder(plan.min(axis=0), plan.max(axis=0), len(plan))
+    def means(values: FloatArray) -> FloatArray:
+        """Return the means of some values of the points in each cell."""
         known = np.isfinite(values) & a.is_observed
-        builder.add(np.column_stack([a.xyz[known, :2], values[known]]))
-        return builder.maps()
+        column, row = lattice.cells(a.xyz[known]).T
+        cell, cells = row * lattice.width + column, lattice.width * lattice.height
+        count, total = (np.bincount(cell, w, cells) for w in (None, values[known]))
+        mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+        return np.asarray(mean.reshape(lattice.height, lattice.width))
 
     # mean squared residual of a coordinate of each point
-    rows, heights = a.used & np.isfinite(a.residual_px).all(axis=1), means(a.xyz[:, 2])
+    rows = a.used & np.isfinite(a.residual_px).all(axis=1)
     owner, square = a.block.owner[rows], (a.residual_px[rows] ** 2).mean(axis=1)
     count, total = (np.bincount(owner, w, len(a.xyz)) for w in (None, square))
     squares = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     unit, higher = (a.block.cameras.lenses or ())[0].unit, a.xyz[:, 2] - before.xyz[:, 2]
-    return heights, [
-        Layer("Height", "m", heights.height_m),
-        Layer("Change in height", "m", means(higher).height_m, DIFFERENCE, is_centred=True),
-        Layer("Residual", unit, np.sqrt(means(squares).height_m), UNCERTAINTY),
+    return lattice, [
+        Layer("Height", "m", means(a.xyz[:, 2])),
+        Layer("Change in height", "m", means(higher), DIFFERENCE, is_centred=True),
+        Layer("Residual", unit, np.sqrt(means(squares)), UNCERTAINTY),
     ]
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pcfix.grid.colours import DIFFERENCE
+from pcfix.grid.maps import Extent
 from pcfix.model import FloatArray
 from pcfix.options.steps import LAYERS
 from pcfix.report.page import (
@@ -204,12 +205,13 @@ def _tables(compared: Plain) -> list[Table]:
 def evaluation(
     compared: Plain,
     sections: list[Plain],
-    dod: tuple[FloatArray, tuple[float, float, float, float]] | None = None,
+    difference_m: FloatArray | None = None,
+    extent_m: Extent = (0.0, 0.0, 0.0, 0.0),
 ) -> tuple[list[Picture], list[Table]]:
     """Return pictures and tables of a `Comparison.as_dict`.
 
-    `sections` have ``distance_m`` and ``heights_m`` as lists, None where nothing is known; `dod` is
-    the difference of the surfaces, shape (rows, columns), metres, and its west, east, south, north.
+    `sections` have ``distance_m`` and ``heights_m`` as lists, None where nothing is known; the
+    difference of the surfaces has the shape (rows, columns).
     """
     pictures, words = [], "histograms with fitted Gaussians; the table has their figures."
     vertical = errors_of(compared, "vertical")
@@ -219,14 +221,14 @@ def evaluation(
         pictures.append(Picture("histogram_vertical", title, f"{title}: {words}", figure))
     title = "Distance to the nearest point (C2C)"
     pictures.append(Picture("histogram_c2c", title, f"{title}: {words}", c2c_figure(compared)))
-    if dod is not None:
-        reach = float(np.nanpercentile(np.abs(dod[0]), 98.0))
+    if difference_m is not None:
+        reach = float(np.nanpercentile(np.abs(difference_m), 98.0))
         alt = (
             "Map of the corrected surface minus the reference surface; blue where the cloud is"
             f" lower. 98 % of the cells differ by less than {reach:.2f} m."
         )
         look: dict[str, Any] = {"cmap": DIFFERENCE, "vmin": -reach, "vmax": reach}
-        figure = map_figure(*dod, "Cloud minus reference (m)", **look)
+        figure = map_figure(difference_m, extent_m, "Cloud minus reference (m)", **look)
         pictures.append(Picture("dod", "Difference of the surfaces (DoD)", alt, figure))
     for key, (_, title, label) in BINS.items():
         if bins := compared[key]:

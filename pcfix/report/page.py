@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.grid.colours import DEPTH, HEIGHT, NO_LIGHT, hillshade, stops_of
-from pcfix.grid.maps import Maps, contours, depth_interval, smoothed
+from pcfix.grid.lattice import Lattice
+from pcfix.grid.maps import Extent, contours, depth_interval, smoothed
 from pcfix.model import FloatArray
 from pcfix.sums import nice_step
 
@@ -66,11 +67,7 @@ def png_of(figure: Figure) -> bytes:
 
 
 def map_figure(
-    values: FloatArray,
-    extent_m: tuple[float, float, float, float],
-    label: str,
-    shade: FloatArray | None = None,
-    **look: Any,
+    values: FloatArray, extent_m: Extent, label: str, shade: FloatArray | None = None, **look: Any
 ) -> Figure:
     """Draw a map of values over west, east, south and north, metres; `shade` is its relief.
 
@@ -197,7 +194,8 @@ class Report:
     lead: str
     head: Table  # beside the map
     warnings: list[str]
-    maps: Maps
+    lattice: Lattice  # the cells of the map
+    height_m: FloatArray  # their heights, shape (rows, columns), shown as relief
     layers: list[Layer]
     pictures: list[Picture]  # the first `FIGURES` are shown, the others folded
     tables: list[Table]  # the first is shown, the others folded
@@ -232,7 +230,7 @@ def render(report: Report) -> str:
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, finalize=_as_read,
     ).get_template("page.html.j2")  # fmt: skip
-    data = Markup(map_json(report.maps, report.layers))
+    data = Markup(map_json(report.lattice, report.height_m, report.layers))
     return template.render(report=report, figures=FIGURES, map_data=data)
 
 
@@ -247,29 +245,35 @@ SMOOTH_CELLS = 1.5
 """Single cells are noisy: the shade is of a surface smoothed by this."""
 
 
-def map_json(maps: Maps, layers: list[Layer]) -> str:
+def extent_of(lattice: Lattice) -> Extent:
+    """Return west, east, south and north of the cells, metres."""
+    west, south, east, north = lattice.bounds_m
+    return west, east, south, north
+
+
+def map_json(lattice: Lattice, height_m: FloatArray, layers: list[Layer]) -> str:
     """Return the data as JSON without "<", so that no text in it can end the script element.
 
     Layers are differences of 16-bit integers, compressed by zlib, in base 64.
     """
-    west, _, _, north = maps.extent_m
-    rows, columns = maps.height_m.shape
-    shade = np.where(np.isfinite(maps.height_m), relief(maps.height_m, maps.cell_m) * 254.0, 0.0)
+    shade = relief(height_m, lattice.resolution_m) * 254.0
     data: dict[str, Any] = {
-        "rows": rows,
-        "columns": columns,
-        "west": west,
-        "north": north,
-        "cell": maps.cell_m,
+        "rows": lattice.height,
+        "columns": lattice.width,
+        "west": lattice.left_m,
+        "north": lattice.top_m,
+        "cell": lattice.resolution_m,
         "noData": _NO_DATA,
-        "shade": _packed(shade),
+        "shade": _packed(np.nan_to_num(shade)),
         "layers": [_of_layer(layer) for layer in layers],
         "interval": 0,
         "contours": [],
     }
     for layer in layers:
         if layer.has_contours:  # lines whose places count from the corner of the map
-            data["interval"] = interval = depth_interval(layer.values, maps.uncertainty_m)
+            known = (one.values for one in layers if one.name == layer.plus_minus)
+            interval = depth_interval(layer.values, next(known, np.zeros(0)))
+            data["interval"] = interval
             data["contours"] = [
                 {"level": level, "line": np.round(place + 0.5, 1).ravel().tolist()}
                 for level, place in contours(layer.values, interval)

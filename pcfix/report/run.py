@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.grid.colours import DEPTH, DIFFERENCE, RAYS, UNCERTAINTY
-from pcfix.grid.maps import Extent, Maps, contours, depth_interval
+from pcfix.grid.colours import DEPTH, DIFFERENCE, UNCERTAINTY
+from pcfix.grid.lattice import Lattice
+from pcfix.grid.maps import contours, depth_interval
 from pcfix.model import Cameras, FloatArray
-from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
+from pcfix.refract.tally import ORDERS, largest_tvu_m
 from pcfix.report.comparison import noise_sentence, raw_of, signed
 from pcfix.report.page import (
     AFTER,
@@ -25,6 +26,7 @@ from pcfix.report.page import (
     Report,
     Table,
     Tile,
+    extent_of,
     label_plan,
     map_figure,
     name_of,
@@ -50,12 +52,14 @@ BESIDE_MAP = ("Submerged", "Cameras", "Water", "")
 UNKNOWN_DATUM = "vertical datum not known"
 
 
-class CloudMaps(NamedTuple):
-    """What the page shows of a corrected cloud, without noise."""
+class RunMaps(NamedTuple):
+    """The rasters of a run in common cells, shape (rows, columns), metres; NaN if unknown."""
 
-    maps: Maps
-    depth_m: dict[str, float]  # min, mean and max of the corrected points
-    sample: FloatArray  # shape (m, 2): depth and standard error of Z, zero where unknown
+    lattice: Lattice
+    height_m: FloatArray  # of land and bed
+    depth_m: FloatArray
+    uncertainty_m: FloatArray  # of the bed, at 95 %
+    difference_m: FloatArray | None  # cloud minus reference
     crs: str  # of the cloud, and its vertical datum; empty if not known
     heights: str
 
@@ -63,13 +67,12 @@ class CloudMaps(NamedTuple):
 def run_report(
     s: Summary,
     cameras: Cameras,
-    cloud: CloudMaps,
+    maps: RunMaps,
     *,
     project: str = "",
     date: str = "",
     verdict: str = "",
     compared: Plain | None = None,
-    difference: tuple[FloatArray, Extent] | None = None,
     pictures: Sequence[Picture] = (),
     tables: Sequence[Table] = (),
     inputs: Sequence[Table] = (),
@@ -77,23 +80,22 @@ def run_report(
 ) -> Report:
     """Return the page of a run.
 
-    `compared` is `Comparison.as_dict`, `difference` the raster of cloud minus reference, metres,
-    and `verdict` a sentence on the steps before the correction. `pictures` and `tables` are of
-    other steps, the most important first; `inputs` list the files read, `files` those next to the
-    page. `date` is that of the images.
+    `compared` is `Comparison.as_dict`, and `verdict` a sentence on the steps before the correction.
+    `pictures` and `tables` are of other steps, the most important first; `inputs` list the files
+    read, `files` those next to the page. `date` is that of the images.
     """
-    compared, depth, mean = compared or {}, cloud.depth_m, s.shift_z_m["mean"]
+    compared, depth, mean = compared or {}, s.depth_m, s.shift_z_m["mean"]
     lead = (
         f"Correction for refraction of {name_of(s.input)}: {s.corrected:,} of {s.points:,} points"
         f" are under water and were moved, {abs(mean):.2f} m"
         f" {'higher' if mean > 0.0 else 'deeper'} on average."
     )
     rows = summary_rows(s, compared.get("tvu"))
-    notes = notes_of(s, cloud.heights, compared)
+    notes = notes_of(s, maps.heights, compared)
     head = [
         ["Images", date or "date not stated"],
-        ["CRS", cloud.crs or "not stated by the cloud"],
-        ["Heights", cloud.heights or f"{UNKNOWN_DATUM}: the cloud states none"],
+        ["CRS", maps.crs or "not stated by the cloud"],
+        ["Heights", maps.heights or f"{UNKNOWN_DATUM}: the cloud states none"],
         ["Points", f"{s.points:,}"],
         *([label, words] for label, words in rows if label in BESIDE_MAP),
     ]
@@ -112,7 +114,7 @@ def run_report(
     versions = [["pcfix", __version__], ["Python", platform.python_version()]]
     versions += [[name, version(name)] for name in ("numpy", "scipy", "numba", "laspy", "lazrs")]
     order = {name: place for place, name in enumerate(FIRST_FIGURES)}
-    pictures = [*_pictures(s, cameras, cloud, compared), *pictures]
+    pictures = [*_pictures(s, cameras, maps, compared), *pictures]
     return Report(
         title=project or Path(name_of(s.input)).stem,
         lead=lead + verdict,
@@ -123,8 +125,9 @@ def run_report(
             Tile("Warnings", notes=notes[:SHOWN_NOTES] or ["None."]),
         ],
         warnings=notes,
-        maps=cloud.maps,
-        layers=_layers(cloud.maps, difference),
+        lattice=maps.lattice,
+        height_m=maps.height_m,
+        layers=_layers(maps),
         pictures=sorted(pictures, key=lambda one: order.get(one.name, len(order))),
         tables=list(tables),
         files=files,
@@ -137,22 +140,17 @@ def run_report(
     )
 
 
-def _layers(maps: Maps, difference: tuple[FloatArray, Extent] | None) -> list[Layer]:
+def _layers(maps: RunMaps) -> list[Layer]:
     """Return the choices of the map, depth first."""
     known = np.isfinite(maps.uncertainty_m).any()
     by = "Uncertainty (95 %)" if known else ""
     layers = [Layer("Depth", "m", maps.depth_m, DEPTH, by, has_contours=True)]
     if known:
         layers.append(Layer(by, "m", maps.uncertainty_m, UNCERTAINTY))
-    if difference is not None:
-        values = maps.sampled(*difference)
-        layers.append(Layer("Cloud minus reference", "m", values, DIFFERENCE, is_centred=True))
-    return [
-        *layers,
-        Layer("Rays", "", maps.rays, RAYS),
-        Layer("Shift in Z", "m", maps.shift_z_m),
-        Layer("Height", "m", maps.height_m),
-    ]
+    if maps.difference_m is not None:
+        name = "Cloud minus reference"
+        layers.append(Layer(name, "m", maps.difference_m, DIFFERENCE, is_centred=True))
+    return [*layers, Layer("Height", "m", maps.height_m)]
 
 
 def _worded(value: Any) -> str:
@@ -165,15 +163,15 @@ def _worded(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _pictures(s: Summary, cameras: Cameras, cloud: CloudMaps, compared: Plain) -> list[Picture]:
+def _pictures(s: Summary, cameras: Cameras, maps: RunMaps, compared: Plain) -> list[Picture]:
     """Return the map of depths, the cameras, and TVU over depth where there are standard errors."""
-    maps, depth = cloud.maps, cloud.depth_m
+    lattice, depth = maps.lattice, s.depth_m
     interval = depth_interval(maps.depth_m, maps.uncertainty_m)
-    shade = relief(maps.height_m, maps.cell_m)
-    figure = map_figure(maps.depth_m, maps.extent_m, "Depth (m)", shade, cmap=DEPTH)
+    shade = relief(maps.height_m, lattice.resolution_m)
+    figure = map_figure(maps.depth_m, extent_of(lattice), "Depth (m)", shade, cmap=DEPTH)
     for _, place in contours(maps.depth_m, interval):
-        x, y = (place + 0.5).T * maps.cell_m  # from the corner of the map
-        figure.axes[0].plot(maps.west_m + x, maps.north_m - y, color=REFERENCE, linewidth=0.5)
+        x, y = (place + 0.5).T * lattice.resolution_m  # from the corner of the map
+        figure.axes[0].plot(lattice.left_m + x, lattice.top_m - y, color=REFERENCE, linewidth=0.5)
     alt = (
         f"Map of the corrected depth over the shaded relief; {depth['min']:.2f} to"
         f" {depth['max']:.2f} m, mean {depth['mean']:.2f} m; contours every {interval:g} m."
@@ -186,7 +184,7 @@ def _pictures(s: Summary, cameras: Cameras, cloud: CloudMaps, compared: Plain) -
         )
         figure = cameras_figure(maps, cameras, s.cameras_unused)
         pictures.append(Picture("cameras", "Cameras", alt, figure))
-    known = cloud.sample[:, 1] > 0.0
+    known = np.isfinite(maps.depth_m) & np.isfinite(maps.uncertainty_m)
     if s.uncertainty is not None and known.any():
         bins = compared["depth_bins"] if compared.get("tvu") else []
         dots = (
@@ -198,18 +196,18 @@ def _pictures(s: Summary, cameras: Cameras, cloud: CloudMaps, compared: Plain) -
             f" limits of the orders of IHO S-44. {formal_words(s)}.{dots if bins else ''}"
             " S-44 has requirements other than the TVU: position, features and coverage."
         )
-        depth_m, sigma_m = cloud.sample[known].T
-        figure = tvu_figure(depth_m, sigma_m, bins)
+        figure = tvu_figure(maps.depth_m[known], maps.uncertainty_m[known], bins)
         pictures.append(Picture("uncertainty", "Vertical uncertainty", alt, figure))
     return pictures
 
 
-def cameras_figure(maps: Maps, cameras: Cameras, unused: Sequence[str]) -> Figure:
+def cameras_figure(maps: RunMaps, cameras: Cameras, unused: Sequence[str]) -> Figure:
     """Draw the projection centres in plan over the cloud."""
+    extent_m = extent_of(maps.lattice)
     used = ~np.isin(np.array(cameras.labels), unused)
     figure, plan = new_figure(8.0, 5.0)
-    plan.imshow(maps.height_m, extent=maps.extent_m, cmap="Greys_r", alpha=0.6)
-    depth = plan.imshow(maps.depth_m, extent=maps.extent_m, cmap=DEPTH)
+    plan.imshow(maps.height_m, extent=extent_m, cmap="Greys_r", alpha=0.6)
+    depth = plan.imshow(maps.depth_m, extent=extent_m, cmap=DEPTH)
     figure.colorbar(depth, ax=plan, label="Depth (m)", shrink=0.8)
     for chosen, mark, colour, name in (used, "o", AFTER, "used"), (~used, "x", BEFORE, "not used"):
         if chosen.any():
@@ -221,18 +219,18 @@ def cameras_figure(maps: Maps, cameras: Cameras, unused: Sequence[str]) -> Figur
     return figure
 
 
-def tvu_figure(depth_m: FloatArray, sigma_z_m: FloatArray, measured: Sequence[Plain]) -> Figure:
+def tvu_figure(depth_m: FloatArray, tvu_m: FloatArray, measured: Sequence[Plain]) -> Figure:
     """Draw TVU at 95 % over depth, and the limits of the orders of IHO S-44 up to one above it.
 
-    `measured` are the `Comparison.depth_bins` of a reference, in plain values.
+    Both have the shape (n,), metres. `measured` are the `Comparison.depth_bins` of a reference, in
+    plain values.
     """
     figure, axes = new_figure()
     deepest = float(max(depth_m.max(), 1e-3))
     edges = np.linspace(0.0, deepest * (1.0 + 1e-9), 31)
     slot = np.clip(np.digitize(depth_m, edges) - 1, 0, 29)
     used = np.unique(slot)
-    tvu = COVERAGE_95 * sigma_z_m
-    low, middle, high = np.array([np.percentile(tvu[slot == i], [5, 50, 95]) for i in used]).T
+    low, middle, high = np.array([np.percentile(tvu_m[slot == i], [5, 50, 95]) for i in used]).T
     centres = 0.5 * (edges[:-1] + edges[1:])[used]
     axes.fill_between(
         centres, low, high, color=WATER, alpha=0.6, linewidth=0.0, label="predicted, 90 %"
