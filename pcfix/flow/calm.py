@@ -27,7 +27,7 @@ from pcfix.options.declare import File, taken
 from pcfix.options.photos import CalmOptions
 from pcfix.photos.calm import LEAST_CORNERS, corners_in, covered, laid, median_of, register
 from pcfix.photos.mapping import Photo
-from pcfix.photos.waves import Nodes, View, displacements, fit_waves, nodes_of, slopes_of, still
+from pcfix.photos.waves import Nodes, View, displacements, fit_waves, nodes_of, slopes_of
 from pcfix.running import threads
 from pcfix.sums import Figures
 from pcfix.water.index import index_of
@@ -97,9 +97,7 @@ def calm_frames(
         if view is not None:
             interval = given.interval * given.every if given.interval else found.interval_s
             nodes = nodes_of(view, given.resolution)
-            measured = displacements(median, view, nodes, count(stack))
-            shifts, weights = (np.stack(one) for one in zip(*measured, strict=True))
-            weights[:, still(shifts, weights)] = 0.0
+            shifts, weights = displacements(median, view, nodes, count(stack))
             waters, water = _water(view, nodes, shifts, weights, interval)
             water.folder = str(folder)
             with temporary_output(folder, is_folder=True) as draft:

@@ -29,7 +29,7 @@ from pcfix.report.summary import Summary
 from pcfix.report.text import Plain
 
 DIFFERENCE = "compare/dod.tif"
-MOST_CELLS = 500_000
+MOST_CELLS = 300_000
 """Of a map, so that the page stays below 4 MB."""
 PAGE = "report.html"
 RESULTS = {

@@ -76,7 +76,7 @@ def test_self_contained(report):
     assert str(folder) not in text and str(SCENE) not in text
     said = " ".join(elements.said)
     assert not re.search(r"\b(None|nan|inf|True|False)\b|[{}]", said)
-    assert len(text) < 8_000_000
+    assert len(text) < 4_000_000
 
 
 def map_data(text):
