@@ -147,7 +147,7 @@ class CleanPlan(NamedTuple):
 def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask) -> CleanPlan:
     """Find the noise of a whole cloud; large arrays are on the disk of the target."""
     cloud = task.source
-    view, ours = view_of(cloud, options.jobs), None
+    view, ours = view_of(cloud, options.jobs, in_metres=options.water is not None), None
     with open_cloud(cloud) as source, suppress(ValueError):  # a damaged record is reported later
         ours = own_settings(source.vlrs)
     has_rays = not (isinstance(ours, dict) and ours.get("cameras") == 0)

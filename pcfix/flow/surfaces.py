@@ -18,7 +18,7 @@ from pcfix.grid.shoreline import NearWater, Shoreline
 from pcfix.io.clouds import CloudView as CloudView
 from pcfix.io.clouds import Points as Points
 from pcfix.io.clouds import points_of as points_of
-from pcfix.io.las.source import metric_crs
+from pcfix.io.las.source import metric_crs, stated_crs
 from pcfix.io.tiles import CloudFiles, open_cloud
 from pcfix.io.vectors import (
     SHORE_RADIUS_M,
@@ -64,12 +64,15 @@ def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
 
 
-def view_of(cloud: CloudFiles, jobs: int | None = None) -> CloudView:
-    """Return the view of a LAS or LAZ file, or of many as one cloud."""
+def view_of(cloud: CloudFiles, jobs: int | None = None, *, in_metres: bool = True) -> CloudView:
+    """Return the view of a LAS or LAZ file, or of many as one cloud.
+
+    Raises InputError if it is not `in_metres`, which does not matter to some steps.
+    """
     with open_cloud(cloud, jobs) as source:
         return CloudView(
             str(cloud),
-            metric_crs(source),
+            metric_crs(source) if in_metres else stated_crs(source),
             np.array(source.header.mins[:2]),
             np.array(source.header.maxs[:2]),
             len(source),
