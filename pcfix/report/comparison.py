@@ -123,7 +123,7 @@ def comparison_text(c: Comparison) -> str:
     if (own := plain["own"]) is not None:
         noise = noise_sentence(own, raw_of(plain)["after"])
         if own["rmse_m"] is not None:
-            noise = f"RMSE {own['rmse_m']:.3f} m, 95 % {own['within_95_m']:.3f} m, {noise}"
+            noise = f"RMSE {own['rmse_m']:.3f} m, 95 % {own['within_95_m']:.3f} m; {noise}"
         rows.append(("Bed" if own["of"] == "bed" else "Cloud", noise))
     if c.m3c2 is not None:
         m = c.m3c2.after
@@ -139,10 +139,11 @@ def comparison_text(c: Comparison) -> str:
 def noise_sentence(own: Plain, raw: Plain) -> str:
     """Return how the noise of the reference changes the errors of the cloud."""
     source = "assumed" if own["is_assumed"] else "stated"
-    noise = f"the reference's noise ({own['sigma_reference_m']:.3f} m, {source})"
+    noise = f"the noise of the reference ({own['sigma_reference_m']:.3f} m, {source})"
     if own["rmse_m"] is None:
         return f"the differences scatter no more than {noise}, so the cloud's error is not known."
-    return f"without {noise}; with it RMSE {raw['rmse_m']:.3f} m, 95 % {raw['within_95_m']:.3f} m."
+    with_it = f"RMSE {raw['rmse_m']:.3f} m, 95 % {raw['within_95_m']:.3f} m"
+    return f"{noise} is subtracted; with it {with_it}."
 
 
 def signed(value_m: float) -> str:
