@@ -12,7 +12,7 @@ import numpy as np
 from pcfix.blocks import blocks, bounds, kept, mapped
 from pcfix.clean.neighbours import nearest_distance
 from pcfix.compare.m3c2 import m3c2_distances
-from pcfix.compare.match import Match, area_spacing_m, heights_at
+from pcfix.compare.match import Match, heights_at, spacing_m
 from pcfix.compare.statistics import (
     binned,
     distribution_of,
@@ -188,10 +188,7 @@ def sparse_notes(match: Match, to: Figures | None, back: Figures | None) -> list
     """Return warnings of distances that mostly measure the spacing of a sparse cloud."""
     if match.reference.sparse:
         return []
-    spacings = {
-        "reference": area_spacing_m(match.reference.xyz),
-        "cloud": area_spacing_m(match.asked.xyz),
-    }
+    spacings = {"reference": spacing_m(match.reference.xyz), "cloud": spacing_m(match.asked.xyz)}
     notes = []
     for pair, sparse, dense in zip((to, back), spacings, reversed(spacings), strict=True):
         apart, times = spacings[sparse], spacings[sparse] / max(spacings[dense], 1e-9)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -12,7 +11,6 @@ import numpy as np
 from pcfix.blocks import blocks, bounds, empty, kept, mapped
 from pcfix.clean.neighbours import nearest_of
 from pcfix.errors import GeometryError, SettingError, bad_file
-from pcfix.grid.lattice import spacing_m
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import CompareRules
 
@@ -216,13 +214,19 @@ def _mean_spacing_m(xyz: FloatArray) -> float:
     return float(np.sqrt(extent.prod() / len(xyz)))
 
 
-def area_spacing_m(xyz: FloatArray) -> float:
+def spacing_m(xyz: FloatArray) -> float:
     """Return the spacing of points (n, 3) in plan, within the area that they fill, metres.
 
     That is the area of the squares with points, which are as large as to hold about three each.
     """
-    mean_m = _mean_spacing_m(xyz)
-    return spacing_m(xyz, max(math.sqrt(POINTS_PER_SQUARE) * mean_m, 1e-9)) or mean_m
+    low, high = bounds(xyz[:, :2])
+    side = max(np.sqrt(POINTS_PER_SQUARE) * _mean_spacing_m(xyz), 1e-9)
+    columns, rows = ((high - low) / side).astype(np.int64) + 1
+    taken = np.zeros(columns * rows, np.bool_)
+    for some in blocks(len(xyz)):
+        column, row = ((xyz[some, :2] - low) / side).astype(np.int64).T
+        taken[row * columns + column] = True
+    return float(side * np.sqrt(np.count_nonzero(taken) / len(xyz)))
 
 
 def near_in_plan(xy: FloatArray, other_xy: FloatArray, limit_m: float) -> BoolArray:
