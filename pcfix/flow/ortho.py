@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from pcfix.flow.inputs import paths_in
-from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, check_kind, finished
+from pcfix.flow.photos import PhotoBlock, block_of, check_kind, finished
 from pcfix.flow.runner import Progress, check_summary
 from pcfix.grid.lattice import Lattice, lattice_over
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
+from pcfix.io.clouds import is_cloud
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.model import WaterPlane
 from pcfix.options.declare import File, taken
@@ -64,8 +65,9 @@ def ortho_photo(
     with threads(given.jobs), temporary_output(target) as draft, scratch_folder(target) as folder:
         # without water, its level is below all ground
         water = NO_WATER if given.water is None else given.water
-        is_cloud = Path(given.dsm).suffix.lower() in CLOUDS
-        coarse_m = 2.0 * given.resolution if is_cloud and given.resolution else None
+        coarse_m = None
+        if given.resolution and is_cloud(Path(given.dsm)):
+            coarse_m = 2.0 * given.resolution
         same = replace(given, water=water, resolution=coarse_m).part(PhotosOptions)
         block = block_of(same, paths, folder)
         # the cells over the DSM; their side is the ground pixel, rounded to two digits

@@ -26,6 +26,7 @@ from pcfix.flow.runner import (
     key_of,
     write_summary,
 )
+from pcfix.io.clouds import is_cloud
 from pcfix.io.files import read_json, write_text
 from pcfix.io.labels import match_labels
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
@@ -48,7 +49,6 @@ MOST_BLACK = 0.2
 """Share of an image; more gives a warning."""
 LENS_TOLERANCE = 0.005
 """Of the shape of a frame in millimetres against that of the image."""
-CLOUDS = (".las", ".laz")
 
 
 def map_photos(
@@ -198,7 +198,7 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
     if read.rotations is None or read.lenses is None:
         sentence = "has no angles or no lenses. Photographs need both for each image."
         raise bad_file(name, "cameras.incomplete", sentence)
-    if Path(given.dsm).suffix.lower() not in CLOUDS and given.resolution is not None:
+    if given.resolution is not None and not is_cloud(Path(given.dsm)):
         sentence = "--resolution applies only to a cloud, but the DSM is a raster. Omit it."
         raise SettingError("option.no_use", sentence, option="resolution")
     heights, origin, crs, corrected = read_heights(
@@ -275,7 +275,7 @@ def read_heights(
     whether pcfix made it of a corrected cloud.
     """
     path = Path(dsm)
-    if path.suffix.lower() in CLOUDS:
+    if is_cloud(path):
         grid_dsm(path, scratch / "dsm.tif", resolution=resolution)
         path = scratch / "dsm.tif"
     with open_raster(path) as source:

@@ -24,8 +24,9 @@ import numpy as np
 from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
-from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, finished, map_photos, open_record
+from pcfix.flow.photos import PhotoBlock, block_of, finished, map_photos, open_record
 from pcfix.flow.runner import Progress, check_summary, json_text, key_of
+from pcfix.io.clouds import is_cloud
 from pcfix.io.files import check_input, run_logged, write_text
 from pcfix.io.las.writing import write_points
 from pcfix.io.photographs import photographs_in, read_colours
@@ -94,7 +95,7 @@ def rebuild_rounds(
         shutil.rmtree(folders.pop())
     record = open_record(target / RECORD, key_of("rebuild", given, ignored=COMMAND_ONLY), folders)
     record.setdefault("rounds", [])
-    start = str(given.dsm) if Path(given.dsm).suffix.lower() in CLOUDS else None
+    start = str(given.dsm) if is_cloud(Path(given.dsm)) else None
     if start is not None:  # a cloud is gridded to the folder
         raster = target / "dsm.tif"
         fresh = raster.exists() and raster.stat().st_mtime_ns > Path(start).stat().st_mtime_ns

@@ -139,18 +139,18 @@ def run_all(
     check_shoreline(request.shoreline, overwrite=asked.overwrite or record.resumes, inputs=inputs)
 
     def step(
-        name: str, title: str, made: Path, work: Callable[[Progress | None], Any],
+        name: str, title: str, result_file: Path, work: Callable[[Progress | None], Any],
         outputs: Sequence[Path] = (), words: Callable[[Any], str] = lambda result: "",
     ) -> Any:  # fmt: skip
-        """Do a step unless it is done, and say what it made; return its result.
+        """Do a step unless it is done, and say where its main result is; return its figures.
 
-        `outputs` are all files that it leaves, by default what it `made`.
+        `outputs` are all files that it leaves, by default only the main one.
         """
         with bar(title) as progress:
-            result, was_done = record.step(name, outputs or [made], partial(work, progress))
+            result, was_done = record.step(name, outputs or [result_file], partial(work, progress))
         if name != "adjust" or result["model"] is not None:
             done = "already done" if was_done else "done"
-            say(f"{name:<9} {done}: {made}{words(result)}")
+            say(f"{name:<9} {done}: {result_file}{words(result)}")
         return result
 
     outputs = [out_dir / FOLDER / name for name in ADJUSTED]
