@@ -24,7 +24,7 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
@@ -40,7 +40,6 @@ from pcfix.options.shared import PartOptions
 Set = TypeVar("Set", bound=OptionSet)
 
 if TYPE_CHECKING:
-    from pcfix.compare.match import SurveyCloud
     from pcfix.flow.surfaces import CloudView, Points
 
 Stage: TypeAlias = Callable[[Dimensions, Dimensions], bool]
@@ -149,8 +148,7 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
 
 
 def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
-    from pcfix.clean.points import WEAK
-    from pcfix.flow.clean import Tested, find_noise
+    from pcfix.flow.clean import find_noise
     from pcfix.flow.runner import check_summary, write_summary
     from pcfix.options.steps import CleanOptions
     from pcfix.running import threads
@@ -158,15 +156,9 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     started = time.perf_counter()
     options = _options(namespace, CleanOptions)
     cloud = PdalCloud(ins, namespace.get("metadata"))
-    rays = cloud.columns(tuple(WEAK))
     check_summary(options)
-
-    def chunks(water: WaterSurface | None) -> Iterator[Tested]:
-        for rows, points in _chunks(cloud, water):
-            yield points, cloud.withheld[rows], {name: rays[name][rows] for name in rays}
-
     with threads(options.jobs):
-        noise, found = find_noise(NAME, options, lambda: _view(cloud), ins, chunks, len(cloud))
+        noise, found = find_noise(options, _view(cloud))
     if options.drop:
         outs["Mask"] = ~noise
     else:
@@ -181,29 +173,13 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
 
 def _compare(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
     """Compare, and pass all points on unchanged."""
-    from pcfix.flow.compare import Held, compare_clouds
+    from pcfix.flow.compare import compare_clouds
     from pcfix.options.steps import StageCompareOptions
 
     options = _options(namespace, StageCompareOptions)
     cloud = PdalCloud(ins, namespace.get("metadata"))
-    held = Held(lambda: _view(cloud), lambda water: _survey(cloud, water))
-    found = compare_clouds(held, options.reference or "", options=options)
+    found = compare_clouds(_view(cloud), options.reference or "", options=options)
     namespace["out_metadata"] = metadata_of(found.as_dict())
-
-
-def _survey(cloud: PdalCloud, water: WaterSurface | None) -> SurveyCloud:
-    """Return the cloud as a comparison needs it."""
-    from pcfix.io.clouds import DIMENSIONS, SurveyPoints, survey_cloud
-    from pcfix.io.crs import parse_crs
-
-    values, withheld = cloud.columns(tuple(DIMENSIONS)), cloud.withheld
-    chunks = (
-        SurveyPoints(points.xyz, points.classes, withheld[rows], points.heights,
-             {name: values[name][rows] for name in values})
-        for rows, points in _chunks(cloud, water)
-    )  # fmt: skip
-    crs = None if cloud.crs is None else parse_crs(cloud.crs, NAME)
-    return survey_cloud(NAME, crs, chunks, water, water is not None, len(cloud))
 
 
 def _options(namespace: dict[str, Any], kind: type[Set]) -> Set:
@@ -246,13 +222,15 @@ def _converted(one: Option, value: Any) -> Any:
     return value
 
 
-def _chunks(cloud: PdalCloud, water: WaterSurface | None) -> Iterator[tuple[slice, Points]]:
+def _chunks(
+    cloud: PdalCloud, water: WaterSurface | None, names: Iterable[str] = ()
+) -> Iterator[tuple[slice, Points]]:
     """Yield the rows of each chunk, and its points."""
     from pcfix.flow.surfaces import Points
     from pcfix.io.las.source import CHUNK_POINTS
     from pcfix.water.checks import checked_points
 
-    ins = cloud.ins
+    ins, known = cloud.ins, cloud.columns(tuple(names))
     for first in range(0, len(cloud), CHUNK_POINTS):
         rows = slice(first, first + CHUNK_POINTS)
         xyz = checked_points(cloud.xyz(rows))
@@ -262,19 +240,23 @@ def _chunks(cloud: PdalCloud, water: WaterSurface | None) -> Iterator[tuple[slic
         sources = ins["PointSourceId"][rows] if "PointSourceId" in ins else None
         has_colours = all(name in ins for name in COLOURS)
         rgb = np.column_stack([ins[name][rows] for name in COLOURS]) if has_colours else None
-        yield rows, Points(xyz, heights, cloud.classes[rows], sources, rgb)
+        yield rows, Points(
+            xyz, heights, cloud.classes[rows], sources, rgb, cloud.withheld[rows],
+            dimensions={name: values[rows] for name, values in known.items()},
+        )  # fmt: skip
 
 
 def _view(cloud: PdalCloud) -> CloudView:
     """Return what is known of the cloud, and all its points."""
     from pcfix.flow.surfaces import CloudView, corners
 
-    def chunks(water: WaterSurface | None = None) -> Iterator[Points]:
-        return (points for _, points in _chunks(cloud, water))
+    def chunks(water: WaterSurface | None = None, names: Iterable[str] = ()) -> Iterator[Points]:
+        return (points for _, points in _chunks(cloud, water, names))
 
     low, high = corners(cloud.ins["X"], cloud.ins["Y"])
     step_m = 0.0 if cloud.scales is None else float(cloud.scales.max())
-    return CloudView(NAME, cloud.crs, low, high, len(cloud), chunks, step_m=step_m)
+    names = frozenset(cloud.ins)
+    return CloudView(NAME, cloud.crs, low, high, len(cloud), chunks, step_m=step_m, names=names)
 
 
 def _repair_process(error: BaseException) -> None:

@@ -24,14 +24,14 @@ CLOUD = "LAS or LAZ to write; a folder for tiles."
 
 
 def _summarized(
-    title: str, text: str, quiet: bool, work: Callable[..., Any], *given: Any, unit: str = "points"
+    title: str, name: str, quiet: bool, work: Callable[..., Any], *given: Any, unit: str = "points"
 ) -> None:
-    """Call a function of two files and options with a bar, and print its summary as a text."""
-    from pcfix.report import text as texts
+    """Call a function of two files and options with a bar, and print the summary of a command."""
+    from pcfix.report.text import text_of
 
     with progress_bar(title, quiet, unit=unit) as progress:
         result = work(*given[:2], options=given[2], progress=progress)
-    say(getattr(texts, text)(result), quiet)
+    say(text_of(name, result), quiet)
 
 
 @command(
@@ -71,7 +71,7 @@ def run(
 )
 def correct(input: str, output: Path, /, *, options: CorrectOptions, quiet: bool) -> None:
     """Correct a point cloud for refraction at the water surface."""
-    _summarized("Correcting", "summary_text", quiet, pcfix.correct_file, input, output, options)
+    _summarized("Correcting", "correct", quiet, pcfix.correct_file, input, output, options)
 
 
 @command(
@@ -99,13 +99,13 @@ def adjust(
 @command("pcfix label cloud.laz labelled.laz --water shore.csv", input=TILED, output=CLOUD)
 def label(input: str, output: Path, /, *, options: LabelOptions, quiet: bool) -> None:
     """Classify points below the water surface (class 40)."""
-    _summarized("Labelling", "labelling_text", quiet, pcfix.label_file, input, output, options)
+    _summarized("Labelling", "label", quiet, pcfix.label_file, input, output, options)
 
 
 @command("pcfix clean corrected.laz cleaned.laz", input=TILED, output=CLOUD)
 def clean(input: str, output: Path, /, *, options: CleanOptions, quiet: bool) -> None:
     """Flag noise: outliers, weak intersections, points far from the bed."""
-    _summarized("Cleaning", "cleaning_text", quiet, pcfix.clean_file, input, output, options)
+    _summarized("Cleaning", "clean", quiet, pcfix.clean_file, input, output, options)
 
 
 @command(
@@ -115,7 +115,7 @@ def clean(input: str, output: Path, /, *, options: CleanOptions, quiet: bool) ->
 )
 def dsm(input: str, output: Path, /, *, options: DsmOptions, quiet: bool) -> None:
     """Grid a cloud to a GeoTIFF: height, count and spread."""
-    _summarized("Gridding", "dsm_text", quiet, pcfix.grid_dsm, input, output, options)
+    _summarized("Gridding", "dsm", quiet, pcfix.grid_dsm, input, output, options)
 
 
 @command(
@@ -126,7 +126,7 @@ def dsm(input: str, output: Path, /, *, options: DsmOptions, quiet: bool) -> Non
 def ortho(images: Path, output: Path, /, *, options: OrthoOptions, quiet: bool) -> None:
     """Make an orthophoto of land and bed from photographs and the corrected DSM."""
     given = images, output, options
-    _summarized("Rectifying", "ortho_text", quiet, pcfix.ortho_photo, *given, unit="cells")
+    _summarized("Rectifying", "ortho", quiet, pcfix.ortho_photo, *given, unit="cells")
 
 
 @command(
@@ -149,16 +149,12 @@ def compare(cloud: str, reference: str, /, *, options: CompareOptions, quiet: bo
 )
 def photos(images: Path, out_dir: Path, /, *, options: PhotosOptions, quiet: bool) -> None:
     """Remove refraction from photographs, for use in any SfM software."""
-    from pcfix.report.text import photos_text, rounds_text
-
-    with progress_bar("Mapping", quiet, unit="photographs") as progress:
-        given: dict[str, Any] = {"options": options, "progress": progress}
-        if options.rebuild is None:
-            text = photos_text(pcfix.map_photos(images, out_dir, **given))
-        else:
-            shown = partial(say, quiet=quiet)
-            text = rounds_text(pcfix.rebuild_rounds(images, out_dir, **given, say=shown))
-    say(text, quiet)
+    given, unit = (images, out_dir, options), "photographs"
+    if options.rebuild is None:
+        _summarized("Mapping", "photos", quiet, pcfix.map_photos, *given, unit=unit)
+    else:
+        work = partial(pcfix.rebuild_rounds, say=partial(say, quiet=quiet))
+        _summarized("Mapping", "rebuild", quiet, work, *given, unit=unit)
 
 
 @command(
@@ -168,7 +164,7 @@ def photos(images: Path, out_dir: Path, /, *, options: PhotosOptions, quiet: boo
 )
 def calm(frames: Path, out: Path, /, *, options: CalmOptions, quiet: bool) -> None:
     """Combine a burst of frames into one image as seen through calm water."""
-    _summarized("Combining", "calm_text", quiet, pcfix.calm_frames, frames, out, options)
+    _summarized("Combining", "calm", quiet, pcfix.calm_frames, frames, out, options)
 
 
 @command(

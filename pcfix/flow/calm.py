@@ -14,8 +14,8 @@ import numpy.typing as npt
 from pcfix.blocks import release
 from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.photos import photo_of, read_heights, warn_all
-from pcfix.flow.runner import Progress, check_summary, write_summary
+from pcfix.flow.photos import check_kind, finished, photo_of, read_heights
+from pcfix.flow.runner import Progress, check_summary
 from pcfix.grid.lattice import Lattice
 from pcfix.io.atomic import temporary_output
 from pcfix.io.crs import parse_crs
@@ -27,7 +27,7 @@ from pcfix.options.declare import File, taken
 from pcfix.options.photos import CalmOptions
 from pcfix.photos.calm import LEAST_CORNERS, corners_in, covered, laid, median_of, register
 from pcfix.photos.mapping import Photo
-from pcfix.photos.waves import Nodes, View, displacements, fit_waves, nodes_of, slopes_of, still
+from pcfix.photos.waves import Nodes, View, displacements, fit_waves, nodes_of, slopes_of
 from pcfix.running import threads
 from pcfix.sums import Figures
 from pcfix.water.index import index_of
@@ -97,9 +97,7 @@ def calm_frames(
         if view is not None:
             interval = given.interval * given.every if given.interval else found.interval_s
             nodes = nodes_of(view, given.resolution)
-            measured = displacements(median, view, nodes, count(stack))
-            shifts, weights = (np.stack(one) for one in zip(*measured, strict=True))
-            weights[:, still(shifts, weights)] = 0.0
+            shifts, weights = displacements(median, view, nodes, count(stack))
             waters, water = _water(view, nodes, shifts, weights, interval)
             water.folder = str(folder)
             with temporary_output(folder, is_folder=True) as draft:
@@ -117,8 +115,10 @@ def calm_frames(
     write_spread(beside, spread)
     middle = np.array([0.5 * found.columns, 0.5 * found.rows, 1.0])
     moved = homographies @ middle
-    warn_all(notes)
-    summary = Figures(
+    return finished(
+        given,
+        started,
+        notes,
         input=str(frames),
         output=str(out),
         spread_file=str(beside),
@@ -131,12 +131,8 @@ def calm_frames(
         # largest movement of the frame's centre
         moved_px=round(float(np.hypot(*(moved[:, :2] / moved[:, 2:] - middle[:2]).T).max()), 2),
         spread=round(float(np.nanmedian(spread)), 2),  # of the frames, median, grey values
-        seconds=round(time.perf_counter() - started, 3),
         water=water,
-        notes=notes,
     )
-    write_summary(given, summary.as_dict())
-    return summary
 
 
 def _registered(frames: Frames, images: Iterable[Any]) -> tuple[FloatArray, FloatArray]:
@@ -162,14 +158,7 @@ def _median(
     for number, frame in enumerate(images):
         if stack is None:
             stack = empty((len(frames.names), *frame.shape), frame.dtype)
-        if frame.shape != stack.shape[1:] or frame.dtype != stack.dtype:
-            raise InputError(
-                "photos.kind",
-                f"{frames.names[number]}: has {frame.shape[2]} bands of {frame.dtype}, but the"
-                f" first frame {stack.shape[3]} of {stack.dtype}. Give frames of one kind.",
-                frame=frames.names[number],
-                bands=frame.shape[2],
-            )
+        check_kind(frames.names[number], frame, stack[0])
         same = np.array_equal(homographies[number], np.eye(3))
         stack[number] = frame if same else laid(frame, homographies[number])
     shape = stack.shape[1:3]

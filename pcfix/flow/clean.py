@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,13 +14,13 @@ from pcfix.blocks import empty, release
 from pcfix.clean.points import WEAK, Cloud, Reason, flag_neighbours
 from pcfix.errors import bad_file
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
-from pcfix.flow.surfaces import CloudView, Points, find_surface, points_of, view_of
+from pcfix.flow.surfaces import CloudView, find_surface, view_of
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header, own_settings
 from pcfix.io.tiles import Clouds, open_cloud
-from pcfix.model import LOW_NOISE, NOISE_CLASSES, BoolArray, FloatArray, WaterSurface
+from pcfix.model import LOW_NOISE, BoolArray
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CleanOptions, CleanRules
@@ -67,25 +66,13 @@ def clean_file(
     )  # fmt: skip
 
 
-Tested: TypeAlias = tuple[Points, BoolArray, dict[str, FloatArray]]
-"""Some points, which of them are withheld, and by name those dimensions of `WEAK` there are."""
-
-
 def find_noise(
-    name: str,
-    options: CleanOptions,
-    view: Callable[[], CloudView],
-    names: Collection[str],
-    chunks: Callable[[WaterSurface | None], Iterable[Tested]],
-    n: int,
-    *,
-    has_rays: bool = True,
+    options: CleanOptions, view: CloudView, *, has_rays: bool = True
 ) -> tuple[BoolArray, Figures]:
-    """Run the tests on a whole cloud of n points, from a file or a PDAL pipeline.
+    """Run the tests on a whole cloud of n points.
 
-    The cloud has some dimensions by `names`. `view` returns it as a water surface needs it, and
-    `chunks` its points under that surface. `has_rays` is False if it was corrected without cameras.
-    Returns which points are noise, shape (n,), and a summary without files and time.
+    `has_rays` is False if it was corrected without cameras. Returns which points are noise, shape
+    (n,), and a summary without files and time.
     """
     rules, not_run = options.part(CleanRules), list[str]()
     tests = {
@@ -96,8 +83,8 @@ def find_noise(
         not_run.append(f"{', '.join(tests)}: the cloud was corrected without cameras")
     water = None
     if options.water is not None:
-        water = find_surface(options.water, WaterOptions(), view()).surface
-    has = {one for one in WEAK if {"RayCount", one} <= set(names)}
+        water = find_surface(options.water, WaterOptions(), view).surface
+    n, has = view.points, {one for one in WEAK if {"RayCount", one} <= set(view.names)}
     not_run += [
         f"{test}: the cloud has no dimension {dimension if has else 'RayCount'}"
         for (test, limit), dimension in zip(tests.items(), WEAK, strict=True)
@@ -107,26 +94,25 @@ def find_noise(
         not_run.append("below bed, floating: no --water, and no dimension RayCount")
     cloud = Cloud(empty((n, 3)), *(np.zeros(n, kind) for kind in (bool, bool, np.uint8)))
     first = 0
-    for points, withheld, rays in chunks(water):
-        rows = slice(first, first + len(withheld))
-        used = ~(withheld | np.isin(points.classes, NOISE_CLASSES))
+    for points in view.chunks(water, set(WEAK).intersection(view.names)):
+        rows = slice(first, first + len(points.xyz))
         above = None if water is None else surface_above(water, points.xyz, points.heights)
-        cloud.add(rows, points.xyz, used, above, rays, rules)
+        cloud.add(rows, points.xyz, points.counts(), above, points.dimensions or {}, rules)
         first = rows.stop
         release()
-        current().report(len(withheld))
+        current().report(len(points.xyz))
     tested, submerged = int(cloud.used.sum()), int(cloud.submerged.sum())
     if not tested:
         sentence = (
             f"all {n:,} points are withheld or noise (class 7 or 18). There is nothing left to"
             " clean."
         )
-        raise bad_file(name, "cloud.all_withheld", sentence, points=n)
+        raise bad_file(view.name, "cloud.all_withheld", sentence, points=n)
     if not rules.below_or_floating:
         submerged = 0
     elif water is not None:
-        check_submerged(submerged, name, water)
-    distance_m = flag_neighbours(name, cloud, rules)
+        check_submerged(submerged, view.name, water)
+    distance_m = flag_neighbours(view.name, cloud, rules)
     noise = cloud.reasons != 0
     count = int(noise.sum())
     return noise, Figures(
@@ -161,11 +147,9 @@ class CleanPlan(NamedTuple):
 def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask) -> CleanPlan:
     """Find the noise of a whole cloud; large arrays are on the disk of the target."""
     cloud = task.source
-    with open_cloud(cloud) as source:
-        names, total = set(source.header.point_format.dimension_names), len(source)
-        ours = None
-        with suppress(ValueError):  # a damaged record is reported where its content is needed
-            ours = own_settings(source.vlrs)
+    view, ours = view_of(cloud, options.jobs, in_metres=options.water is not None), None
+    with open_cloud(cloud) as source, suppress(ValueError):  # a damaged record is reported later
+        ours = own_settings(source.vlrs)
     has_rays = not (isinstance(ours, dict) and ours.get("cameras") == 0)
     passed = 0.0
 
@@ -173,28 +157,18 @@ def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask)
         nonlocal passed
         passed += points
         if progress is not None:
-            progress(int(passed) // _PASSES, total)
-
-    def chunks(water: WaterSurface | None) -> Iterator[Tested]:
-        with open_cloud(cloud, options.jobs) as source:
-            shown = names.intersection(WEAK)
-            for chunk in source.chunks():
-                rays = {name: source.dimension(chunk, name) for name in shown}
-                withheld = np.asarray(chunk["withheld"]).astype(np.bool_)
-                yield points_of(chunk, source, water), withheld, rays
+            progress(int(passed) // _PASSES, view.points)
 
     near = task.target.absolute()
     if not near.parent.is_dir():  # the folder of many files is made later
         near = next(one for one in near.parents if one.is_dir()) / near.name
     with scratch_arrays(near), running(report=count):
-        noise, summary = find_noise(
-            str(cloud), options, lambda: view_of(cloud), names, chunks, total, has_rays=has_rays
-        )
+        noise, summary = find_noise(options, view, has_rays=has_rays)
     if options.drop and noise.all():
         sentence = (
             "every point exceeds these thresholds of noise. Use wider thresholds, or omit --drop."
         )
-        raise bad_file(cloud, "cloud.all_noise", sentence, points=total)
+        raise bad_file(cloud, "cloud.all_noise", sentence, points=view.points)
     return CleanPlan(np.packbits(noise), options.drop, summary)
 
 

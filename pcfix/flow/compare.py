@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from pcfix.compare.figures import Comparison, bins_table, figures_of
+from pcfix.compare.figures import Comparison, bins_table, figures_of, parse_line
 from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.compare.match import Match, SurveyCloud, match
-from pcfix.compare.sections import parse_line
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
 from pcfix.io.atomic import all_or_none
-from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
+from pcfix.io.clouds import (
+    DIMENSIONS,
+    CloudView,
+    check_same_crs,
+    read_cloud,
+    read_reference,
+    reference_of,
+    survey_cloud,
+)
+from pcfix.io.crs import parse_crs
 from pcfix.io.files import check_output, scratch_arrays, write_text
 from pcfix.io.tiles import Clouds, cloud_of, inputs_of
-from pcfix.model import WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CompareOptions, CompareRules
@@ -27,18 +33,9 @@ from pcfix.options.steps import CompareOptions, CompareRules
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from pcfix.flow.surfaces import CloudView
-
-
-class Held(NamedTuple):
-    """A cloud in memory: its view, and a function that returns its points for a water surface."""
-
-    view: Callable[[], CloudView]
-    read: Callable[[WaterSurface | None], SurveyCloud]
-
 
 def compare_clouds(
-    cloud: Clouds | Held,
+    cloud: Clouds | CloudView,
     reference: Clouds,
     *,
     options: CompareOptions | None = None,
@@ -52,21 +49,22 @@ def compare_clouds(
     Parameters
     ----------
     cloud : path, or list of paths
-        LAS or LAZ, or many as `pcfix.io.tiles.tiles_of` has them. If `correct_file` wrote it with
-        all its dimensions, the apparent points are compared too.
+        LAS or LAZ, or many as `pcfix.io.tiles.tiles_of` has them, or the view of a cloud in memory.
+        If `correct_file` wrote it with all its dimensions, the apparent points are compared too.
     reference : path, or list of paths
         LAS or LAZ, or many; CSV check points (x, y, z); or a GeoTIFF of heights. At check points
         the cloud's surface is measured, not the reference's at each point of the cloud.
     options : CompareOptions, optional
         Or its attributes as keywords: the options of ``pcfix compare``. `section` takes texts
-        ``x1,y1,x2,y2`` or `pcfix.compare.sections.SectionLine`, `share` texts or pairs, `also`
+        ``x1,y1,x2,y2`` or `pcfix.compare.figures.SectionLine`, `share` texts or pairs, `also`
         texts, pairs or a dict of paths by name.
 
     """
     started = time.perf_counter()
     given = taken(CompareOptions, options, keywords, "compare_clouds")
     lines = [parse_line(line) if isinstance(line, str) else line for line in given.section]
-    clouds = [] if isinstance(cloud, Held) else [cloud_of(cloud)]
+    held = cloud if isinstance(cloud, CloudView) else None
+    clouds = [] if isinstance(cloud, CloudView) else [cloud_of(cloud)]
     also = {name: cloud_of(path) for name, path in given.also}
     surveyed = reference_of(reference)
     read = (*clouds, surveyed, *also.values())
@@ -77,8 +75,7 @@ def compare_clouds(
     if given.water is not None:
         from pcfix.flow.surfaces import find_surface, view_of  # slow to import
 
-        view = cloud.view() if isinstance(cloud, Held) else view_of(clouds[0])
-        water = find_surface(given.water, WaterOptions(), view).surface
+        water = find_surface(given.water, WaterOptions(), held or view_of(clouds[0])).surface
     outputs = [path for path in (given.out_dir, given.summary, given.plot) if path is not None]
     near = Path([*outputs, Path(tempfile.gettempdir()) / "pcfix"][0])
     with scratch_arrays(near):  # arrays of large clouds
@@ -88,7 +85,12 @@ def compare_clouds(
             check_same_crs(one.name, one.crs, target.name, target.crs)
             return match(one, target, given.part(CompareRules), given=water is not None)
 
-        whole = cloud.read(water) if isinstance(cloud, Held) else read_cloud(clouds[0], water)
+        if held is None:
+            whole = read_cloud(clouds[0], water)
+        else:
+            crs = None if held.crs is None else parse_crs(str(held.crs), held.name)
+            chunks = held.chunks(water, DIMENSIONS)
+            whole = survey_cloud(held.name, crs, chunks, water, water is not None, held.points)
         matched, others = matched_to(whole), {}
         for name, further in also.items():  # at the places of the first
             others[name] = replace(matched_to(read_cloud(further, water)), places=matched.places)

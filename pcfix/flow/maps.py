@@ -14,7 +14,7 @@ import shapely
 from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
 from pcfix.flow.request import SURFACE, RunFolder
 from pcfix.flow.runner import Progress
-from pcfix.flow.surfaces import points_of, shoreline_layer, view_of
+from pcfix.flow.surfaces import file_points, shoreline_layer, view_of
 from pcfix.grid.colours import hillshade, relief_colours
 from pcfix.grid.lattice import round_resolution
 from pcfix.grid.maps import contours, depth_interval
@@ -23,9 +23,9 @@ from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.styles import Symbol, limits_of, vector_style
 from pcfix.io.tables import read_check_depths
-from pcfix.io.tiles import Tiles, open_cloud
+from pcfix.io.tiles import Tiles
 from pcfix.io.vectors import Layer, write_layers
-from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, Cameras, FloatArray, WaterSurface
+from pcfix.model import BATHYMETRIC_POINT, Cameras, FloatArray, WaterSurface
 from pcfix.options.correct import LEVEL_M
 from pcfix.options.declare import File
 from pcfix.options.steps import DsmOptions
@@ -157,14 +157,13 @@ def contours_layer(folder: Path, interval: float | None = None) -> Layer:
 def _waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Layer:
     """Return where the water meets the corrected cloud."""
     near = NearWater()
-    with open_cloud(cloud) as source:
-        for chunk in source.chunks():
-            points = points_of(chunk, source, water)
-            above = points.xyz[:, 2] - surface_above(water, points.xyz, points.heights).height_m
-            bed = points.classes == BATHYMETRIC_POINT
-            above[bed] = -source.dimension(chunk, "WaterDepth")[bed]
-            above[np.isin(points.classes, NOISE_CLASSES) | (chunk["withheld"] == 1)] = np.nan
-            near += NearWater.of(points.xyz, above, source.dimension(chunk, "SigmaZ"))
+    for points in file_points(cloud, water, ("WaterDepth", "SigmaZ")):
+        known = points.dimensions or {}
+        above = points.xyz[:, 2] - surface_above(water, points.xyz, points.heights).height_m
+        bed = points.classes == BATHYMETRIC_POINT
+        above[bed] = -known["WaterDepth"][bed]
+        above[~points.counts()] = np.nan
+        near += NearWater.of(points.xyz, above, known["SigmaZ"])
     lines = near.lines(lambda xy: np.full(len(xy), sigma_m))
     style = vector_style({"line": Symbol("line", RED, 0.5)})
     return shoreline_layer("waterline", lines, style)

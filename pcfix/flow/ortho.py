@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import bad_file
 from pcfix.flow.inputs import paths_in
-from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, warn_all
-from pcfix.flow.runner import Progress, check_summary, write_summary
+from pcfix.flow.photos import PhotoBlock, block_of, check_kind, finished
+from pcfix.flow.runner import Progress, check_summary
 from pcfix.grid.lattice import Lattice, lattice_over
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
+from pcfix.io.clouds import is_cloud
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.model import WaterPlane
 from pcfix.options.declare import File, taken
@@ -65,11 +65,11 @@ def ortho_photo(
     with threads(given.jobs), temporary_output(target) as draft, scratch_folder(target) as folder:
         # without water, its level is below all ground
         water = NO_WATER if given.water is None else given.water
-        is_cloud = Path(given.dsm).suffix.lower() in CLOUDS
-        coarse_m = 2.0 * given.resolution if is_cloud and given.resolution else None
+        coarse_m = None
+        if given.resolution and is_cloud(Path(given.dsm)):
+            coarse_m = 2.0 * given.resolution
         same = replace(given, water=water, resolution=coarse_m).part(PhotosOptions)
         block = block_of(same, paths, folder)
-        warn_all(block.notes)
         # the cells over the DSM; their side is the ground pixel, rounded to two digits
         bed = block.scene.ground
         rows, columns = bed.height_m.shape
@@ -79,7 +79,10 @@ def ortho_photo(
         lattice = lattice_over(low, high - 1e-6 * side, side, str(given.dsm))
         covered, ground = _write(block, lattice, given, folder / "plain.tif", progress)
         rasters.copy_as_cog(folder / "plain.tif", draft)
-    summary = Figures(
+    return finished(
+        given,
+        started,
+        block.notes,
         output=str(target),
         images=len(block.photos),
         width=lattice.width,
@@ -87,13 +90,9 @@ def ortho_photo(
         resolution_m=lattice.resolution_m,
         bounds_m=lattice.bounds_m,
         covered_share=round(covered / max(ground, 1), 5),  # of the cells over the DSM
-        seconds=round(time.perf_counter() - started, 3),
         dsm=str(given.dsm),
         water=None if given.water is None else str(given.water),
-        notes=block.notes,
     )
-    write_summary(given, summary.as_dict())
-    return summary
 
 
 def _write(
@@ -107,12 +106,7 @@ def _write(
     @lru_cache(maxsize=max(4, CACHE_BYTES // first.nbytes))
     def picture(row: int) -> Picture:
         pixels = read_colours(block.paths[row])
-        if pixels.shape[2] != bands or pixels.dtype != dtype:
-            sentence = (
-                f"has {pixels.shape[2]} bands of {pixels.dtype}, but {block.paths[0].name} {bands}"
-                f" of {dtype}. Give photographs of one kind."
-            )
-            raise bad_file(block.paths[row], "photos.kind", sentence, bands=pixels.shape[2])
+        check_kind(block.paths[row], pixels, first)
         return picture_of(pixels, shrunk, blanks=given.water is None)
 
     side = lattice.resolution_m

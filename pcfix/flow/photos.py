@@ -13,6 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.dsm import grid_dsm
@@ -25,6 +26,7 @@ from pcfix.flow.runner import (
     key_of,
     write_summary,
 )
+from pcfix.io.clouds import is_cloud
 from pcfix.io.files import read_json, write_text
 from pcfix.io.labels import match_labels
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
@@ -47,7 +49,6 @@ MOST_BLACK = 0.2
 """Share of an image; more gives a warning."""
 LENS_TOLERANCE = 0.005
 """Of the shape of a frame in millimetres against that of the image."""
-CLOUDS = (".las", ".laz")
 
 
 def map_photos(
@@ -111,13 +112,14 @@ def map_photos(
             f" {100 * MOST_BLACK:.0f} % of them is black ({name}: {100 * worst:.0f} %)."
         )
         notes.append(PcfixWarning("dsm.too_small", words, photographs=len(poor)))
-    warn_all(notes)
     pixels = sum(one[1] for one in found)
-    summary = Figures(
+    return finished(
+        given,
+        started,
+        notes,
         images=len(block.photos),
         done_before=len(old),  # images that an earlier call wrote
         megapixels=round(1e-6 * pixels, 1),
-        seconds=round(time.perf_counter() - started, 3),
         largest_shift_px=round(max((one[3] for one in found), default=0.0), 2),
         # of the pixels: without ground, occluded, or outside the original image
         black_share=round(sum(one[2] for one in found) / max(pixels, 1), 5),
@@ -126,10 +128,7 @@ def map_photos(
         water=str(block.scene.water),
         refractive_index=block.scene.refractive_index,
         spacing_px=block.step_px,
-        notes=notes,
     )
-    write_summary(given, summary.as_dict())
-    return summary
 
 
 def open_record(place: Path, key: str, written: Collection[Path]) -> dict[str, Any]:
@@ -152,10 +151,24 @@ def open_record(place: Path, key: str, written: Collection[Path]) -> dict[str, A
     return record
 
 
-def warn_all(notes: Iterable[PcfixWarning]) -> None:
-    """Show notes as warnings of the function that the user called."""
+def finished(given: Any, started: float, notes: Iterable[PcfixWarning], **figures: Any) -> Figures:
+    """Return the summary of a command, show its notes as warnings, and write it to a file."""
+    seconds = round(time.perf_counter() - started, 3)
+    found = Figures(**figures, seconds=seconds, notes=list(notes))
     for note in notes:
         warnings.warn(note, stacklevel=3)
+    write_summary(given, found.as_dict())
+    return found
+
+
+def check_kind(name: File, image: npt.NDArray[Any], first: npt.NDArray[Any]) -> None:
+    """Check that an image has the bands and the type of the first one."""
+    if image.shape[2] != first.shape[2] or image.dtype != first.dtype:
+        sentence = (
+            f"has {image.shape[2]} bands of {image.dtype}, but the first image {first.shape[2]} of"
+            f" {first.dtype}. Give images of one kind."
+        )
+        raise bad_file(name, "photos.kind", sentence, bands=image.shape[2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +198,7 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
     if read.rotations is None or read.lenses is None:
         sentence = "has no angles or no lenses. Photographs need both for each image."
         raise bad_file(name, "cameras.incomplete", sentence)
-    if Path(given.dsm).suffix.lower() not in CLOUDS and given.resolution is not None:
+    if given.resolution is not None and not is_cloud(Path(given.dsm)):
         sentence = "--resolution applies only to a cloud, but the DSM is a raster. Omit it."
         raise SettingError("option.no_use", sentence, option="resolution")
     heights, origin, crs, corrected = read_heights(
@@ -262,7 +275,7 @@ def read_heights(
     whether pcfix made it of a corrected cloud.
     """
     path = Path(dsm)
-    if path.suffix.lower() in CLOUDS:
+    if is_cloud(path):
         grid_dsm(path, scratch / "dsm.tif", resolution=resolution)
         path = scratch / "dsm.tif"
     with open_raster(path) as source:

@@ -44,9 +44,8 @@ from pcfix.report.page import (
 )
 from pcfix.report.text import aligned
 from pcfix.running import threads
-from pcfix.simulate.scene import lay_out, points_on
+from pcfix.simulate.scene import lay_out, points_on, see
 from pcfix.simulate.settings import SceneSettings
-from pcfix.simulate.sight import see
 from pcfix.sums import Figures
 from pcfix.water.index import index_of
 

@@ -24,8 +24,9 @@ import numpy as np
 from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
-from pcfix.flow.photos import CLOUDS, PhotoBlock, block_of, map_photos, open_record
-from pcfix.flow.runner import Progress, check_summary, json_text, key_of, write_summary
+from pcfix.flow.photos import PhotoBlock, block_of, finished, map_photos, open_record
+from pcfix.flow.runner import Progress, check_summary, json_text, key_of
+from pcfix.io.clouds import is_cloud
 from pcfix.io.files import check_input, run_logged, write_text
 from pcfix.io.las.writing import write_points
 from pcfix.io.photographs import photographs_in, read_colours
@@ -94,7 +95,7 @@ def rebuild_rounds(
         shutil.rmtree(folders.pop())
     record = open_record(target / RECORD, key_of("rebuild", given, ignored=COMMAND_ONLY), folders)
     record.setdefault("rounds", [])
-    start = str(given.dsm) if Path(given.dsm).suffix.lower() in CLOUDS else None
+    start = str(given.dsm) if is_cloud(Path(given.dsm)) else None
     if start is not None:  # a cloud is gridded to the folder
         raster = target / "dsm.tif"
         fresh = raster.exists() and raster.stat().st_mtime_ns > Path(start).stat().st_mtime_ns
@@ -140,7 +141,6 @@ def rebuild_rounds(
                 f" {100 * excess:.0f} % too deep. Correct the cloud and use --mapping exact."
             )
             notes.append(PcfixWarning("photos.paper_limit", words, excess=excess))
-            warnings.warn(notes[-1], stacklevel=2)
     compared = None
     if given.reference is not None:
         # Figs 16, 18 and 20 of the paper; with the first cloud also 15 and 17
@@ -151,20 +151,19 @@ def rebuild_rounds(
             rounds[-1].cloud, given.reference, water=given.water, submerged=True, out_dir=compared,
             also=also, overwrite=True,
         )  # fmt: skip
-    summary = Figures(
+    return finished(
+        given,
+        started,
+        notes,
         rounds=rounds,
         done_before=done_before,  # rounds that an earlier call finished
         settled=abs(rounds[-1].mean_m) < threshold_m,
         gsd_m=round(block.gsd_m, 5),
         threshold_m=threshold_m,
-        seconds=round(time.perf_counter() - started, 3),
         mapping=given.mapping,
         rebuild=str(given.rebuild),
         compared=compared,  # folder, where a reference was given
-        notes=notes,
     )
-    write_summary(given, summary.as_dict())
-    return summary
 
 
 def _reconstruct(

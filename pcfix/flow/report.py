@@ -1,7 +1,8 @@
-"""Read a corrected cloud once, and write its report page and figures."""
+"""Write the report page of a run and its figures, from the rasters and results of its steps."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,35 +10,35 @@ from typing import Any
 import numpy as np
 
 from pcfix.flow.adjust import FOLDER, SUMMARY
-from pcfix.flow.request import RunFolder
+from pcfix.flow.maps import DEPTH, UNCERTAINTY
+from pcfix.flow.request import SURFACE, RunFolder
 from pcfix.flow.surfaces import view_of
 from pcfix.flow.water import found_picture
-from pcfix.grid.maps import MOST_CELLS, MapsBuilder
+from pcfix.grid.lattice import Lattice
 from pcfix.io.crs import crs_words
 from pcfix.io.files import read_json, sha256, write_bytes, write_text
-from pcfix.io.las.source import coordinates, stated_crs
-from pcfix.io.rasters import preview
-from pcfix.io.tiles import Tiles, open_cloud
-from pcfix.model import NOISE_CLASSES
-from pcfix.report.adjustment import adjustment_tables
+from pcfix.io.las.source import stated_crs
+from pcfix.io.rasters import lattice_of, open_raster, read_onto
+from pcfix.io.tiles import open_cloud
+from pcfix.model import Cameras
+from pcfix.report.adjustment import adjustment_sentence
 from pcfix.report.comparison import evaluation
-from pcfix.report.page import Picture, Report, Table, render
-from pcfix.report.run import RunResults, in_short, run_report
+from pcfix.report.page import Report, Table, extent_of, render
+from pcfix.report.run import RunMaps, run_report
 from pcfix.report.summary import Summary
-from pcfix.report.text import uncertainty_sentence
+from pcfix.report.text import Plain
 
-Plain = dict[str, Any]
-COLUMNS = ("WaterDepth", "ShiftZ", "RayCount", "SigmaZ")
-SAMPLE_POINTS = 200_000
-"""Points in histogram and uncertainty figure, evenly spread over the file."""
+DIFFERENCE = "compare/dod.tif"
+MOST_CELLS = 300_000
+"""Of a map, so that the page stays below 4 MB."""
 PAGE = "report.html"
 RESULTS = {
     "corrected.laz": "all points, the bed corrected",
     "cleaned.laz": "all points, with outliers flagged as noise",
-    "depth.tif": "depth below the water",
+    DEPTH: "depth below the water",
     "bed.tif": "heights of the bed",
-    "surface.tif": "heights of land and bed",
-    "uncertainty.tif": "vertical uncertainty at 95 %",
+    SURFACE: "heights of land and bed",
+    UNCERTAINTY: "vertical uncertainty at 95 %",
     "surface_counts.tif": "number of points in each cell, and their spread",
     "shaded.tif": "coloured, shaded relief",
     "map.gpkg": "contours, waterline and other layers for a GIS",
@@ -45,7 +46,7 @@ RESULTS = {
     "compare/compare.json": "all figures of the comparison",
     "compare/depth_bins.csv": "errors by depth",
     "compare/shore_bins.csv": "errors by distance from the shore",
-    "compare/dod.tif": "cloud minus reference",
+    DIFFERENCE: "cloud minus reference",
     "compare/reference_dsm.tif": "heights of the reference",
     "adjusted/report.html": "the adjustment of the cameras",
 }
@@ -55,83 +56,83 @@ RESULTS = {
 def report_run(
     run: RunFolder, inputs: list[Path], first: Plain, corrected: Plain, compared: Plain
 ) -> Plain:
-    """Write the page of a run, and return what it says in short."""
-    pictures, tables, dod, verdict = list[Picture](), list[Table](), None, ""
+    """Write the page of a run, and return what it says in short.
+
+    `first`, `corrected` and `compared` are the results of these steps.
+    """
+    more: Plain = {"pictures": [], "tables": [], "compared": compared.get("figures", {})}
     if first["why"]:
         how = "not adjusted:" if first["model"] is None else "adjusted first, as"
-        verdict = f" The cameras were {how} {first['why']}."
+        more["verdict"] = f" The cameras were {how} {first['why']}."
     request, summary = run.request, Summary(**corrected)
+    rasters = [SURFACE, DEPTH, *([] if summary.uncertainty is None else [UNCERTAINTY])]
+    rasters += [DIFFERENCE] if compared and request.has_surface else []
+    with open_cloud(run.cleaned_cloud) as source:
+        maps = read_maps(run.folder, rasters, *crs_words(stated_crs(source)))
     if compared:
-        dod = preview(run.dod, MOST_CELLS) if request.has_surface else None
-        pictures, tables = evaluation(compared["figures"], compared["sections"], dod)
+        figures = evaluation(
+            compared["figures"], compared["sections"], maps.difference_m, extent_of(maps.lattice)
+        )
+        more |= {"pictures": figures[0], "tables": figures[1]}
     if first["model"] is not None:
-        figures = read_json(run.folder / FOLDER / SUMMARY)
-        tables += adjustment_tables(figures, f"{FOLDER}/report.html")
+        more["verdict"] += f" {adjustment_sentence(read_json(run.folder / FOLDER / SUMMARY))}."
     if (summary.water_fit or {}).get("model") == "auto":  # the water was sought in the cloud
-        pictures.append(found_picture(run.inputs.surface(view_of(request.source))))
-    results = RunResults(
-        summary, run.cameras, **read_cloud(run.cleaned_cloud, run.resolution_m),
-        project=request.project or "", date=request.date or "",
-        pictures=pictures, tables=tables, verdict=verdict, compared=compared.get("figures", {}),
-        difference=dod,
+        more["pictures"].append(found_picture(run.inputs.surface(view_of(request.source))))
+    page = write_report(
+        run.folder, summary, run.cameras, maps, inputs,
+        project=request.project or "", date=request.date or "", **more,
     )  # fmt: skip
-    page = write_report(results, inputs, run.folder)
-    return {
-        "in_short": in_short(page.tiles),
-        "uncertainty": uncertainty_sentence(summary, compared.get("figures", {}).get("tvu")),
-    }
+    shown = [
+        f"{tile.title}{f', {tile.tag}' if tile.tag else ''}: "
+        + ", ".join(f"{name} {value}" for name, value in tile.figures)
+        for tile in page.tiles
+        if tile.figures
+    ]
+    return {"in_short": "; ".join(shown)}
 
 
-def write_report(run: RunResults, inputs: Sequence[Path], out_dir: Path) -> Report:
-    """Write ``report.html`` and ``figures/*.png`` of a run, into an existing folder.
+def write_report(
+    folder: Path, summary: Summary, cameras: Cameras, maps: RunMaps, inputs: Sequence[Path],
+    **more: Any,
+) -> Report:  # fmt: skip
+    """Write ``report.html`` and ``figures/*.png`` of a run, into its folder.
 
-    The page lists size and checksum of the files `inputs`.
+    The page lists size and checksum of the files `inputs`; `more` goes to `run_report`.
     """
     rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in inputs]
     table = Table("Input files", ["file", "bytes", "SHA-256"], rows)
     files = []
     for name, words in RESULTS.items():
-        tiles = out_dir / name.removesuffix(".laz")
-        if (out_dir / name).is_file():
+        tiles = folder / name.removesuffix(".laz")
+        if (folder / name).is_file():
             files.append((name, words))
         elif tiles.is_dir():  # of many files
             files.append((f"{tiles.name}/", words))
-    sections = sorted(out_dir.glob("compare/section_*.csv"))
+    sections = sorted(folder.glob("compare/section_*.csv"))
     files += [(f"compare/{one.name}", "a cross-section") for one in sections]
-    report = run_report(run, table, files)
-    figures = out_dir / "figures"
+    report = run_report(summary, cameras, maps, inputs=[table], files=files, **more)
+    figures = folder / "figures"
     figures.mkdir(exist_ok=True)
     for picture in report.pictures:
         write_bytes(figures / f"{picture.name}.png", picture.png, overwrite=True)
-    write_text(out_dir / PAGE, render(report), overwrite=True)
+    write_text(folder / PAGE, render(report), overwrite=True)
     return report
 
 
-def read_cloud(path: Path | Tiles, resolution_m: float | None = None) -> Plain:
-    """Return maps, depths, a sample, CRS and vertical datum of a cloud, without noise.
+def read_maps(folder: Path, names: Sequence[str], crs: str = "", heights: str = "") -> RunMaps:
+    """Read rasters of a run by name, in cells of theirs, or of several where there are many.
 
-    The cloud is from `correct_file` with all dimensions, cleaned or not. The names are those of
-    `RunResults`; `resolution_m` is that of the rasters.
+    `crs` and `heights` name the CRS of the cloud and its vertical datum.
     """
-    with open_cloud(path) as source:
-        builder = MapsBuilder(
-            source.header.mins[:2], source.header.maxs[:2], len(source), resolution_m
-        )
-        every = max(1, len(source) // SAMPLE_POINTS)
-        sample, low, high, total, count = [], np.inf, -np.inf, 0.0, 0
-        for points in source.chunks():
-            good = ~np.isin(np.asarray(points["classification"]), NOISE_CLASSES)
-            points = points[good & ~np.asarray(points["withheld"]).astype(bool)]
-            moved = np.asarray(points["RayCount"]) > 0
-            values = np.column_stack([np.asarray(points[name])[moved] for name in COLUMNS])
-            builder.add(coordinates(points), moved, values)
-            sample.append(values[-count % every :: every, [0, 3]])
-            depth = values[:, 0]
-            low, high = depth.min(initial=low), depth.max(initial=high)
-            total, count = total + float(depth.sum()), count + len(depth)
-        crs, heights = crs_words(stated_crs(source))
-    depth_m = {"min": float(low), "mean": total / max(count, 1), "max": float(high)}
-    return {
-        "maps": builder.maps(), "depth_m": depth_m, "sample": np.vstack(sample), "crs": crs,
-        "heights": heights,
-    }  # fmt: skip
+    with open_raster(folder / SURFACE) as source:
+        fine = lattice_of(source)
+    k = max(1, math.ceil(math.sqrt(fine.width * fine.height / MOST_CELLS)))
+    column, row = fine.first_column // k, fine.first_row // k
+    width = (fine.first_column + fine.width - 1) // k - column + 1
+    height = (fine.first_row + fine.height - 1) // k - row + 1
+    lattice = Lattice(k * fine.resolution_m, column, row, width, height)
+    values = {name: read_onto(folder / name, lattice) for name in names}
+    uncertainty_m = values.get(UNCERTAINTY, np.full((height, width), np.nan))
+    return RunMaps(
+        lattice, values[SURFACE], values[DEPTH], uncertainty_m, values.get(DIFFERENCE), crs, heights
+    )

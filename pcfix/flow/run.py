@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from numbers import Real
@@ -139,20 +139,26 @@ def run_all(
     check_shoreline(request.shoreline, overwrite=asked.overwrite or record.resumes, inputs=inputs)
 
     def step(
-        name: str, title: str, outputs: list[Path], work: Callable[[Progress | None], Any]
-    ) -> tuple[Any, str]:
-        """Do a step unless it is done; return its result, and the start of its line."""
+        name: str, title: str, result_file: Path, work: Callable[[Progress | None], Any],
+        outputs: Sequence[Path] = (), words: Callable[[Any], str] = lambda result: "",
+    ) -> Any:  # fmt: skip
+        """Do a step unless it is done, and say where its main result is; return its figures.
+
+        `outputs` are all files that it leaves, by default only the main one.
+        """
         with bar(title) as progress:
-            result, was_done = record.step(name, outputs, partial(work, progress))
-        return result, f"{name:<9} {'already done' if was_done else 'done'}: "
+            result, was_done = record.step(name, outputs or [result_file], partial(work, progress))
+        if name != "adjust" or result["model"] is not None:
+            done = "already done" if was_done else "done"
+            say(f"{name:<9} {done}: {result_file}{words(result)}")
+        return result
 
     outputs = [out_dir / FOLDER / name for name in ADJUSTED]
-    first, done = step(
-        "adjust", "Adjusting", outputs, lambda _: adjust_first(asked, out_dir, inputs)
+    first = step(
+        "adjust", "Adjusting", outputs[0], lambda _: adjust_first(asked, out_dir, inputs), outputs
     )
     if first["model"] is not None:
         figures = read_json(out_dir / FOLDER / SUMMARY)
-        say(f"{done}{outputs[0]}")
         for words in (adjustment_sentence(figures), *all_notes(figures)):
             say(f"{'':<9} {words}")
     elif first["why"]:
@@ -163,38 +169,33 @@ def run_all(
     outputs = run.files_of(run.corrected)
     outputs += [] if request.check_depths is None else [run.regression]
     outputs += [] if request.shoreline is None else [Path(request.shoreline)]
-    corrected, done = step("correct", "Correcting", outputs, partial(_correct, run))
+    corrected = step("correct", "Correcting", run.corrected, partial(_correct, run), outputs)
     poses = corrected["poses"]
     if first["absorbed"] is False and poses is not None and poses["absorbed"] is None:
         # the first step has surveys that the correction has not
         words = "did not absorb the refraction, as the first step found"
         corrected = {**corrected, "poses": {**poses, "absorbed": False, "words": words}}
-    say(f"{done}{run.corrected}")
 
     # the corrected cloud marks which points are below the water
     how = CleanOptions(overwrite=True, jobs=asked.jobs, scheduler=asked.scheduler)
-    _, done = step(
-        "clean", "Cleaning", run.files_of(run.cleaned),
+    step(
+        "clean", "Cleaning", run.cleaned,
         lambda progress: clean_file(
             run.corrected_cloud, run.cleaned, options=how, progress=progress
         ).as_dict(),
+        run.files_of(run.cleaned),
     )  # fmt: skip
-    say(f"{done}{run.cleaned}")
-
     errors = corrected["uncertainty"] is not None
     outputs = maps.raster_files(out_dir, errors=errors)
-    gridded, done = step(
-        "dsm", "Gridding", outputs,
-        lambda progress: maps.write_rasters(run, errors=errors, progress=progress),
+    step(
+        "dsm", "Gridding", outputs[0],
+        lambda progress: maps.write_rasters(run, errors=errors, progress=progress), outputs,
+        lambda result: f", cells of {result['resolution_m']:g} m",
     )  # fmt: skip
-    say(f"{done}{outputs[0]}, cells of {gridded['resolution_m']:g} m")
-
     compared: Plain = {}
     if request.reference is not None:
-        outputs = [run.compare / "compare.json"]
-        compared, done = step("compare", "Comparing", outputs, lambda _: _compare(run))
-        say(f"{done}{outputs[0]}")
-
+        found = run.compare / "compare.json"
+        compared = step("compare", "Comparing", found, lambda _: _compare(run))
     layers = out_dir / "map.gpkg"
     try:
         vectors.check_layers(layers, overwrite=True)
@@ -202,16 +203,13 @@ def run_all(
         say(f"{'map':<9} not written: {error}")
     else:
         draw = partial(maps.write_map, layers, run, corrected, compared)
-        _, done = step("map", "Drawing the map", [layers], lambda _: draw())
-        say(f"{done}{layers}")
-
-    path = out_dir / PAGE
-    page, done = step(
-        "report", "Writing the report", [path],
+        step("map", "Drawing the map", layers, lambda _: draw())
+    step(
+        "report", "Writing the report", out_dir / PAGE,
         lambda _: report_run(run, inputs, first, corrected, compared),
+        words=lambda page: f": {page['in_short']}",
     )  # fmt: skip
-    say(f"{done}{path}: {page['in_short']}")
-    return path
+    return out_dir / PAGE
 
 
 def _opened(request: Request, out_dir: Path) -> Record:
@@ -424,7 +422,7 @@ class RunResults:
         if not self.compared:
             return {}
         files = sorted((self.folder / "compare").glob("*.csv"))
-        rows = [{"of": name, **figures} for name, _, figures in signed_statistics(self.compared)]
+        rows = [{"of": name, **figures} for name, figures in signed_statistics(self.compared)]
         pandas = analysis_library("pandas")
         statistics = pandas.json_normalize(rows).set_index("of")
         return {"statistics": statistics, **{one.stem: pandas.read_csv(one) for one in files}}

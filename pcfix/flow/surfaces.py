@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from os import PathLike
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 
 from pcfix.errors import InputError, PcfixWarning, SettingError, coded
-from pcfix.flow.runner import Chunk, read_ahead
+from pcfix.flow.runner import read_ahead
 from pcfix.grid.shoreline import NearWater, Shoreline
-from pcfix.io.las.source import LasSource, coordinates, metric_crs
+from pcfix.io.clouds import CloudView as CloudView
+from pcfix.io.clouds import Points as Points
+from pcfix.io.clouds import points_of as points_of
+from pcfix.io.las.source import metric_crs, stated_crs
 from pcfix.io.tiles import CloudFiles, open_cloud
 from pcfix.io.vectors import (
     SHORE_RADIUS_M,
@@ -45,54 +47,14 @@ from pcfix.options.shared import WaterOptions
 from pcfix.water.surface import FoundSurface, OwnWater, build_fields, surface_above
 
 if TYPE_CHECKING:
-    from pyproj import CRS
-
     from pcfix.io.views import ViewMatch
 
 
-class Points(NamedTuple):
-    """Some points of a cloud; None where the cloud does not have an attribute."""
-
-    xyz: FloatArray  # (n, 3), world frame, metres
-    heights: FloatArray | None  # (n,), of the water above each, if a dimension has it
-    classes: npt.NDArray[np.uint8]  # (n,)
-    sources: IntArray | None = None  # (n,), point source IDs
-    rgb: npt.NDArray[Any] | None = None  # (n, 3)
-    original_xyz: FloatArray | None = None  # (n, 3), before the transfer to adjusted cameras
-    views: Views | None = None
-
-    def take(self, rows: IntArray | slice) -> Points:
-        """Return some of the points."""
-        some: list[Any] = [None if v is None else np.ascontiguousarray(v[rows]) for v in self[:-1]]
-        views = None if self.views is None else self.views.take(np.arange(len(self.xyz))[rows])
-        return Points._make([*some, views])
-
-
-RGB = ("red", "green", "blue")
 WATER_CLASSES = (9, 41)
 """ASPRS: water, and water surface of the topo-bathy profile."""
 
 SAMPLE_POINTS = 2_000_000
 """Points of a cloud that are searched for water, evenly spread."""
-
-
-@dataclass(frozen=True)
-class CloudView:
-    """A cloud in one file, in many, or in memory: its properties, and all its points."""
-
-    name: str  # for messages
-    crs: CRS | str | None
-    low: FloatArray  # (2,), south-west and north-east corner, metres
-    high: FloatArray
-    points: int
-    chunks: Callable[..., Iterator[Points]]  # of the water, whose heights a dimension may have
-    software: str = ""  # generating software in the header
-    step_m: float = 0.0  # coordinates are rounded to it
-
-    @property
-    def bounds(self) -> tuple[float, float, float, float]:
-        """West, south, east and north, metres."""
-        return (*self.low.tolist(), *self.high.tolist())
 
 
 def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -102,27 +64,32 @@ def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
 
 
-def view_of(cloud: CloudFiles, jobs: int | None = None) -> CloudView:
-    """Return the view of a LAS or LAZ file, or of many as one cloud."""
+def view_of(cloud: CloudFiles, jobs: int | None = None, *, in_metres: bool = True) -> CloudView:
+    """Return the view of a LAS or LAZ file, or of many as one cloud.
+
+    Raises InputError if it is not `in_metres`, which does not matter to some steps.
+    """
     with open_cloud(cloud, jobs) as source:
         return CloudView(
             str(cloud),
-            metric_crs(source),
+            metric_crs(source) if in_metres else stated_crs(source),
             np.array(source.header.mins[:2]),
             np.array(source.header.maxs[:2]),
             len(source),
             partial(file_points, cloud, jobs=jobs),
             str(source.header.generating_software or ""),
             float(max(source.header.scales)),
+            frozenset(source.header.point_format.dimension_names),
         )
 
 
 def file_points(
-    cloud: CloudFiles, water: WaterSurface | None = None, jobs: int | None = None
-) -> Iterator[Points]:
+    cloud: CloudFiles, water: WaterSurface | None = None, names: Iterable[str] = (),
+    jobs: int | None = None,
+) -> Iterator[Points]:  # fmt: skip
     """Yield all points of a LAS or LAZ file, or of many, chunk by chunk; see `LasSource`."""
     with open_cloud(cloud, jobs) as source:
-        yield from read_ahead(points_of(one, source, water) for one in source.chunks())
+        yield from read_ahead(points_of(one, source, water, names) for one in source.chunks())
 
 
 def sample_of(
@@ -149,29 +116,14 @@ def sample_of(
         return parts[0]
     joined = [
         None if any(v is None for v in one) else np.concatenate(one)
-        for one in zip(*(part[:-1] for part in parts), strict=True)
+        for one in zip(*(part[:-2] for part in parts), strict=True)
     ]
     lists = [part.views for part in parts if part.views is not None]
     if not lists:
-        return Points._make([*joined, None])
+        return Points._make([*joined, None, None])
     start = np.cumsum(np.concatenate([[0], *(np.diff(one.start) for one in lists)]))
     camera = np.concatenate([one.camera for one in lists])
-    return Points._make([*joined, Views(start, camera, kind=lists[0].kind)])
-
-
-def points_of(chunk: Chunk, source: LasSource, water: WaterSurface | None) -> Points:
-    """Return the n points of a chunk."""
-    heights = None
-    if isinstance(water, WaterDimension):
-        heights = source.dimension(chunk, water.name)
-    has_colours = "red" in (chunk.array.dtype.names or ())
-    return Points(
-        coordinates(chunk),
-        heights,
-        np.asarray(chunk["classification"]),
-        np.asarray(chunk["point_source_id"]),
-        np.column_stack([chunk.array[one] for one in RGB]) if has_colours else None,
-    )
+    return Points._make([*joined, Views(start, camera, kind=lists[0].kind), None])
 
 
 def parts_of(chunks: Iterable[Points], water: WaterSurface) -> Iterable[Part]:

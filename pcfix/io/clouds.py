@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -27,6 +28,8 @@ from pcfix.model import (
     NOISE_CLASSES,
     BoolArray,
     FloatArray,
+    IntArray,
+    Views,
     WaterDimension,
     WaterPlane,
     WaterSurface,
@@ -34,6 +37,74 @@ from pcfix.model import (
 
 if TYPE_CHECKING:
     from pyproj import CRS
+
+
+class Points(NamedTuple):
+    """Some points of a cloud; None where the cloud does not have an attribute."""
+
+    xyz: FloatArray  # (n, 3), world frame, metres
+    heights: FloatArray | None  # (n,), of the water above each, if a dimension has it
+    classes: npt.NDArray[np.uint8]  # (n,)
+    sources: IntArray | None = None  # (n,), point source IDs
+    rgb: npt.NDArray[Any] | None = None  # (n, 3)
+    withheld: BoolArray | None = None  # (n,)
+    original_xyz: FloatArray | None = None  # (n, 3), before the transfer to adjusted cameras
+    views: Views | None = None
+    dimensions: Mapping[str, FloatArray] | None = None  # (n,), those that were asked for, by name
+
+    def counts(self, skip_classes: Sequence[int] = NOISE_CLASSES) -> BoolArray:
+        """Return which points are neither withheld nor of some classes, shape (n,)."""
+        good = ~np.isin(self.classes, skip_classes)
+        return good if self.withheld is None else good & ~self.withheld
+
+    def take(self, rows: IntArray | slice) -> Points:
+        """Return some of the points, without dimensions."""
+        some: list[Any] = [None if v is None else np.ascontiguousarray(v[rows]) for v in self[:-2]]
+        views = None if self.views is None else self.views.take(np.arange(len(self.xyz))[rows])
+        return Points._make([*some, views, None])
+
+
+@dataclass(frozen=True)
+class CloudView:
+    """A cloud in one file, in many, or in memory: its properties, and all its points."""
+
+    name: str  # for messages
+    crs: CRS | str | None
+    low: FloatArray  # (2,), south-west and north-east corner, metres
+    high: FloatArray
+    points: int
+    # of the water, whose heights a dimension may have, and of the names of further dimensions
+    chunks: Callable[..., Iterator[Points]]
+    software: str = ""  # generating software in the header
+    step_m: float = 0.0  # coordinates are rounded to it
+    names: Collection[str] = ()  # of its dimensions
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """West, south, east and north, metres."""
+        return (*self.low.tolist(), *self.high.tolist())
+
+
+RGB = ("red", "green", "blue")
+
+
+def points_of(
+    chunk: Any, source: LasSource, water: WaterSurface | None, names: Iterable[str] = ()
+) -> Points:
+    """Return the n points of a chunk, with the dimensions of some names."""
+    heights = None
+    if isinstance(water, WaterDimension):
+        heights = source.dimension(chunk, water.name)
+    has_colours = "red" in (chunk.array.dtype.names or ())
+    return Points(
+        coordinates(chunk),
+        heights,
+        np.asarray(chunk["classification"]),
+        np.asarray(chunk["point_source_id"]),
+        np.column_stack([chunk.array[one] for one in RGB]) if has_colours else None,
+        np.asarray(chunk["withheld"]).astype(np.bool_),
+        dimensions={name: source.dimension(chunk, name) for name in names},
+    )
 
 
 def read_cloud(
@@ -48,21 +119,14 @@ def read_cloud(
     or it lacks the dimension that `water` names.
     """
     with open_cloud(path) as source:
-        crs = stated_crs(source)
         own = water or own_water(source)
-        extra = set(source.header.point_format.extra_dimension_names)
+        names = set(source.header.point_format.extra_dimension_names).intersection(DIMENSIONS)
         chunks = (
-            SurveyPoints(
-                coordinates(points),
-                np.asarray(points["classification"]),
-                np.asarray(points["withheld"]).astype(bool),
-                source.dimension(points, own.name) if isinstance(own, WaterDimension) else None,
-                {name: source.dimension(points, name) for name in extra.intersection(DIMENSIONS)},
-            )
+            points_of(chunk[rows], source, own, names)
             for chunk in source.chunks()
-            for points in (chunk[rows] for rows in blocks(len(chunk), FEW_ROWS))
+            for rows in blocks(len(chunk), FEW_ROWS)
         )
-        given = water is not None
+        given, crs = water is not None, stated_crs(source)
         return survey_cloud(str(path), crs, chunks, own, given, len(source), skip_classes)
 
 
@@ -70,20 +134,10 @@ DIMENSIONS = ("WaterDepth", *SHIFTS)
 """What the dimensions of a correction say of the water, and of where the points were."""
 
 
-class SurveyPoints(NamedTuple):
-    """Some points of a cloud; those of `DIMENSIONS` that it has are by name, in metres."""
-
-    xyz: FloatArray
-    classes: npt.NDArray[Any]
-    withheld: BoolArray
-    heights: FloatArray | None  # of the water above each, where a dimension was named for it
-    dimensions: dict[str, FloatArray]
-
-
 def survey_cloud(
     name: str,
     crs: CRS | None,
-    chunks: Iterable[SurveyPoints],
+    chunks: Iterable[Points],
     water: WaterSurface | None,
     given: bool,
     most: int,
@@ -91,14 +145,15 @@ def survey_cloud(
 ) -> SurveyCloud:
     """Return the points that count; the water is `given`, or else what the cloud says of its own.
 
-    There are `most` points at most. An `InputError` if none counts.
+    There are `most` points at most, with those of `DIMENSIONS` that the cloud has. An `InputError`
+    if none counts.
     """
     columns: list[npt.NDArray[Any]] = []
     first = count = 0
     for points in chunks:
-        keep = ~(np.isin(np.arange(256), skip_classes)[points.classes] | points.withheld)
-        if not given and "WaterDepth" in points.dimensions:
-            depth = points.dimensions["WaterDepth"]
+        known, keep = points.dimensions or {}, points.counts(skip_classes)
+        if not given and "WaterDepth" in known:
+            depth = known["WaterDepth"]
             above = np.where(depth > 0.0, points.xyz[:, 2] + depth, np.nan)
         elif water is not None:
             from pcfix.water.surface import surface_above  # with its compiler, not quick to load
@@ -108,9 +163,8 @@ def survey_cloud(
             above = np.full(len(points.xyz), np.nan)
         bathymetric = kept(keep, points.classes) == BATHYMETRIC_POINT
         parts = [kept(keep, points.xyz), kept(keep, above), bathymetric]
-        if points.dimensions.keys() >= set(SHIFTS):
-            shift = np.column_stack([points.dimensions[name] for name in SHIFTS])
-            parts.append(shift[keep])
+        if known.keys() >= set(SHIFTS):
+            parts.append(np.column_stack([known[name] for name in SHIFTS])[keep])
         columns = columns or [empty((most, *part.shape[1:]), part.dtype) for part in parts]
         for column, part in zip(columns, parts, strict=True):
             column[first : first + len(part)] = part

@@ -72,6 +72,22 @@ def read_masked(raster: Any, **how: Any) -> FloatArray:
     return np.asarray(raster.read(1, masked=True, **how).astype(np.float64).filled(np.nan))
 
 
+def read_onto(path: Path, lattice: Lattice) -> FloatArray:
+    """Return the mean of the first band in each cell of a lattice, NaN for no value and beyond."""
+    from rasterio.enums import Resampling
+    from rasterio.transform import from_origin
+    from rasterio.vrt import WarpedVRT
+
+    size = lattice.resolution_m
+    how = {
+        "transform": from_origin(lattice.left_m, lattice.top_m, size, size),
+        "width": lattice.width, "height": lattice.height, "dtype": "float64", "nodata": NO_HEIGHT,
+        "resampling": Resampling.average,
+    }  # fmt: skip
+    with open_raster(path) as source, WarpedVRT(source, crs=source.crs, **how) as same:
+        return read_masked(same)
+
+
 def filled_heights(source: DatasetReader, *, fill: bool) -> FloatArray:
     """Return the first band, NaN for no value; with `fill` its holes are interpolated."""
     from rasterio.fill import fillnodata

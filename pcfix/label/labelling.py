@@ -13,7 +13,7 @@ numbers, so that they do not depend on the order of the points.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -75,64 +75,6 @@ class Surroundings(NamedTuple):
     joined: BoolArray | None = None  # (rows, columns), a pool of water is in or next to the cell
 
 
-def surroundings_of(
-    parts: Iterable[tuple[FloatArray, FloatArray, FloatArray, BoolArray]],
-    low: FloatArray,
-    high: FloatArray,
-    dead_m: float,
-    *,
-    connected: bool,
-    least_pool_m2: float | None,
-) -> Surroundings:
-    """Collect points in cells, coarsen these until they have enough points, and find the water.
-
-    Parts have x, y and height above the water surface of their points, (n,), NaN if unknown, and
-    which of them count; the others cannot be submerged, and only show that there is no gap. Points
-    within `dead_m` of the surface are undecided. `low` and `high` are the corners of the cloud,
-    metres, shape (2,), if they are known. Water is connected over sides, corners, and gaps of at
-    most two cells.
-    """
-    from scipy.ndimage import binary_dilation, convolve, label
-
-    none = Layer(np.zeros((), np.uint8), np.bitwise_or), Layer(np.zeros((), np.int64), np.add)
-    cells, water_points = Cells(low, high, *none), 0
-    for x, y, height_m, counts in parts:
-        if not x.size:
-            continue
-        cells.cover(np.array([x.min(), y.min()]), np.array([x.max(), y.max()]))
-        row, column = cells.frame.cells(x, y)
-        flags, votes = cells.values
-        cell = row * flags.shape[1] + column
-        counts = counts & ~np.isnan(height_m)
-        below = counts & (height_m < -dead_m)
-        unsure = counts & ~below & (height_m <= dead_m) & (dead_m > 0.0)
-        water_points += int(np.count_nonzero(below | unsure))
-        bits = PRESENT + BELOW * below + UNDECIDED * unsure
-        np.bitwise_or.at(flags.reshape(-1), cell, bits.astype(np.uint8))
-        if dead_m:
-            vote = np.rint(_VOTE * np.clip(height_m[counts] / dead_m, -1.0, 1.0))
-            np.add.at(votes.reshape(-1), cell[counts], vote.astype(np.int64))
-    if not cells.values[0].size:  # no points
-        cells.cover(np.zeros(2), np.zeros(2))
-    cells.coarsen(water_points, lambda flags: (flags & (BELOW | UNDECIDED)) > 0)
-    frame, (flags, votes) = cells.frame, cells.values
-    # the votes of a cell and its eight neighbours together
-    is_wet = convolve(votes, np.ones((3, 3)), mode="constant") < 0
-    if not connected:
-        return Surroundings(frame, is_wet)
-    water = (flags & BELOW) > 0
-    if dead_m:
-        water |= ((flags & UNDECIDED) > 0) & is_wet
-    found, count = label(water | (binary_dilation(water, _AROUND) & (flags == 0)), _AROUND)
-    pool = np.where(water, found, 0).astype(np.int32)
-    area = frame.side_m**2 * np.bincount(pool[water], minlength=count + 1).astype(np.float64)
-    least = SHARE_OF_LARGEST * area.max() if least_pool_m2 is None else least_pool_m2
-    stays = (area >= least) | (area == area.max())
-    stays[0] = False
-    joined = binary_dilation(stays[pool], _AROUND)
-    return Surroundings(frame, is_wet, pool, stays, joined)
-
-
 class Part(NamedTuple):
     """Some points of a cloud."""
 
@@ -187,27 +129,58 @@ class Labelling:
         """Return the rules with the surroundings of all points, if they need them.
 
         `parts` are the whole cloud in chunks, and `low` and `high` its corners, if they are known.
+        Points are collected in cells, which are coarsened until they have enough points. Water is
+        connected over sides, corners, and gaps of at most two cells.
         """
-        rules = self.settings
-        if not (rules.connected or rules.dead_band > 0.0):
+        from scipy.ndimage import binary_dilation, convolve, label
+
+        rules, dead_m = self.settings, self.settings.dead_band
+        if not (rules.connected or dead_m):
             return self
-
-        def counted() -> Iterator[tuple[FloatArray, FloatArray, FloatArray, BoolArray]]:
-            for part in parts:
-                x, y, z = np.ascontiguousarray(part.xyz.T)
-                height = z - part.surface.height_m
-                # high points have no vote without a dead band
-                counts = np.ones(len(x), np.bool_) if rules.dead_band else height < 0.0
-                counts &= ~self._is_respected(part.classes)
-                rows = np.flatnonzero(counts)
-                counts[rows] = self._is_inside(x[rows], y[rows])
-                yield x, y, height, counts
-
-        around = surroundings_of(
-            counted(), low, high, rules.dead_band,
-            connected=rules.connected, least_pool_m2=rules.least_pool,
-        )  # fmt: skip
-        return replace(self, around=around)
+        none = Layer(np.zeros((), np.uint8), np.bitwise_or), Layer(np.zeros((), np.int64), np.add)
+        cells, water_points = Cells(low, high, *none), 0
+        for part in parts:
+            if not len(part.xyz):
+                continue
+            x, y, z = np.ascontiguousarray(part.xyz.T)
+            height = z - part.surface.height_m
+            # points that may be submerged or vote; the others only show that there is no gap
+            counts = ~(np.isnan(height) | self._is_respected(part.classes))
+            if not dead_m:
+                counts &= height < 0.0
+            rows = np.flatnonzero(counts)
+            counts[rows] = self._is_inside(x[rows], y[rows])
+            cells.cover(np.array([x.min(), y.min()]), np.array([x.max(), y.max()]))
+            row, column = cells.frame.cells(x, y)
+            flags, votes = cells.values
+            cell = row * flags.shape[1] + column
+            below = counts & (height < -dead_m)
+            unsure = counts & ~below & _within(height, dead_m)
+            water_points += int(np.count_nonzero(below | unsure))
+            bits = PRESENT + BELOW * below + UNDECIDED * unsure
+            np.bitwise_or.at(flags.reshape(-1), cell, bits.astype(np.uint8))
+            if dead_m:
+                vote = np.rint(_VOTE * np.clip(height[counts] / dead_m, -1.0, 1.0))
+                np.add.at(votes.reshape(-1), cell[counts], vote.astype(np.int64))
+        if not cells.values[0].size:  # no points
+            cells.cover(np.zeros(2), np.zeros(2))
+        cells.coarsen(water_points, lambda flags: (flags & (BELOW | UNDECIDED)) > 0)
+        frame, (flags, votes) = cells.frame, cells.values
+        # the votes of a cell and its eight neighbours together
+        is_wet = convolve(votes, np.ones((3, 3)), mode="constant") < 0
+        if not rules.connected:
+            return replace(self, around=Surroundings(frame, is_wet))
+        water = (flags & BELOW) > 0
+        if dead_m:
+            water |= ((flags & UNDECIDED) > 0) & is_wet
+        found, count = label(water | (binary_dilation(water, _AROUND) & (flags == 0)), _AROUND)
+        pool = np.where(water, found, 0).astype(np.int32)
+        area = frame.side_m**2 * np.bincount(pool[water], minlength=count + 1).astype(np.float64)
+        least = SHARE_OF_LARGEST * area.max() if rules.least_pool is None else rules.least_pool
+        stays = (area >= least) | (area == area.max())
+        stays[0] = False
+        joined = binary_dilation(stays[pool], _AROUND)
+        return replace(self, around=Surroundings(frame, is_wet, pool, stays, joined))
 
     def submerged(
         self, xyz: FloatArray, surface: SurfaceAbove, classes: Classes
@@ -276,32 +249,31 @@ class Labelling:
     def check(self, name: str, counts: LabelCounts, submerged: int | None = None) -> None:
         """Check that mask, respected classes and dead band leave points below the water."""
         left = counts.below - counts.outside_mask - counts.respected
-        if submerged == 0 and left and self.settings.dead_band:
+        dead_m, classes = self.settings.dead_band, self.settings.respect_classes
+        if submerged == 0 and left and dead_m:
             raise GeometryError(
                 "option.dead_band",
                 f"{name}: all {left:,} points below the water are within the dead band of"
-                f" {self.settings.dead_band:g} m, and most points near them are above it. Give a"
-                " narrower --dead-band.",
-                path=name, points=left, value=self.settings.dead_band,
+                f" {dead_m:g} m, and most points near them are above it. Give a narrower"
+                " --dead-band.",
+                path=name, points=left, value=dead_m,
             )  # fmt: skip
         if counts.respected and not left:
-            respected = ", ".join(map(str, self.settings.respect_classes))
             raise GeometryError(
                 "option.respect_classes",
                 f"{name}: all {counts.respected:,} points below the water are of the classes to"
-                f" respect ({respected}). Respect fewer classes.",
+                f" respect ({', '.join(map(str, classes))}). Respect fewer classes.",
                 path=name, points=counts.respected,
             )  # fmt: skip
-        if self.mask is None or counts.outside_mask < max(counts.below, 1):
-            return
-        west, south, east, north = bounds = self.mask.area.bounds
-        raise GeometryError(
-            "mask.no_points",
-            f"{self.mask.name} (x {west:.1f} to {east:.1f}, y {south:.1f} to {north:.1f}) contains"
-            f" none of the {counts.below:,} points of {name} below the water. Check the CRS of"
-            " both, and that the polygons are of water.",
-            path=self.mask.name, points=counts.below, bounds=bounds,
-        )  # fmt: skip
+        if self.mask is not None and counts.outside_mask >= max(counts.below, 1):
+            west, south, east, north = bounds = self.mask.area.bounds
+            raise GeometryError(
+                "mask.no_points",
+                f"{self.mask.name} (x {west:.1f} to {east:.1f}, y {south:.1f} to {north:.1f})"
+                f" contains none of the {counts.below:,} points of {name} below the water. Check"
+                " the CRS of both, and that the polygons are of water.",
+                path=self.mask.name, points=counts.below, bounds=bounds,
+            )  # fmt: skip
 
     def report(self, counts: LabelCounts) -> dict[str, Any] | None:
         """Return rules and counts of excluded points as plain values; None without rules."""

@@ -112,6 +112,14 @@ class Photo(NamedTuple):
     rotation: FloatArray
     lens: Lens
 
+    def pixels(self, xyz: FloatArray) -> FloatArray:
+        """Return the pixels that straight rays from places, shape (n, 3), meet, shape (n, 2)."""
+        return project(self.lens, (xyz - self.centre) @ self.rotation.T)
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """Return the unit vectors of the rays of pixels, world frame, shape (n, 3)."""
+        return np.asarray(unproject(self.lens, pixels) @ self.rotation)
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -149,10 +157,9 @@ def exact(photo: Photo, scene: Scene, step_px: int) -> Shifts:
     xyz, depth, known = ground_seen(photo, scene, nodes)
     shift = np.zeros((len(nodes), 2))
     wet = np.flatnonzero(depth > 0.0)
-    path = trace(photo.centre, xyz[wet], scene.water, refractive_index=scene.refractive_index)
-    place = project(photo.lens, (path.piercing_xyz - photo.centre) @ photo.rotation.T)
-    free = path.converged & np.isfinite(place).all(axis=1)
-    free[free] = ~hidden(scene.ground, path.piercing_xyz[free], xyz[wet[free]])
+    place, pierced, free = traced(photo, xyz[wet], depth[wet], scene)
+    free &= np.isfinite(place).all(axis=1)
+    free[free] = ~hidden(scene.ground, pierced[free], xyz[wet[free]])
     shift[wet[free]] = place[free] - nodes[wet[free]]
     known[wet[~free]] = False
     return Shifts(step_px, shift.reshape(*shape, 2).astype(np.float32), known.reshape(shape))
@@ -191,7 +198,7 @@ def ground_seen(
     photo: Photo, scene: Scene, nodes: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return where straight rays meet the ground, its depth (0 on land), and whether they do."""
-    direction = unproject(photo.lens, nodes) @ photo.rotation
+    direction = photo.rays(nodes)
     usable = np.isfinite(direction).all(axis=1)
     direction[~usable] = 0.0, 0.0, 1.0
     far = scene.ground.hit(photo.centre, direction)
@@ -200,6 +207,21 @@ def ground_seen(
     depth = np.zeros(len(nodes))
     depth[known] = surface_above(scene.water, xyz[known]).height_m - xyz[known, 2]
     return xyz, np.maximum(np.nan_to_num(depth, nan=0.0), 0.0), known  # NaN: no water above
+
+
+def traced(
+    photo: Photo, xyz: FloatArray, depth: FloatArray, scene: Scene
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Trace light from places (n, 3), with their depths (n,), through the water to an image.
+
+    Returns the pixels, the piercing points (places on land are their own), and whether the light
+    was found.
+    """
+    wet = np.flatnonzero(depth > 0.0)
+    pierced, found = xyz.copy(), np.ones(len(xyz), bool)
+    path = trace(photo.centre, xyz[wet], scene.water, refractive_index=scene.refractive_index)
+    pierced[wet], found[wet] = path.piercing_xyz, path.converged
+    return photo.pixels(pierced), pierced, found
 
 
 def hidden(ground: Ground, start: FloatArray, end: FloatArray) -> BoolArray:

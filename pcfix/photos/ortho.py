@@ -16,10 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.lens.imaging import project
 from pcfix.model import BoolArray, FloatArray
-from pcfix.photos.mapping import Photo, Scene, hidden
-from pcfix.refract.tracing import trace
+from pcfix.photos.mapping import Photo, Scene, hidden, traced
 from pcfix.water.surface import surface_above
 
 FEATHER = 0.01
@@ -94,8 +92,7 @@ def mosaic(
     """
     slopes = []  # tangents of straight rays from nadir; infinite far outside the frame
     for photo in photos:
-        away, lens = xyz - photo.centre, photo.lens
-        at = project(lens, away @ photo.rotation.T) / [lens.width, lens.height]
+        away, at = xyz - photo.centre, photo.pixels(xyz) / [photo.lens.width, photo.lens.height]
         inside = ((at > -SPARE_SHARE) & (at < 1.0 + SPARE_SHARE)).all(axis=1) & (away[:, 2] < 0.0)
         tangent = np.hypot(away[:, 0], away[:, 1]) / np.where(inside, -away[:, 2], 1.0)
         slopes.append(np.where(inside, tangent, np.inf).astype(np.float32))
@@ -141,11 +138,7 @@ def seen_at(photo: Photo, xyz: FloatArray, scene: Scene) -> tuple[FloatArray, Bo
     A place is seen if it lies in the frame and the ground does not occlude its ray in air or water.
     """
     depth = np.nan_to_num(surface_above(scene.water, xyz).height_m - xyz[:, 2], nan=0.0)
-    wet = np.flatnonzero(depth > 0.0)
-    seen, pierced = np.ones(len(xyz), bool), xyz.copy()
-    path = trace(photo.centre, xyz[wet], scene.water, refractive_index=scene.refractive_index)
-    pierced[wet], seen[wet] = path.piercing_xyz, path.converged
-    place = project(photo.lens, (pierced - photo.centre) @ photo.rotation.T)
+    place, pierced, seen = traced(photo, xyz, depth, scene)
     frame = np.array([photo.lens.width, photo.lens.height])
     seen &= ((place >= 0.0) & (place <= frame)).all(axis=1)
     rows = np.flatnonzero(seen)

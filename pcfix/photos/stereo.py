@@ -16,7 +16,7 @@ import numpy as np
 
 from pcfix.errors import GeometryError
 from pcfix.grid.heights import cell_statistics
-from pcfix.lens.imaging import project, unproject
+from pcfix.lens.imaging import project
 from pcfix.model import BoolArray, FloatArray
 from pcfix.photos.mapping import Ground, Photo
 from pcfix.photos.ortho import Picture
@@ -124,7 +124,7 @@ def pair_points(
     for photo in (left, right):
         w, h = photo.lens.width, photo.lens.height
         places = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]])
-        corners.append(np.asarray(unproject(photo.lens, places) @ photo.rotation))
+        corners.append(photo.rays(places))
     ahead = [rays @ rotation.T for rays in corners]
     if min((rays[:, 2] / np.linalg.norm(rays, axis=1)).min() for rays in ahead) < 0.3:
         return nothing

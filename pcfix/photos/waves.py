@@ -43,7 +43,6 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError
 from pcfix.grid.lattice import Lattice
-from pcfix.lens.imaging import project, unproject
 from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.photos.calm import grey8
@@ -90,7 +89,7 @@ class Nodes(NamedTuple):
 
 def on_level(view: View, pixels: FloatArray) -> FloatArray:
     """Return where the straight rays of pixels meet the level, shape (n, 3)."""
-    ray = unproject(view.photo.lens, pixels) @ view.photo.rotation
+    ray = view.photo.rays(pixels)
     far = (view.level_m - view.photo.centre[2]) / ray[:, 2]
     return np.asarray(view.photo.centre + np.where(far > 0.0, far, np.nan)[:, None] * ray)
 
@@ -132,21 +131,18 @@ def nodes_of(view: View, cell_m: float | None) -> Nodes:
     x = lattice.left_m + (np.arange(columns) + 0.5) * cell
     y = lattice.top_m - (np.arange(rows) + 0.5) * cell
     xy = np.column_stack([np.tile(x, rows), np.repeat(y, columns)])
-    pixel = _pixels(view, np.column_stack([xy, np.full(len(xy), view.level_m)]))
+    pixel = view.photo.pixels(np.column_stack([xy, np.full(len(xy), view.level_m)]))
     inside = ((pixel > 0.0) & (pixel < [lens.width, lens.height])).all(axis=1)
     return Nodes(lattice, xy, np.asarray(inside))
 
 
-def _pixels(view: View, xyz: FloatArray) -> FloatArray:
-    return project(view.photo.lens, (xyz - view.photo.centre) @ view.photo.rotation.T)
-
-
 def displacements(
     median: npt.NDArray[Any], view: View, nodes: Nodes, frames: Iterable[npt.NDArray[Any]]
-) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield the displacement of the bed in each frame from the median image, at the nodes.
+) -> tuple[FloatArray, FloatArray]:
+    """Return the displacement of the bed in f frames from the median image, at the nodes.
 
-    Displacements, shape (n, 2), are in pixels, and come with their weights, shape (n,).
+    Displacements, shape (f, n, 2), are in pixels. Their weights, shape (n,), are zero where the
+    bed hardly moves, as on land.
     """
     cv2 = photo_library("cv2")
     calm = grey8(median)
@@ -154,21 +150,26 @@ def displacements(
     weight = texture / (texture + np.median(texture[texture > 0.0]) + 1e-30)
     weight = weight.astype(np.float32)
     level = np.full(len(nodes.xy), view.level_m)
-    at = (_pixels(view, np.column_stack([nodes.xy, level])) - 0.5).astype(np.float32)
+    at = (view.photo.pixels(np.column_stack([nodes.xy, level])) - 0.5).astype(np.float32)
     # means over a cell, as seen in the middle of the raster
     centre = np.append(nodes.xy[len(nodes.xy) // 2], view.level_m)
     ends = centre + np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]) * nodes.lattice.resolution_m
-    side = int(np.hypot(*np.diff(_pixels(view, ends), axis=0)[0])) | 1
+    side = int(np.hypot(*np.diff(view.photo.pixels(ends), axis=0)[0])) | 1
     base = cv2.blur(weight, (side, side))
-    weight_at = cv2.remap(base, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0]
-    weight_at = np.where(nodes.seen, weight_at, 0.0).astype(np.float64)
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow.setFinestScale(0)  # waves are short, and patches of 8 px smooth enough
+    shifts = []
     for frame in frames:
         moved = flow.calc(grey8(frame), calm, None)
         mean = cv2.blur(moved * weight[..., None], (side, side)) / (base[..., None] + 1e-9)
-        shift = cv2.remap(mean, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0]
-        yield shift.astype(np.float64), weight_at
+        shifts.append(cv2.remap(mean, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0])
+    shift_px = np.stack(shifts).astype(np.float64)
+    weight_at = cv2.remap(base, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0]
+    weight_at = np.where(nodes.seen, weight_at, 0.0).astype(np.float64)
+    known, size = weight_at > 0.0, np.sqrt((shift_px**2).sum(axis=2).mean(axis=0))
+    if known.any():
+        weight_at[size < STILL * np.median(size[known])] = 0.0
+    return shift_px, weight_at
 
 
 def slopes_of(view: View, xy: FloatArray, height_m: FloatArray, shift_px: FloatArray) -> FloatArray:
@@ -181,7 +182,7 @@ def slopes_of(view: View, xy: FloatArray, height_m: FloatArray, shift_px: FloatA
     pierced = np.column_stack([xy, height_m])
     seen = pierced - view.photo.centre
     seen /= np.linalg.norm(seen, axis=1)[:, None]
-    wet = bed_places(view, _pixels(view, pierced) + shift_px) - pierced
+    wet = bed_places(view, view.photo.pixels(pierced) + shift_px) - pierced
     wet[~(wet[:, 2] < 0.0)] = np.nan
     wet /= np.linalg.norm(wet, axis=1)[:, None]
     normal = seen - view.refractive_index * wet
@@ -266,17 +267,16 @@ class _Shell:
         self.frequency = np.sqrt(GRAVITY * self._size * np.tanh(self._size * depth_m))
 
     def _transformed(self, slope: FloatArray, weight: FloatArray) -> npt.NDArray[np.complex128]:
-        """Return the slope along each wave number of a frame, as its Fourier coefficient."""
-        planes = (slope * weight[:, None]).T.reshape(2, self._height, -1)
-        whole = np.fft.fft2(planes, s=self._shape).reshape(2, -1)[:, self._rows]
-        return np.asarray((self.number.T * whole).sum(axis=0) / self._size)
+        """Return the slopes of f frames along each wave number, as Fourier coefficients, (f, m)."""
+        planes = (slope * weight[..., None]).transpose(0, 2, 1)
+        planes = planes.reshape(len(slope), 2, self._height, -1)
+        whole = np.fft.fft2(planes, s=self._shape).reshape(len(slope), 2, -1)[..., self._rows]
+        return np.asarray((self.number.T * whole).sum(axis=1) / self._size)
 
     def energy(self, slope: FloatArray) -> FloatArray:
         """Return the energy of slopes, shape (f, n, 2), at each wave number."""
-        total = np.zeros(len(self.number), np.complex128)
-        for one, weight, time in zip(slope, self._weight, self._time_s, strict=True):
-            total += self._transformed(one, weight) * np.exp(1j * self.frequency * time)
-        return np.abs(total) ** 2
+        turn = np.exp(1j * self._time_s[:, None] * self.frequency)
+        return np.abs((self._transformed(slope, self._weight) * turn).sum(axis=0)) ** 2
 
     def white(self, slope: FloatArray) -> float:
         """Return the energy at each wave number if the slopes were white noise."""
@@ -286,11 +286,9 @@ class _Shell:
         """Integrate residual slopes to heights, rms, by the method of Frankot & Chellappa."""
         known = (self._weight > 0.0).astype(np.float64)
         half = 2.0 if len(known) == 1 else 1.0
-        total = 0.0
-        for one, weight in zip(residual, known, strict=True):
-            full = self._transformed(one, weight) / self._size
-            total += half * float((np.abs(full) ** 2).sum()) / np.prod(self._shape)
-        return float(np.sqrt(total / max(float(known.sum()), 1.0)))
+        squares = np.abs(self._transformed(residual, known) / self._size) ** 2
+        cells = np.prod(self._shape) * max(float(known.sum()), 1.0)
+        return float(np.sqrt(half * squares.sum() / cells))
 
     def _bases(self, rows: IntArray, chosen: IntArray) -> Iterator[FloatArray]:
         """Yield the slopes along unit waves, cosines then sines, at some nodes of each frame.
@@ -330,10 +328,3 @@ class _Shell:
                 left[used] = one[used] - basis @ (found[:, None] * along)
             noise = float((self._weight[..., None] * residual**2).sum()) / (2.0 * count)
         return found, np.asarray(covariance * noise, np.float64), residual
-
-
-def still(shifts_px: FloatArray, weight: FloatArray) -> BoolArray:
-    """Return which nodes hardly move, and so are land, by displacements of shape (f, n, 2)."""
-    moved = np.sqrt((shifts_px**2).sum(axis=2).mean(axis=0))
-    known = weight.mean(axis=0) > 0.0
-    return np.asarray(known & (moved < STILL * np.median(moved[known])) if known.any() else ~known)

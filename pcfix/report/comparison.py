@@ -6,11 +6,12 @@ earlier one measured. The terminal and the page show the same tables.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from pcfix.grid.colours import DIFFERENCE
+from pcfix.grid.maps import Extent
 from pcfix.model import FloatArray
 from pcfix.options.steps import LAYERS
 from pcfix.report.page import (
@@ -24,23 +25,25 @@ from pcfix.report.page import (
     name_of,
     new_figure,
 )
-from pcfix.report.text import aligned, share
+from pcfix.report.text import Plain, aligned, share
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from pcfix.compare.figures import Comparison
 
-Plain = dict[str, Any]
 TIMES = (("before", "uncorrected", BEFORE), ("after", "corrected", AFTER))
-SIGNED = {
+FURTHER = ("#6a3d9a", "#33804d", "#c51b7d", "#8c6d1f", "#5f6b73")
+"""Colours of further clouds, in turn."""
+KINDS = {
     "vertical": ("dZ", "Vertical error"),
     "bed": ("dZ bed", "Bed, vertical error"),
     "land": ("dZ land", "Land, vertical error"),
     "m3c2": ("M3C2", "M3C2 distance"),
+    "c2c": ("C2C", "C2C to reference"),
+    "c2c_from_reference": ("C2C from reference", "C2C from reference"),
 }
-"""Errors with a sign: their names in the tables of Python and of the page."""
+"""The errors of a comparison: their names in the tables of Python and of the page."""
 MOMENTS = {
     "mean": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m", "median": "median_m",
 }  # fmt: skip
@@ -52,38 +55,44 @@ BINS = {
     ),
 }  # fmt: skip
 """Their titles as a table and as a picture, and the label of the axis."""
-_SHOWN = 0.995
-"""The share of the distances of each histogram up to which the axis reaches at least."""
+SHOWN = 0.995
+"""The share of the distances of each histogram of C2C up to which the axis reaches at least."""
 
 
-# Numbers
+class Errors(NamedTuple):
+    """One kind of error of one cloud."""
+
+    name: str  # in the tables of Python
+    title: str  # on the page
+    cloud: str
+    colour: str
+    found: Plain  # statistics, with a histogram where there is one
 
 
-def signed_statistics(compared: Plain) -> list[tuple[str, str, Plain]]:
-    """Return every error that has a sign: its titles in Python and on the page, and statistics."""
-    found = []
-    for key, (short, title) in SIGNED.items():
-        for when, name, _ in TIMES:
-            if (one := (compared.get(key) or {}).get(when)) is not None:
-                label = f"{short} {when}" if compared[key]["before"] else short
-                found.append((label, f"{title}, {name}", one.get("statistics", one)))
-    return found
-
-
-def c2c_rows(compared: Plain) -> list[tuple[str, str, str, Plain]]:
-    """Return direction, cloud, colour and distribution of all C2C, a direction after the other."""
+def errors_of(compared: Plain, *kinds: str) -> list[Errors]:
+    """Return the errors of some of `KINDS`, one kind after the other."""
     rows = []
-    for key, way in (("c2c", "to reference"), ("c2c_from_reference", "from reference")):
-        pair = compared.get(key) or {}
-        if key == "c2c" and compared["measured_at"] == "reference":
-            way = "from check points"
-        for when, name, colour in TIMES:
-            if pair.get(when) is not None:
-                rows.append((way, "cloud" if pair["before"] is None else name, colour, pair[when]))
-        for number, one in enumerate(compared.get("also", ())):
-            if one[key] is not None:
-                rows.append((way, one["name"], further_colour(number), one[key]))
+    for kind in kinds:
+        name, title = KINDS[kind]
+        if kind == "c2c" and compared["measured_at"] == "reference":
+            title = "C2C from check points"
+        pair = compared[kind] or {}
+        for when, cloud, colour in TIMES:
+            if (found := pair.get(when)) is not None:
+                both = pair["before"] is not None
+                label, cloud = (f"{name} {when}", cloud) if both else (name, "cloud")
+                rows.append(Errors(label, title, cloud, colour, found))
+        for number, one in enumerate(compared["also"]):
+            if one.get(kind) is not None:
+                colour = FURTHER[number % len(FURTHER)]
+                rows.append(Errors(f"{name} {one['name']}", title, one["name"], colour, one[kind]))
     return rows
+
+
+def signed_statistics(compared: Plain) -> list[tuple[str, Plain]]:
+    """Return name and statistics of every error that has a sign."""
+    signed = errors_of(compared, "vertical", "bed", "land", "m3c2")
+    return [(one.name, one.found.get("statistics", one.found)) for one in signed]
 
 
 def raw_of(compared: Plain) -> Plain:
@@ -98,8 +107,7 @@ def raw_of(compared: Plain) -> Plain:
 
 def comparison_text(c: Comparison) -> str:
     """Return the summary of a comparison; metres throughout."""
-    plain, n = c.as_dict(), c.counts
-    checks = c.measured_at == "reference"
+    plain, n, checks = c.as_dict(), c.counts, c.measured_at == "reference"
     in_reference = n.reference - n.reference_left_out
     compared = share(n.compared, in_reference if checks else n.cloud)
     rows = [("Compared", f"{n.compared:,} {'check points' if checks else 'points'} ({compared})")]
@@ -112,10 +120,10 @@ def comparison_text(c: Comparison) -> str:
     if n.reference_compared:
         of = share(n.reference_compared, in_reference)
         rows.append(("C2C from", f"{n.reference_compared:,} points of the reference ({of})"))
-    if c.own is not None:
-        own, noise = plain["own"], noise_sentence(plain["own"], raw_of(plain)["after"])
+    if (own := plain["own"]) is not None:
+        noise = noise_sentence(own, raw_of(plain)["after"])
         if own["rmse_m"] is not None:
-            noise = f"RMSE {own['rmse_m']:.3f} m, 95 % {own['within_95_m']:.3f} m, {noise}"
+            noise = f"RMSE {own['rmse_m']:.3f} m, 95 % {own['within_95_m']:.3f} m; {noise}"
         rows.append(("Bed" if own["of"] == "bed" else "Cloud", noise))
     if c.m3c2 is not None:
         m = c.m3c2.after
@@ -131,10 +139,11 @@ def comparison_text(c: Comparison) -> str:
 def noise_sentence(own: Plain, raw: Plain) -> str:
     """Return how the noise of the reference changes the errors of the cloud."""
     source = "assumed" if own["is_assumed"] else "stated"
-    noise = f"the reference's noise ({own['sigma_reference_m']:.3f} m, {source})"
+    noise = f"the noise of the reference ({own['sigma_reference_m']:.3f} m, {source})"
     if own["rmse_m"] is None:
         return f"the differences scatter no more than {noise}, so the cloud's error is not known."
-    return f"without {noise}; with it RMSE {raw['rmse_m']:.3f} m, 95 % {raw['within_95_m']:.3f} m."
+    with_it = f"RMSE {raw['rmse_m']:.3f} m, 95 % {raw['within_95_m']:.3f} m"
+    return f"{noise} is subtracted; with it {with_it}."
 
 
 def signed(value_m: float) -> str:
@@ -142,61 +151,51 @@ def signed(value_m: float) -> str:
     return f"{round(value_m, 3) + 0.0:+.3f} m"
 
 
-def gauss(of: Plain) -> str:
-    """Return the normal distribution fitted to distances, in CloudCompare's words."""
-    s, classes = of["statistics"], len(of["histogram"]["counts"])
-    return f"Gauss: mean = {s['mean_m']:.6f} / std.dev. = {s['sd_m']:.6f} [{classes} classes]"
-
-
 # Tables
 
 
 def _tables(compared: Plain) -> list[Table]:
     """Return the tables for terminal and page; those without rows are omitted."""
-    names = {when: name for when, name, _ in TIMES}
-    c2c = c2c_rows(compared)
-    found = [(title, s) for _, title, s in signed_statistics(compared)]
-    found += [(f"C2C {way}, {name}", of["statistics"]) for way, name, _, of in c2c]
     rows = []
-    for title, s in found:
+    for one in errors_of(compared, *KINDS):
+        s = one.found.get("statistics", one.found)
         marks = s["percentiles_m"]
         values = [*(s[key] for key in MOMENTS.values()), marks["p5"], marks["p95"], s["max_m"]]
+        title = f"{one.title}, {one.cloud}"
         rows.append([title, f"{s['count']:,}", *(f"{value:.3f}" for value in values)])
     title = f"Against {name_of(compared['reference'])} (m)"
     tables = [Table(title, ["", "points", *MOMENTS, "5 %", "95 %", "max"], rows)]
 
-    bands = c2c[0][-1].get("shares", ()) if c2c else ()
-    header = ["", "mean (m)", "std.dev. (m)", "classes"]
-    header += [f"{one['low_m']:g} to {one['high_m']:g} m" for one in bands]
-    rows = [
-        [
-            f"{way}, {name}", f"{of['statistics']['mean_m']:.6f}",
-            f"{of['statistics']['sd_m']:.6f}", str(len(of["histogram"]["counts"])),
-            *(f"{100 * one['share']:.1f} %" for one in of.get("shares", ())),
-        ]
-        for way, name, _, of in c2c
-    ]  # fmt: skip
+    header, rows = [], []
+    for one in errors_of(compared, "c2c", "c2c_from_reference"):
+        s, bands = one.found["statistics"], one.found["shares"]
+        header = [f"{band['low_m']:g} to {band['high_m']:g} m" for band in bands]
+        shares = [f"{100 * band['share']:.1f} %" for band in bands]
+        classes = str(len(one.found["histogram"]["counts"]))
+        figures = [f"{s['mean_m']:.6f}", f"{s['sd_m']:.6f}", classes]
+        rows.append([f"{one.title}, {one.cloud}", *figures, *shares])
+    header = ["", "mean (m)", "std.dev. (m)", "classes", *header]
     tables.append(Table("C2C: Gauss as CloudCompare fits it", header, rows))
 
-    lines = [(name, (compared["depth"] or {}).get(when)) for when, name, _ in TIMES]
     rows = [
         [name, f"{fit['slope']:.4f}", f"{fit['intercept_m']:+.3f}", f"{fit['r2']:.4f}"]
-        for name, fit in lines
-        if fit is not None
+        for when, name, _ in TIMES
+        if (fit := (compared["depth"] or {}).get(when)) is not None
     ]
     header = ["", "slope", "intercept (m)", "r²"]
     tables.append(Table("Depth against reference depth", header, rows))
 
     # of each class of depth or of distance from the shore
-    figures = {"bias": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m"}
-    header = ["", "points", *(f"{one}, {name}" for name in names.values() for one in figures)]
+    figures_of = {"bias": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m"}
+    header = ["", "points", *(f"{one}, {name}" for _, name, _ in TIMES for one in figures_of)]
     for key, (title, _, _) in BINS.items():
         rows = []
         for one in compared[key]:
-            both = [one[when] for when in names]
-            cells = ["" if s is None else f"{s[of]:.3f}" for s in both for of in figures.values()]
-            name = f"{one['from_m']:g} to {one['to_m']:g}"
-            rows.append([name, f"{one['after']['count']:,}", *cells])
+            row = [f"{one['from_m']:g} to {one['to_m']:g}", f"{one['after']['count']:,}"]
+            for when, _, _ in TIMES:
+                s = one[when]
+                row += ["" if s is None else f"{s[key]:.3f}" for key in figures_of.values()]
+            rows.append(row)
         tables.append(Table(title, header, rows))
     return [table for table in tables if table.rows]
 
@@ -207,91 +206,87 @@ def _tables(compared: Plain) -> list[Table]:
 def evaluation(
     compared: Plain,
     sections: list[Plain],
-    dod: tuple[FloatArray, tuple[float, float, float, float]] | None = None,
+    difference_m: FloatArray | None = None,
+    extent_m: Extent = (0.0, 0.0, 0.0, 0.0),
 ) -> tuple[list[Picture], list[Table]]:
     """Return pictures and tables of a `Comparison.as_dict`.
 
-    `sections` have ``distance_m`` and ``heights_m`` as lists, None where nothing is known; `dod` is
-    the difference of the surfaces, shape (rows, columns), metres, and its west, east, south, north.
+    `sections` have ``distance_m`` and ``heights_m`` as lists, None where nothing is known; the
+    difference of the surfaces has the shape (rows, columns).
     """
-    pictures, pair = [], compared["vertical"]
-    if pair is not None:
-        times = [(name, colour, pair[when]) for when, name, colour in TIMES if pair[when]]
-        figure, panels = new_figure(8.0, 2.4 * len(times) + 0.4, nrows=len(times), squeeze=False)
-        for axes, (name, colour, of) in zip(panels[:, 0], times, strict=True):
-            s = of["statistics"]
-            label = f"{name}: mean {s['mean_m']:.3f}, sd {s['sd_m']:.3f} m"
-            _histogram(axes, of, color=colour, label=label)
-        panels[-1, 0].set_xlabel("Cloud minus reference, Z (m)")
-        alt = "Vertical error: histograms with fitted Gaussians; the table has their figures."
-        pictures.append(Picture("histogram_vertical", "Vertical error", alt, figure))
+    pictures, words = [], "histograms with fitted Gaussians; the table has their figures."
+    vertical = errors_of(compared, "vertical")
+    if vertical:
+        figure = _histograms([vertical], "Cloud minus reference, Z (m)", sharex=False)
+        title = "Vertical error"
+        pictures.append(Picture("histogram_vertical", title, f"{title}: {words}", figure))
     title = "Distance to the nearest point (C2C)"
-    alt = f"{title}: histograms with fitted Gaussians; the table has their figures."
-    sparse = ("cloud.sparse", "reference.sparse")
-    alt += "".join(f" {one['message']}" for one in compared["notes"] if one["code"] in sparse)
-    pictures.append(Picture("histogram_c2c", title, alt, c2c_figure(compared)))
-    if dod is not None:
-        reach = float(np.nanpercentile(np.abs(dod[0]), 98.0))
+    pictures.append(Picture("histogram_c2c", title, f"{title}: {words}", c2c_figure(compared)))
+    if difference_m is not None:
+        reach = float(np.nanpercentile(np.abs(difference_m), 98.0))
         alt = (
             "Map of the corrected surface minus the reference surface; blue where the cloud is"
             f" lower. 98 % of the cells differ by less than {reach:.2f} m."
         )
-        figure = map_figure(*dod, "Cloud minus reference (m)", cmap=DIFFERENCE, vmin=-reach,
-                            vmax=reach)  # fmt: skip
+        look: dict[str, Any] = {"cmap": DIFFERENCE, "vmin": -reach, "vmax": reach}
+        figure = map_figure(difference_m, extent_m, "Cloud minus reference (m)", **look)
         pictures.append(Picture("dod", "Difference of the surfaces (DoD)", alt, figure))
-    pictures += [
-        Picture(
-            key, title,
-            f"{title}: mean and standard deviation of the vertical error in {len(compared[key])}"
-            " classes, before and after the correction.",
-            _errors(compared[key], label),
-        )
-        for key, (_, title, label) in BINS.items() if compared[key]
-    ]  # fmt: skip
+    for key, (_, title, label) in BINS.items():
+        if bins := compared[key]:
+            alt = (
+                f"{title}: mean and standard deviation of the vertical error in {len(bins)}"
+                " classes, before and after the correction."
+            )
+            pictures.append(Picture(key, title, alt, _errors_figure(bins, label)))
     pictures += [_section(number, one) for number, one in enumerate(sections, start=1)]
     return pictures, _tables(compared)
 
 
 def c2c_figure(compared: Plain) -> Figure:
-    """Draw all histograms with their Gauss: a column a direction, a row a cloud, one axis."""
-    rows = c2c_rows(compared)
-    ways = list(dict.fromkeys(way for way, *_ in rows))
-    count = len(rows) // len(ways)  # each direction has the same clouds
-    figure, panels = new_figure(
-        7.5 * len(ways) + 0.5, 2.4 * count + 0.4, nrows=count, ncols=len(ways), sharex=True,
-        squeeze=False,
-    )  # fmt: skip
+    """Draw the histograms of all C2C: a column a direction, a row a cloud, one axis."""
+    columns = [errors_of(compared, kind) for kind in ("c2c", "c2c_from_reference")]
+    columns = [one for one in columns if one]
+    figure = _histograms(columns, "Distance to the nearest point (m)", sharex=True)
     reach = 0.0
-    for axes, (way, name, colour, of) in zip(panels.T.flat, rows, strict=True):
-        label = f"{name}, {way}; largest {of['statistics']['max_m']:.3f} m"
-        _histogram(axes, of, color=colour, label=label)
-        axes.set_title(gauss(of), fontsize="medium")
-        # the upper edge of the class in which the last of the distances shown lies
-        up_to = np.cumsum(of["histogram"]["counts"])
-        last = int(np.searchsorted(up_to, _SHOWN * up_to[-1]))
-        reach = max(reach, of["histogram"]["edges_m"][1 + last])
-    panels[0, 0].set_xlim(0.0, reach)
-    for axes in panels[-1]:
-        axes.set_xlabel("Distance to the nearest point (m)")
+    for column in columns:
+        for one in column:
+            # the upper edge of the class in which the last of the distances shown lies
+            up_to = np.cumsum(one.found["histogram"]["counts"])
+            last = int(np.searchsorted(up_to, SHOWN * up_to[-1]))
+            reach = max(reach, one.found["histogram"]["edges_m"][1 + last])
+    figure.axes[0].set_xlim(0.0, reach)
     return figure
 
 
-def _histogram(axes: Axes, of: Plain, **look: Any) -> None:
-    """Draw a distribution, and the normal distribution of its mean and standard deviation."""
+def _histograms(columns: list[list[Errors]], label: str, *, sharex: bool) -> Figure:
+    """Draw distributions with the normal distributions of their means and standard deviations."""
     from scipy.stats import norm
 
-    edges, counts = (np.array(of["histogram"][key]) for key in ("edges_m", "counts"))
-    axes.stairs(counts, edges, fill=True, alpha=0.55, **look)
-    mean, sd = of["statistics"]["mean_m"], of["statistics"]["sd_m"]
-    if sd > 1e-12 * abs(mean):
-        x = np.linspace(edges[0], edges[-1], 2000)
-        area = of["statistics"]["count"] * (edges[1] - edges[0])
-        axes.plot(x, area * norm.pdf(x, mean, sd), color="0.15")
-    axes.set_ylabel("Count")
-    axes.legend(loc="upper right")
+    rows = len(columns[0])  # each direction has the same clouds
+    size = 7.5 * len(columns) + 0.5, 2.4 * rows + 0.4
+    figure, panels = new_figure(
+        *size, nrows=rows, ncols=len(columns), sharex=sharex, squeeze=False
+    )  # fmt: skip
+    for axes, one in zip(panels.T.flat, (one for some in columns for one in some), strict=True):
+        s, histogram = one.found["statistics"], one.found["histogram"]
+        edges, counts, mean, sd = histogram["edges_m"], histogram["counts"], s["mean_m"], s["sd_m"]
+        name = f"{one.title}, {one.cloud}; {s['min_m']:.3f} to {s['max_m']:.3f} m"
+        axes.stairs(counts, edges, fill=True, alpha=0.55, color=one.colour, label=name)
+        if sd > 1e-12 * abs(mean):
+            x = np.linspace(edges[0], edges[-1], 2000)
+            axes.plot(x, s["count"] * (edges[1] - edges[0]) * norm.pdf(x, mean, sd), color="0.15")
+        axes.set_ylabel("Count")
+        axes.legend(loc="upper right")
+        # in CloudCompare's words
+        words = f"Gauss: mean = {mean:.6f} / std.dev. = {sd:.6f} [{len(counts)} classes]"
+        axes.set_title(words, fontsize="medium")
+    for axes in panels[-1]:
+        axes.set_xlabel(label)
+    return figure
 
 
-def _errors(bins: list[Plain], label: str) -> Figure:
+def _errors_figure(bins: list[Plain], label: str) -> Figure:
+    """Draw the mean error of each class, with its standard deviation."""
     figure, axes = new_figure()
     axes.axhline(0.0, color="0.5", linewidth=0.8)
     for when, name, colour in TIMES:
@@ -305,27 +300,22 @@ def _errors(bins: list[Plain], label: str) -> Figure:
     return figure
 
 
-def further_colour(number: int) -> str:
-    """Return the colour of a further cloud, by its number from 0."""
-    return ("#6a3d9a", "#33804d", "#c51b7d", "#8c6d1f", "#5f6b73")[number % 5]
-
-
 def _section(number: int, section: Plain) -> Picture:
+    """Draw the heights along a line."""
     figure, axes = new_figure(8.0, 4.0)
-    further = [name for name in section["heights_m"] if name not in LAYERS]
+    heights, further = section["heights_m"], [n for n in section["heights_m"] if n not in LAYERS]
     looks: dict[str, dict[str, Any]] = {
         "water": {"color": WATER, "linewidth": 1.2},
         "reference": {"color": REFERENCE, "linewidth": 2.5, "alpha": 0.45},
         "apparent": {"color": BEFORE, "linestyle": "--", "label": "uncorrected"},
         "corrected": {"color": AFTER},
     }
-    looks |= {
-        name: {"color": further_colour(i), "linewidth": 1.0} for i, name in enumerate(further)
-    }
-    for key, look in looks.items():
-        if key in section["heights_m"]:
-            heights = np.array(section["heights_m"][key], float)
-            axes.plot(section["distance_m"], heights, **{"label": key} | look)
+    for place, name in enumerate(further):
+        looks[name] = {"color": FURTHER[place % len(FURTHER)], "linewidth": 1.0}
+    for name, look in looks.items():
+        if name in heights:
+            line = np.array(heights[name], float)
+            axes.plot(section["distance_m"], line, **{"label": name} | look)
     axes.set(xlabel="Distance along the line (m)", ylabel="Height (m)")
     axes.legend(loc="best")
     alt = (

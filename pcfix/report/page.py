@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.grid.colours import DEPTH, HEIGHT, NO_LIGHT, hillshade, stops_of
-from pcfix.grid.maps import Maps, contours, depth_interval, smoothed
+from pcfix.grid.lattice import Lattice
+from pcfix.grid.maps import Extent, contours, depth_interval, smoothed
 from pcfix.model import FloatArray
 from pcfix.sums import nice_step
 
@@ -66,11 +67,7 @@ def png_of(figure: Figure) -> bytes:
 
 
 def map_figure(
-    values: FloatArray,
-    extent_m: tuple[float, float, float, float],
-    label: str,
-    shade: FloatArray | None = None,
-    **look: Any,
+    values: FloatArray, extent_m: Extent, label: str, shade: FloatArray | None = None, **look: Any
 ) -> Figure:
     """Draw a map of values over west, east, south and north, metres; `shade` is its relief.
 
@@ -198,12 +195,12 @@ class Report:
     head: Table  # beside the map
     warnings: list[str]
     tables: list[Table]  # the first is shown, the others folded
-    maps: Maps | None = None  # None for a page without a map
+    lattice: Lattice | None = None  # the cells of the map; None for a page without one
+    height_m: FloatArray | None = None  # their heights, shape (rows, columns), shown as relief
     layers: Sequence[Layer] = ()
     pictures: Sequence[Picture] = ()  # the first `FIGURES` are shown, the others folded
     provenance: list[Table] = field(default_factory=list)
     tiles: Sequence[Tile] = ()
-    place: str = ""  # CRS and vertical datum of the map
     files: Sequence[tuple[str, str]] = ()  # path from the page, and its contents
 
 
@@ -233,7 +230,9 @@ def render(report: Report) -> str:
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, finalize=_as_read,
     ).get_template("page.html.j2")  # fmt: skip
-    data = None if report.maps is None else Markup(map_json(report.maps, report.layers))
+    data = None
+    if report.lattice is not None and report.height_m is not None:
+        data = Markup(map_json(report.lattice, report.height_m, report.layers))
     return template.render(report=report, figures=FIGURES, map_data=data)
 
 
@@ -248,29 +247,35 @@ SMOOTH_CELLS = 1.5
 """Single cells are noisy: the shade is of a surface smoothed by this."""
 
 
-def map_json(maps: Maps, layers: Sequence[Layer]) -> str:
+def extent_of(lattice: Lattice) -> Extent:
+    """Return west, east, south and north of the cells, metres."""
+    west, south, east, north = lattice.bounds_m
+    return west, east, south, north
+
+
+def map_json(lattice: Lattice, height_m: FloatArray, layers: Sequence[Layer]) -> str:
     """Return the data as JSON without "<", so that no text in it can end the script element.
 
     Layers are differences of 16-bit integers, compressed by zlib, in base 64.
     """
-    west, _, _, north = maps.extent_m
-    rows, columns = maps.height_m.shape
-    shade = np.where(np.isfinite(maps.height_m), relief(maps.height_m, maps.cell_m) * 254.0, 0.0)
+    shade = relief(height_m, lattice.resolution_m) * 254.0
     data: dict[str, Any] = {
-        "rows": rows,
-        "columns": columns,
-        "west": west,
-        "north": north,
-        "cell": maps.cell_m,
+        "rows": lattice.height,
+        "columns": lattice.width,
+        "west": lattice.left_m,
+        "north": lattice.top_m,
+        "cell": lattice.resolution_m,
         "noData": _NO_DATA,
-        "shade": _packed(shade),
+        "shade": _packed(np.nan_to_num(shade)),
         "layers": [_of_layer(layer) for layer in layers],
         "interval": 0,
         "contours": [],
     }
     for layer in layers:
         if layer.has_contours:  # lines whose places count from the corner of the map
-            data["interval"] = interval = depth_interval(layer.values, maps.uncertainty_m)
+            known = (one.values for one in layers if one.name == layer.plus_minus)
+            interval = depth_interval(layer.values, next(known, np.zeros(0)))
+            data["interval"] = interval
             data["contours"] = [
                 {"level": level, "line": np.round(place + 0.5, 1).ravel().tolist()}
                 for level, place in contours(layer.values, interval)

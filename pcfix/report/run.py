@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.grid.colours import DEPTH, DIFFERENCE, RAYS, UNCERTAINTY
-from pcfix.grid.maps import Extent, Maps, contours, depth_interval
+from pcfix.grid.colours import DEPTH, DIFFERENCE, UNCERTAINTY
+from pcfix.grid.lattice import Lattice
+from pcfix.grid.maps import contours, depth_interval
 from pcfix.model import Cameras, FloatArray
-from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
+from pcfix.refract.tally import ORDERS, largest_tvu_m
 from pcfix.report.comparison import noise_sentence, raw_of, signed
 from pcfix.report.page import (
     AFTER,
@@ -26,6 +26,7 @@ from pcfix.report.page import (
     Report,
     Table,
     Tile,
+    extent_of,
     label_plan,
     map_figure,
     name_of,
@@ -33,7 +34,7 @@ from pcfix.report.page import (
     relief,
 )
 from pcfix.report.summary import Summary
-from pcfix.report.text import FEWEST, formal_words, summary_rows, uncertainty_sentence
+from pcfix.report.text import FEWEST, formal_words, summary_rows
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
@@ -51,113 +52,105 @@ BESIDE_MAP = ("Submerged", "Cameras", "Water", "")
 UNKNOWN_DATUM = "vertical datum not known"
 
 
-@dataclass(frozen=True, eq=False)
-class RunResults:
-    """Everything that the page of a run shows."""
+class RunMaps(NamedTuple):
+    """The rasters of a run in common cells, shape (rows, columns), metres; NaN if unknown."""
 
-    summary: Summary
-    cameras: Cameras
-    maps: Maps
-    depth_m: dict[str, float]  # min, mean and max of the bed's points that are not noise
-    sample: FloatArray  # shape (m, 2): depth and standard error of Z, zero where unknown
-    crs: str = ""  # of the cloud, and its vertical datum; empty if not known
-    heights: str = ""
-    project: str = ""
-    date: str = ""  # of the images
-    pictures: Sequence[Picture] = ()  # of other steps, the most important first
-    tables: Sequence[Table] = ()
-    verdict: str = ""  # one sentence on them
-    compared: Plain = field(default_factory=dict)  # `Comparison.as_dict`
-    difference: tuple[FloatArray, Extent] | None = None  # cloud minus reference, metres
+    lattice: Lattice
+    height_m: FloatArray  # of land and bed
+    depth_m: FloatArray
+    uncertainty_m: FloatArray  # of the bed, at 95 %
+    difference_m: FloatArray | None  # cloud minus reference
+    crs: str  # of the cloud, and its vertical datum; empty if not known
+    heights: str
 
 
-def run_report(run: RunResults, inputs: Table, files: Sequence[Pair]) -> Report:
-    """Return the page of a run; `inputs` lists the files read, `files` those beside the page."""
-    s, depth = run.summary, run.depth_m
-    versions = [["pcfix", __version__], ["Python", platform.python_version()]]
-    versions += [[name, version(name)] for name in ("numpy", "scipy", "numba", "laspy", "lazrs")]
-    order = {name: place for place, name in enumerate(FIRST_FIGURES)}
-    mean = s.shift_z_m["mean"]
+def run_report(
+    s: Summary,
+    cameras: Cameras,
+    maps: RunMaps,
+    *,
+    project: str = "",
+    date: str = "",
+    verdict: str = "",
+    compared: Plain | None = None,
+    pictures: Sequence[Picture] = (),
+    tables: Sequence[Table] = (),
+    inputs: Sequence[Table] = (),
+    files: Sequence[Pair] = (),
+) -> Report:
+    """Return the page of a run.
+
+    `compared` is `Comparison.as_dict`, and `verdict` a sentence on the steps before the correction.
+    `pictures` and `tables` are of other steps, the most important first; `inputs` list the files
+    read, `files` those next to the page. `date` is that of the images.
+    """
+    compared, depth, mean = compared or {}, s.depth_m, s.shift_z_m["mean"]
     lead = (
         f"Correction for refraction of {name_of(s.input)}: {s.corrected:,} of {s.points:,} points"
         f" are under water and were moved, {abs(mean):.2f} m"
         f" {'higher' if mean > 0.0 else 'deeper'} on average."
     )
-    if s.transfer is not None:
-        lead += (
-            " Before that, the whole cloud was transferred to the adjusted poses, which moved it by"
-            f" {s.transfer['shift_m']['rms']:.2f} m (rms)."
-        )
-    rows = summary_rows(s)
-    beside = [
-        ["Images", run.date or "date not stated"],
-        ["CRS", run.crs or "not stated by the cloud"],
-        ["Heights", run.heights or f"{UNKNOWN_DATUM}: the cloud states none"],
+    rows = summary_rows(s, compared.get("tvu"))
+    notes = notes_of(s, maps.heights, compared)
+    head = [
+        ["Images", date or "date not stated"],
+        ["CRS", maps.crs or "not stated by the cloud"],
+        ["Heights", maps.heights or f"{UNKNOWN_DATUM}: the cloud states none"],
         ["Points", f"{s.points:,}"],
         *([label, words] for label, words in rows if label in BESIDE_MAP),
     ]
-    notes = notes_of(s, run.heights, run.compared)
-    moved = (
-        f"{s.corrected:,} points of the bed moved {'up' if mean > 0.0 else 'down'} by"
-        f" {abs(mean):.2f} m on average."
-    )
     depths = [
         ("range", f"{depth['min']:.2f} to {depth['max']:.2f} m"),
         ("mean", f"{depth['mean']:.2f} m"),
     ]
-    # the rows of the terminal, with the detected reconstruction type in words
-    facts = {"Cloud": name_of(s.input), "Points": f"{s.points:,}", **dict(rows)}
-    facts |= {"Method": f"{s.made['method']}. {s.made['because']}"} if s.made else {}
-    # it names the order of S-44, by the measured differences where there are some
-    facts |= {"Uncertainty": uncertainty_sentence(s, run.compared.get("tvu")), "IHO S-44": ""}
+    # the rows of the terminal, and why the method was chosen
+    facts = [("Input cloud", name_of(s.input)), ("Points", f"{s.points:,}"), *rows]
+    facts += [("Reconstruction", s.made["because"])] if s.made else []
     settings = [
         [name.replace("_", " "), _worded(value)]
         for name, value in s.settings.items()
         if value not in (None, "", {}, [])
     ]
+    versions = [["pcfix", __version__], ["Python", platform.python_version()]]
+    versions += [[name, version(name)] for name in ("numpy", "scipy", "numba", "laspy", "lazrs")]
+    order = {name: place for place, name in enumerate(FIRST_FIGURES)}
+    pictures = [*_pictures(s, cameras, maps, compared), *pictures]
     return Report(
-        title=run.project or Path(name_of(s.input)).stem,
-        lead=lead + run.verdict,
-        head=Table("The project", [], beside),
+        title=project or Path(name_of(s.input)).stem,
+        lead=lead + verdict,
+        head=Table("The project", [], head),
         tiles=[
-            Tile("Depth", figures=depths, notes=[moved]),
-            accuracy_tile(s, run.compared),
+            Tile("Depth", figures=depths),
+            accuracy_tile(s, compared),
             Tile("Warnings", notes=notes[:SHOWN_NOTES] or ["None."]),
         ],
         warnings=notes,
-        maps=run.maps,
-        place=f"{run.crs or 'CRS not stated'}; heights: {run.heights or UNKNOWN_DATUM}.",
-        layers=_layers(run),
-        pictures=sorted(
-            [*_pictures(run), *run.pictures], key=lambda one: order.get(one.name, len(order))
-        ),
-        tables=list(run.tables),
+        lattice=maps.lattice,
+        height_m=maps.height_m,
+        layers=_layers(maps),
+        pictures=sorted(pictures, key=lambda one: order.get(one.name, len(order))),
+        tables=list(tables),
         files=files,
         provenance=[
-            Table("In short", [], [[label, words] for label, words in facts.items() if words]),
+            Table("In short", [], [list(row) for row in facts]),
             Table("Settings", ["setting", "value"], settings),
-            inputs,
+            *inputs,
             Table("Software", ["name", "version"], versions),
         ],
     )
 
 
-def _layers(run: RunResults) -> list[Layer]:
+def _layers(maps: RunMaps) -> list[Layer]:
     """Return the choices of the map, depth first."""
-    maps, known = run.maps, np.isfinite(run.maps.uncertainty_m).any()
+    known = np.isfinite(maps.uncertainty_m).any()
     by = "Uncertainty (95 %)" if known else ""
     layers = [Layer("Depth", "m", maps.depth_m, DEPTH, by, has_contours=True)]
     if known:
         layers.append(Layer(by, "m", maps.uncertainty_m, UNCERTAINTY))
-    if run.difference is not None:
-        values = maps.sampled(*run.difference)
-        layers.append(Layer("Cloud minus reference", "m", values, DIFFERENCE, is_centred=True))
-    return [
-        *layers,
-        Layer("Rays", "", maps.rays, RAYS),
-        Layer("Shift in Z", "m", maps.shift_z_m),
-        Layer("Height", "m", maps.height_m),
-    ]
+    if maps.difference_m is not None:
+        name = "Cloud minus reference"
+        layers.append(Layer(name, "m", maps.difference_m, DIFFERENCE, is_centred=True))
+    return [*layers, Layer("Height", "m", maps.height_m)]
 
 
 def _worded(value: Any) -> str:
@@ -170,32 +163,30 @@ def _worded(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _pictures(run: RunResults) -> list[Picture]:
+def _pictures(s: Summary, cameras: Cameras, maps: RunMaps, compared: Plain) -> list[Picture]:
     """Return the map of depths, the cameras, and TVU over depth where there are standard errors."""
-    s, maps, depth = run.summary, run.maps, run.depth_m
+    lattice, depth = maps.lattice, s.depth_m
     interval = depth_interval(maps.depth_m, maps.uncertainty_m)
-    shade = relief(maps.height_m, maps.cell_m)
-    depths = map_figure(maps.depth_m, maps.extent_m, "Depth (m)", shade, cmap=DEPTH)
+    shade = relief(maps.height_m, lattice.resolution_m)
+    figure = map_figure(maps.depth_m, extent_of(lattice), "Depth (m)", shade, cmap=DEPTH)
     for _, place in contours(maps.depth_m, interval):
-        x, y = (place + 0.5).T * maps.cell_m  # from the corner of the map
-        depths.axes[0].plot(maps.west_m + x, maps.north_m - y, color=REFERENCE, linewidth=0.5)
-    pictures = [
-        Picture(
-            "depth", "Depth",
-            f"Map of the corrected depth over the shaded relief; {depth['min']:.2f} to"
-            f" {depth['max']:.2f} m, mean {depth['mean']:.2f} m; contours every {interval:g} m.",
-            depths,
-        ),
-    ]  # fmt: skip
+        x, y = (place + 0.5).T * lattice.resolution_m  # from the corner of the map
+        figure.axes[0].plot(lattice.left_m + x, lattice.top_m - y, color=REFERENCE, linewidth=0.5)
+    alt = (
+        f"Map of the corrected depth over the shaded relief; {depth['min']:.2f} to"
+        f" {depth['max']:.2f} m, mean {depth['mean']:.2f} m; contours every {interval:g} m."
+    )
+    pictures = [Picture("depth", "Depth", alt, figure)]
     if s.cameras:
         alt = (
             f"Projection centres over the cloud; {s.cameras_used} of {s.cameras} see corrected"
             " points."
         )
-        pictures.append(Picture("cameras", "Cameras", alt, cameras_figure(run)))
-    known = run.sample[:, 1] > 0.0
+        figure = cameras_figure(maps, cameras, s.cameras_unused)
+        pictures.append(Picture("cameras", "Cameras", alt, figure))
+    known = np.isfinite(maps.depth_m) & np.isfinite(maps.uncertainty_m)
     if s.uncertainty is not None and known.any():
-        bins = run.compared["depth_bins"] if run.compared.get("tvu") else []
+        bins = compared["depth_bins"] if compared.get("tvu") else []
         dots = (
             " Dots: 95 % of the differences from the reference are smaller, noise of the"
             " reference included."
@@ -205,19 +196,18 @@ def _pictures(run: RunResults) -> list[Picture]:
             f" limits of the orders of IHO S-44. {formal_words(s)}.{dots if bins else ''}"
             " S-44 has requirements other than the TVU: position, features and coverage."
         )
-        depth_m, sigma_z_m = run.sample[known].T
-        figure = tvu_figure(depth_m, sigma_z_m, bins)
+        figure = tvu_figure(maps.depth_m[known], maps.uncertainty_m[known], bins)
         pictures.append(Picture("uncertainty", "Vertical uncertainty", alt, figure))
     return pictures
 
 
-def cameras_figure(run: RunResults) -> Figure:
+def cameras_figure(maps: RunMaps, cameras: Cameras, unused: Sequence[str]) -> Figure:
     """Draw the projection centres in plan over the cloud."""
-    maps, cameras = run.maps, run.cameras
-    used = ~np.isin(np.array(cameras.labels), run.summary.cameras_unused)
+    extent_m = extent_of(maps.lattice)
+    used = ~np.isin(np.array(cameras.labels), unused)
     figure, plan = new_figure(8.0, 5.0)
-    plan.imshow(maps.height_m, extent=maps.extent_m, cmap="Greys_r", alpha=0.6)
-    depth = plan.imshow(maps.depth_m, extent=maps.extent_m, cmap=DEPTH)
+    plan.imshow(maps.height_m, extent=extent_m, cmap="Greys_r", alpha=0.6)
+    depth = plan.imshow(maps.depth_m, extent=extent_m, cmap=DEPTH)
     figure.colorbar(depth, ax=plan, label="Depth (m)", shrink=0.8)
     for chosen, mark, colour, name in (used, "o", AFTER, "used"), (~used, "x", BEFORE, "not used"):
         if chosen.any():
@@ -229,18 +219,18 @@ def cameras_figure(run: RunResults) -> Figure:
     return figure
 
 
-def tvu_figure(depth_m: FloatArray, sigma_z_m: FloatArray, measured: Sequence[Plain]) -> Figure:
+def tvu_figure(depth_m: FloatArray, tvu_m: FloatArray, measured: Sequence[Plain]) -> Figure:
     """Draw TVU at 95 % over depth, and the limits of the orders of IHO S-44 up to one above it.
 
-    `measured` are the `Comparison.depth_bins` of a reference, in plain values.
+    Both have the shape (n,), metres. `measured` are the `Comparison.depth_bins` of a reference, in
+    plain values.
     """
     figure, axes = new_figure()
     deepest = float(max(depth_m.max(), 1e-3))
     edges = np.linspace(0.0, deepest * (1.0 + 1e-9), 31)
     slot = np.clip(np.digitize(depth_m, edges) - 1, 0, 29)
     used = np.unique(slot)
-    tvu = COVERAGE_95 * sigma_z_m
-    low, middle, high = np.array([np.percentile(tvu[slot == i], [5, 50, 95]) for i in used]).T
+    low, middle, high = np.array([np.percentile(tvu_m[slot == i], [5, 50, 95]) for i in used]).T
     centres = 0.5 * (edges[:-1] + edges[1:])[used]
     axes.fill_between(
         centres, low, high, color=WATER, alpha=0.6, linewidth=0.0, label="predicted, 90 %"
@@ -260,17 +250,6 @@ def tvu_figure(depth_m: FloatArray, sigma_z_m: FloatArray, measured: Sequence[Pl
     axes.set(xlim=(0.0, deepest), ylim=(0.0, None), xlabel="Depth (m)", ylabel="TVU at 95 % (m)")
     axes.legend(loc="best")
     return figure
-
-
-def in_short(tiles: Sequence[Tile]) -> str:
-    """Return the figures of tiles in a line, for the terminal."""
-    parts = []
-    for tile in tiles:
-        if tile.figures:
-            tag = f", {tile.tag}" if tile.tag else ""
-            figures = ", ".join(f"{name} {value}" for name, value in tile.figures)
-            parts.append(f"{tile.title[0].lower()}{tile.title[1:]}{tag}: {figures}")
-    return "; ".join(parts)
 
 
 def accuracy_tile(s: Summary, compared: Plain) -> Tile:

@@ -1,13 +1,18 @@
 """The summaries of the commands, as tables of rows.
 
-A row is (label, format, needs): label and format take values by name, and the row is omitted if the
-value that it needs is missing or zero. With a star before it, the value is a list, and the row is
-repeated with the values by name of each. Terminal and report page use the same rows.
+A row is (label, format, needs). Label and format take values by name, as `str.format` does, with
+three more ways to write a value: ``of NAME`` (the share that it is of another value), a format that
+ends in `` %`` or `` cm`` (a hundred times the value), and ``?YES|NO`` (one of two texts).
+
+A row is omitted if the value that it needs is missing, zero or empty; with ``!`` before the name,
+unless it is known and zero or empty. With a star before the name the row is repeated, for each dict
+of values in a list, each text in a list, or each count in a dict that is not zero. Terminal and
+report page use the same rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from string import Formatter
 from typing import TYPE_CHECKING, Any
 
@@ -28,214 +33,197 @@ FEWEST = 59
 """Differences of which all keep an order before 95 % of all are likely to: 0.95^59 is 0.05."""
 SHOWN_NAMES = 5
 
-_PART = ("Read", "{part_words}", "part_words")
+_PART: RowTable = (
+    ("Read", "a part of {part[of]:,} points", "part"),
+    ("", "within {part[bounds]:.12g}", "part[bounds]"),
+    ("", "at a resolution of {part[read_resolution]:g} m", "part[read_resolution]"),
+)
 _NO_SURFACE = ("No surface", "{water_unknown:,} points have no water surface", "water_unknown")
 _SHORELINE: RowTable = (
-    ("Shoreline", "{lines} lines, {length_m:.1f} m, standard error in plan {sigma_m:.2f} m: {path}",
-     "lines"),
-    ("Shoreline", "none: the water does not intersect the cloud; {path} is empty", "is_empty"),
+    ("Shoreline", "{shoreline[lines]} lines, {shoreline[length_m]:.1f} m, standard error in plan"
+     " {shoreline[sigma_m]:.2f} m: {shoreline[path]}", "shoreline[lines]"),
+    ("Shoreline", "none: the water does not intersect the cloud; {shoreline[path]} is empty",
+     "!shoreline[lines]"),
 )  # fmt: skip
 _LABELLING: RowTable = (
-    ("Mask", "{outside_mask:,} points below the surface are outside: land", "water_mask"),
-    ("Respected", "{respected:,} points below the surface have classes of land", "respected"),
-    ("Pools", "{pools[points]:,} points in {pools[pools]:,} separate pools: land", "pools"),
-    ("Pools", "none separate from the water", "no_pools"),
+    ("Mask", "{labelling[outside_mask]:,} points below the surface are outside: land",
+     "labelling[water_mask]"),
+    ("Respected", "{labelling[respected]:,} points below the surface have classes of land",
+     "labelling[respected]"),
+    ("Pools", "{labelling[separate][points]:,} points in {labelling[separate][pools]:,} separate"
+     " pools: land", "labelling[separate][pools]"),
+    ("Pools", "none separate from the water", "!labelling[separate][pools]"),
 )  # fmt: skip
 _CORRECTED: RowTable = (
-    _PART,
+    *_PART,
     ("Transferred", "{transfer[points]:,} points ({transfer[land]:,} on land) to the adjusted"
      " poses: {transfer[shift_m][rms]:.3f} m rms, at most {transfer[shift_m][max]:.3f} m, mean Z"
      " {transfer[shift_m][mean_z]:+.3f} m", "transfer"),
-    ("", "{not_transferred:,} not transferred: {transfer[not_transferred_reason]} ({fate})",
-     "not_transferred"),
-    ("Submerged", "{submerged:,} points ({submerged_share}), {corrected_words}", "points"),
-    ("", "{count:,} not corrected: {reason} ({fate})", "*not_corrected"),
+    ("", "{transfer[not_transferred]:,} not transferred: {transfer[not_transferred_reason]}"
+     " ({fate})", "transfer[not_transferred]"),
+    ("Submerged", "{submerged:,} points ({submerged:of points}), {corrected_words}", ""),
+    ("", "{count:,} not corrected: {name} ({fate})", "*uncorrected"),
     _NO_SURFACE,
-    ("Withheld", "{unsure:,} corrected points ({unsure_share}) are seen at large incidence angles"
-     " only", "unsure"),
+    ("Withheld", "{unsure:,} corrected points ({unsure:of corrected}) are seen at large incidence"
+     " angles only", "unsure"),
     ("Depth", "{depth_m[min]:.2f} to {depth_m[max]:.2f} m, mean {depth_m[mean]:.2f} m", "depth_m"),
     ("Z shift", "mean {shift_z_m[mean]:.3f} m (5th to 95th percentile {shift_z_m[p5]:.3f} to"
      " {shift_z_m[p95]:.3f} m)", "shift_z_m"),
-    ("Method", "{method}", "method"),
+    ("Method", "{method}", ""),
     ("Cameras", "{cameras_used} of {cameras} used, {rays_per_point:.1f} rays per point, incidence"
      " angles up to {incidence_deg:.0f} deg", "cameras"),
-    ("Cameras", "none; ray counts of 1 and incidence angles of 0 are placeholders", "no_cameras"),
+    ("Cameras", "none; ray counts of 1 and incidence angles of 0 are placeholders", "!cameras"),
     ("Unused", "{unused_count} see no corrected point: {unused}", "unused"),
-    ("Water", "{water}, refractive index {settings[index]:.6g}", "water"),
-    ("", "fitted: {water_fit[model]}{fit_points}, standard error {water_fit[sigma_level_m]:.3f} m",
+    ("Water", "{water}, refractive index {settings[index]:.6g}", ""),
+    ("", "fitted: {water_fit[model]}, standard error {water_fit[sigma_level_m]:.3f} m",
      "water_fit"),
-)  # fmt: skip
-_UNCERTAINTY: RowTable = (
+    ("", "accepted {water_fit[accepted]} of {water_fit[points]} points", "water_fit[points]"),
+    *_SHORELINE,
     ("Uncertainty", "{uncertainty[tvu_95_m][mean]:.3f} m at 95 % (predicted)", "uncertainty"),
     ("Uncertainty", "not known: without cameras there are no rays", "no_uncertainty"),
-    ("IHO S-44", "{order}", "uncertainty"),
+    ("Measured", "{measured[tvu_95_m]:.3f} m at 95 %, at {measured[count]:,} points of the bed",
+     "measured"),
+    ("IHO S-44", "{order}", "order"),
     ("Check", "{check}", "check"),
     ("Poses", "{poses[words]}", "poses"),
+    *_LABELLING,
 )  # fmt: skip
-_LABELLED: RowTable = (
-    _PART,
-    ("Class 40", "{submerged:,} points ({submerged_share})", "points"),
-    ("Class 41", "{water_surface:,} points within {settings[band]:g} m of the surface", "has_band"),
-    ("Reclassified", "{stale:,} former points of class 40 or 41: {stale_fate}", "stale"),
-    _NO_SURFACE,
-)  # fmt: skip
-_CLEANED: RowTable = (
-    ("Noise", "{noise:,} points ({noise_share}), {fate}", "points"),
-    ("", "{count:,} {reason}", "*flagged"),
-    ("Ignored", "{set_aside:,} points were withheld or noise before", "set_aside"),
-    ("Bed", "{submerged:,} submerged points tested against it", "submerged"),
-    ("Neighbours", "mean distance {near[mean]:.3f} m, standard deviation {near[sd]:.3f} m, limit"
-     " {near[limit]:.3f} m", "near"),
-    ("Not run", "{test}", "*tests_not_run"),
-)  # fmt: skip
-_GRIDDED: RowTable = (
-    _PART,
-    ("Raster", "{width:,} x {height:,} cells of {settings[resolution]:g} m{chosen},"
-     " {settings[method]}", "width"),
-    ("Values", "{what} {low:.4g} to {high:.4g}, mean {mean:.4g}{unit}", "what"),
-    ("Bounds", "x {bounds_m[0]:.10g} to {bounds_m[2]:.10g}, y {bounds_m[1]:.10g} to"
-     " {bounds_m[3]:.10g} m", "width"),
-    ("CRS", "{crs_name}; heights: {heights_name}", "width"),
-    ("Cells", "{cells:,} with points ({cells_share}), {points_per_cell:.1f} points each", "width"),
-    ("", "{filled:,} interpolated ({filled_share}), across holes up to {hole_m:.3g} m", "hole_m"),
-    ("", "{empty:,} empty ({empty_share})", "width"),
-    ("Hillshade", "{hillshade}", "hillshade"),
-    ("Counts", "{counts}", "counts"),
-)  # fmt: skip
-_CALMED: RowTable = (
-    ("Registered", "by {corners:,} corners with a median scatter of {scatter_px:.2f} px; the camera"
-     " moved by up to {moved_px:.1f} px", "corners"),
-    ("Registered", "no: the camera stood still", "is_still"),
-    ("Spread", "median {spread:.1f} grey values: {spread_file}", "frames"),
-    ("Water", "{found.waves} waves; slopes {found.slope_deg:.2f} deg rms, {percent:.0f} % of them"
-     " explained", "found"),
-    ("", "heights {height_cm:.1f} cm rms, standard error {sigma_cm:.1f} cm: {found.folder}",
-     "found"),
-)  # fmt: skip
-_MAPPED: RowTable = (
-    ("Mapping", "{mapping}, nodes every {spacing_px} px, largest shift {largest_shift_px:.1f} px",
-     "images"),
-    ("Black", "{black_percent:.1f} % of the pixels: no ground, occluded, or outside the image",
-     "images"),
-    ("Skipped", "{done_before:,} images, already done", "done_before"),
-    ("Ground", "{dsm}", "dsm"),
-    ("Water", "{water}, refractive index {refractive_index:g}", "water"),
-)  # fmt: skip
-_REBUILT: RowTable = (
-    ("Result", "{verdict}: the last round moved the bed by {less} than {threshold_m:.3f} m on"
-     " average", "rebuild"),
-    ("Cloud", "{cloud}", "cloud"),
-    ("Compared", "{compared}", "compared"),
-)  # fmt: skip
-_ORTHO: RowTable = (
-    ("Raster", "{width:,} x {height:,} cells of {resolution_m:g} m", "width"),
-    ("Covered", "{covered:.1f} % of the DSM {dsm}", "width"),
-    ("Images", "{images}, {traced}", "images"),
-)  # fmt: skip
-_FATE = {"withhold": "not moved, withheld", "keep": "not moved", "drop": "dropped"}
+_TABLES: dict[str, tuple[str, RowTable]] = {
+    "correct": ("Corrected {input} -> {output}      {points:,} points in {seconds:.1f} s",
+                _CORRECTED),
+    "label": ("Labelled {input} -> {output}      {points:,} points in {seconds:.1f} s", (
+        *_PART,
+        ("Class 40", "{submerged:,} points ({submerged:of points})", ""),
+        ("Class 41", "{water_surface:,} points within {settings[band]:g} m of the surface",
+         "settings[band]"),
+        ("Reclassified", "{stale:,} former points of class 40 or 41:"
+         " {settings[reset]:?class 1|unchanged; --reset sets them to class 1}", "stale"),
+        _NO_SURFACE,
+        *_LABELLING,
+        ("Water", "{water}", ""),
+    )),
+    "clean": ("Cleaned {input} -> {output}      {points:,} points in {seconds:.1f} s", (
+        ("Noise", "{noise:,} points ({noise:of points}), {dropped:?dropped|class 7, withheld}", ""),
+        ("", "{count:,} {name}", "*reasons"),
+        ("Ignored", "{set_aside:,} points were withheld or noise before", "set_aside"),
+        ("Bed", "{submerged:,} submerged points tested against it", "submerged"),
+        ("Neighbours", "mean distance {neighbour_distance_m[mean]:.3f} m, standard deviation"
+         " {neighbour_distance_m[sd]:.3f} m, limit {neighbour_distance_m[limit]:.3f} m",
+         "neighbour_distance_m"),
+        ("Not run", "{text}", "*not_run"),
+    )),
+    "dsm": ("Gridded {input} -> {output}      {points_used:,} of {points:,} points"
+            " ({is_bed:?bed, class 40|land and bed}) in {seconds:.1f} s", (
+        *_PART,
+        ("Raster", "{width:,} x {height:,} cells of {settings[resolution]:g} m"
+         "{is_chosen:?, chosen for 2 to 4 points each|}, {settings[method]}", ""),
+        ("Values", "{what} {values[min]:.4g} to {values[max]:.4g}, mean {values[mean]:.4g}"
+         "{is_tvu:? m at 95 % (predicted)|}", "values"),
+        ("Bounds", "x {bounds_m[0]:.10g} to {bounds_m[2]:.10g}, y {bounds_m[1]:.10g} to"
+         " {bounds_m[3]:.10g} m", ""),
+        ("CRS", "{crs_name}; heights: {heights_name}", ""),
+        ("Cells", "{cells:,} with points ({cells:of all}), {points_per_cell:.1f} points each", ""),
+        ("", "{filled:,} interpolated ({filled:of all}), across holes up to {hole_m:.3g} m",
+         "hole_m"),
+        ("", "{empty:,} empty ({empty:of all})", ""),
+        ("Hillshade", "{hillshade}", "hillshade"),
+        ("Counts", "{counts}", "counts"),
+    )),
+    "calm": ("Combined {input} -> {output}      {frames} frames of {columns:,} x {rows:,} pixels in"
+             " {seconds:.1f} s", (
+        ("Registered", "by {corners:,} corners with a median scatter of {scatter_px:.2f} px; the"
+         " camera moved by up to {moved_px:.1f} px", "corners"),
+        ("Registered", "no: the camera stood still", "!corners"),
+        ("Spread", "median {spread:.1f} grey values: {spread_file}", ""),
+        ("Water", "{water[waves]} waves; slopes {water[slope_deg]:.2f} deg rms,"
+         " {water[explained]:.0f %} of them explained", "water"),
+        ("", "heights {water[height_m]:.1f cm} rms, standard error {water[sigma_m]:.1f cm}:"
+         " {water[folder]}", "water"),
+    )),
+    "photos": ("Mapped {mapped:,} images in {seconds:.1f} s", (
+        ("Pixels", "{megapixels:.1f} million", "megapixels"),
+        ("Mapping", "{mapping}, nodes every {spacing_px} px, largest shift"
+         " {largest_shift_px:.1f} px", ""),
+        ("Black", "{black_share:.1f %} of the pixels: no ground, occluded, or outside the image",
+         ""),
+        ("Skipped", "{done_before:,} images, already done", "done_before"),
+        ("Ground", "{dsm}", ""),
+        ("Water", "{water}, refractive index {refractive_index:g}", ""),
+    )),
+    "rebuild": ("Rebuilt in {count} rounds", (
+        ("Result", "{settled:?settled|not settled}: the last round moved the bed by"
+         " {settled:?less|more} than {threshold_m:.3f} m on average", ""),
+        ("Cloud", "{last[cloud]}", ""),
+        ("Compared", "{compared}", "compared"),
+    )),
+    "ortho": ("Orthophoto {output} in {seconds:.1f} s", (
+        ("Raster", "{width:,} x {height:,} cells of {resolution_m:g} m", ""),
+        ("Covered", "{covered_share:.1f %} of the DSM {dsm}", ""),
+        ("Images", "{images}, traced through water {water}", "water"),
+        ("Images", "{images}, without refraction", "is_dry"),
+    )),
+}  # fmt: skip
+"""By command: the line that says what was done, and the rows below it."""
+
+
+class _Words(Formatter):
+    """Formats texts with values by name, see the docstring of the module."""
+
+    def __init__(self, values: Plain) -> None:
+        self.values = values
+
+    def known(self, name: str) -> Any:
+        """Return a value by name, such as ``transfer[points]``; None if it is not known."""
+        try:
+            return self.get_field(name, (), self.values)[0] if name else True
+        except (KeyError, TypeError):
+            return None
+
+    def written(self, text: str, more: Plain) -> str:
+        """Return a text with all its values, and `more` of them."""
+        return self.vformat(text, (), self.values | more)
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        """Return a value as text: a dash for None, and the numbers of a list one by one."""
+        if format_spec.startswith("?"):
+            return format_spec[1:].split("|")[0 if value else 1]
+        if isinstance(value, list | tuple):
+            return ", ".join(self.format_field(one, format_spec) for one in value)
+        if value is None:
+            return "-"
+        if format_spec.startswith("of "):
+            return share(value, self.values[format_spec[3:]])
+        number, space, unit = format_spec.partition(" ")
+        return str(format(100.0 * value if unit else value, number)) + space + unit
+
+
+def filled(table: RowTable, values: Plain) -> Rows:
+    """Return labels and texts of the rows of a table whose values are known."""
+    words, rows = _Words(values), Rows()
+    for label, text, needs in table:
+        for one in _repeats(needs, words.known(needs.lstrip("*!"))):
+            rows.append((words.written(label, one), words.written(text, one)))
+    return rows
+
+
+def _repeats(needs: str, needed: Any) -> Iterator[Plain]:
+    """Yield the further values of each time that a row is shown."""
+    if not needs.startswith("*"):
+        if needed is not None and bool(needed) != needs.startswith("!"):
+            yield {}
+    elif isinstance(needed, dict):
+        for name, count in needed.items():
+            if count:
+                yield {"name": name.replace("_", " "), "count": count}
+    else:
+        for one in needed or ():
+            yield one if isinstance(one, dict) else {"text": one}
 
 
 def aligned(head: str, rows: Iterable[tuple[str, str]], notes: Iterable[object] = ()) -> str:
     """Return a summary: a line that says what was done, labelled rows, and notes."""
     lines = [head, *(f"  {label:<13} {text}" for label, text in rows)]
     return "\n".join([*lines, *(f"Note: {note}" for note in notes)])
-
-
-class _Numbers(Formatter):
-    """Formats None as a dash, and the numbers of a list one by one."""
-
-    def format_field(self, value: Any, format_spec: str) -> str:
-        """Return a value as text."""
-        if isinstance(value, list):
-            return ", ".join(self.format_field(one, format_spec) for one in value)
-        return "-" if value is None else str(format(value, format_spec))
-
-
-def filled(table: RowTable, values: Plain) -> Rows:
-    """Return labels and texts of the rows of a table whose values are known."""
-    rows: Rows = []
-    for label, text, needs in table:
-        needed = values.get(needs)
-        once: list[Plain] = [{}] if needed not in (None, 0, "", {}, ()) else []
-        for one in values[needs[1:]] if needs.startswith("*") else once:
-            row = (_Numbers().vformat(words, (), values | one) for words in (label, text))
-            rows.append((next(row), next(row)))
-    return rows
-
-
-def summary_text(summary: Summary) -> str:
-    """Return the summary of a correction."""
-    return aligned(_head("Corrected", summary), summary_rows(summary), summary.told)
-
-
-def summary_rows(s: Summary) -> Rows:
-    """Return the facts of a correction, for the terminal and the report page."""
-    fit, made = s.water_fit or {}, s.made
-    method = str(s.settings["method"])
-    if made is not None and made.get("made_of", "") not in ("", method):
-        sure = f"detected, confidence {100.0 * made['confidence']:.0f} %"
-        method = f"{made['method']}, {made['made_of']} ({sure})"
-    elif made is not None and "made_of" not in made:
-        method = f"{made['method']}. {made['because']}"
-    check = ""
-    if s.fit is not None and s.cameras:
-        check = "cameras match the cloud"
-        if s.fit["doubts"]:
-            check = "cameras may not match the cloud; see the warnings"
-        elif not s.fit["fits"]:
-            check = "cameras and cloud could not be tested"
-    values = vars(s) | {
-        "part_words": _part_words(s.part),
-        "fate": _FATE[s.settings["uncorrected"]],
-        "not_transferred": (s.transfer or {}).get("not_transferred"),
-        "submerged_share": share(s.submerged, s.points),
-        "corrected_words": "all corrected" if s.corrected == s.submerged
-        else f"{s.corrected:,} corrected ({share(s.corrected, s.submerged)})",
-        "not_corrected": [{"reason": why, "count": n} for why, n in s.uncorrected.items() if n],
-        "unsure_share": share(s.unsure or 0, s.corrected),
-        "method": method,
-        "rays_per_point": s.rays / max(s.corrected, 1),
-        "no_cameras": not s.cameras,
-        "unused_count": len(s.cameras_unused),
-        "unused": ", ".join(s.cameras_unused[:SHOWN_NAMES])
-        + (", ..." if len(s.cameras_unused) > SHOWN_NAMES else ""),
-        "fit_points": ", {accepted} of {points} points".format(**fit) if "points" in fit else "",
-        "no_uncertainty": s.uncertainty is None and s.settings["dimensions"] == "all"
-        and not s.cameras,
-        "order": order_sentence(s),
-        "check": check,
-    }  # fmt: skip
-    rows = filled(_CORRECTED, values) + shoreline_rows(s.shoreline)
-    return [*rows, *filled(_UNCERTAINTY, values), *_labelling_rows(s.labelling)]
-
-
-def _head(verb: str, s: Any, points: str = "") -> str:
-    points = points or f"{s.points:,}"
-    return f"{verb} {s.input} -> {s.output}      {points} points in {s.seconds:.1f} s"
-
-
-def _part_words(part: Plain | None) -> str:
-    """Return which part of the points was read, and by which bounds."""
-    if part is None:
-        return ""
-    box, step = part["bounds"], part["read_resolution"]
-    words = "" if box is None else " within " + ",".join(f"{one:.12g}" for one in box)
-    words += "" if step is None else f" at a resolution of {step:g} m"
-    return f"a part of {part['of']:,} points,{words}"
-
-
-def shoreline_rows(found: Plain | None) -> Rows:
-    """Return the length and the standard error of a shoreline, where one was written."""
-    return [] if found is None else filled(_SHORELINE, found | {"is_empty": not found["lines"]})
-
-
-def _labelling_rows(labelling: Plain | None) -> Rows:
-    """Return what stays land although it lies below the surface."""
-    if labelling is None:
-        return []
-    pools = labelling["separate"] or {}
-    values = {"pools": pools if pools.get("pools") else None, "no_pools": pools.get("pools") == 0}
-    return filled(_LABELLING, labelling | values)
 
 
 def share(part: int, whole: int) -> str:
@@ -246,52 +234,121 @@ def share(part: int, whole: int) -> str:
     return f"{percent:.0f} %" if percent >= 10 or percent == 0 else f"{percent:.1f} %"
 
 
-def formal_words(s: Summary) -> str:
-    """Return what the standard errors of a run rest on."""
-    if s.settings["method"] == "regression":
-        return "the scatter of check depths about the line, where it was not fitted to them"
-    fitted = None if s.water_fit is None else s.water_fit["sigma_level_m"]
-    known = s.uncertainty or {}
-    found, poses_m = known.get("of_cloud"), known.get("poses_m")
-    cloud = "" if found is None else (
-        f". Estimated from the cloud: matching noise {found['scatter_m']:.3f} m, model uncertainty"
-        f" {100.0 * found['per_depth']:.1f} % of depth"
-    )  # fmt: skip
-    poses = "" if poses_m is None else f". Adjusted poses: {poses_m:.3f} m"
-    return f"Assumed standard deviations: {budget_words(s.settings, fitted)}{cloud}{poses}"
+def text_of(command: str, found: Figures) -> str:
+    """Return the summary of a command as text."""
+    if isinstance(found, Summary):
+        return summary_text(found)
+    s = found.as_dict()
+    if command == "dsm":
+        s |= {
+            "all": s["width"] * s["height"], "is_bed": s["settings"]["surface"] == "bed",
+            "is_chosen": s["resolution_is"] == "chosen", "is_tvu": s["what"] == "uncertainty",
+            "crs_name": s["crs"] or "the cloud states none",
+            "heights_name": s["heights"] or "the cloud states no vertical datum",
+        }  # fmt: skip
+    elif command == "photos":
+        s["mapped"] = s["images"] - s["done_before"]
+    elif command == "rebuild":
+        s |= {"count": len(s["rounds"]), "last": s["rounds"][-1]}
+    elif command == "ortho":
+        s["is_dry"] = s["water"] is None
+    head, rows = _TABLES[command]
+    return aligned(_Words(s).written(head, {}), filled(rows, s))
+
+
+def summary_text(summary: Summary) -> str:
+    """Return the summary of a correction."""
+    head = _Words(vars(summary)).written(_TABLES["correct"][0], {})
+    return aligned(head, summary_rows(summary), summary.told)
+
+
+def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
+    """Return the facts of a correction, for the terminal and the report page.
+
+    `measured` is the vertical uncertainty against a reference, `Comparison.tvu` in plain values.
+    """
+    made, unused, check = s.made, s.cameras_unused, ""
+    method = str(s.settings["method"])
+    if made is not None and made.get("made_of", "") not in ("", method):
+        sure = f"detected, confidence {100.0 * made['confidence']:.0f} %"
+        method = f"{made['method']}, {made['made_of']} ({sure})"
+    elif made is not None and "made_of" not in made:
+        method = f"{made['method']}. {made['because']}"
+    if s.fit is not None and s.cameras:
+        check = "cameras match the cloud"
+        if s.fit["doubts"]:
+            check = "cameras may not match the cloud; see the warnings"
+        elif not s.fit["fits"]:
+            check = "cameras and cloud could not be tested"
+    fates = {"withhold": "not moved, withheld", "keep": "not moved", "drop": "dropped"}
+    corrected = f"{s.corrected:,} corrected ({share(s.corrected, s.submerged)})"
+    return filled(_CORRECTED, vars(s) | {
+        "fate": fates[s.settings["uncorrected"]],
+        "corrected_words": "all corrected" if s.corrected == s.submerged else corrected,
+        "method": method,
+        "rays_per_point": s.rays / max(s.corrected, 1),
+        "unused_count": len(unused),
+        "unused": ", ".join([*unused[:SHOWN_NAMES], *(["..."] if unused[SHOWN_NAMES:] else [])]),
+        "no_uncertainty": s.uncertainty is None and s.settings["dimensions"] == "all"
+        and not s.cameras,
+        "measured": measured,
+        "order": order_sentence(s, measured),
+        "check": check,
+    })  # fmt: skip
+
+
+def shoreline_rows(found: Plain | None) -> Rows:
+    """Return the length and the standard error of a shoreline, where one was written."""
+    return filled(_SHORELINE, {"shoreline": found})
 
 
 _BUDGET: RowTable = (
-    ("image", "{sigma_image:g} px", "settings"),
-    ("level", "{level:.3f} m{source}", "settings"),
-    ("index", "{sigma_index:g}", "settings"),
+    ("image", "{sigma_image:g} px", ""),
+    ("level", "{level:.3f} m{source}", ""),
+    ("index", "{sigma_index:g}", ""),
     ("tilt", "{sigma_tilt:g} deg", "sigma_tilt"),
     ("waves", "{sigma_waves:g} deg", "sigma_waves"),
     ("camera positions", "{sigma_centre:g} m", "sigma_centre"),
     ("attitude", "{sigma_attitude:g} deg", "sigma_attitude"),
-)  # fmt: skip
+)
 
 
-def budget_words(errors: Plain, level_from_fit: float | None = None) -> str:
-    """Return the standard deviations that were assumed, as ``image 0.5 px, level 0.020 m``.
+def formal_words(s: Summary) -> str:
+    """Return what the standard errors of a run rest on, as ``image 0.5 px, level 0.020 m`` ...
 
-    `errors` are the settings of a summary. Where the user stated none for the level, it is that of
-    a fit, if there was one.
+    Where the user stated no standard deviation of the level, it is that of a fit, if there was one.
     """
-    level, source = errors["sigma_level"], ""
+    if s.settings["method"] == "regression":
+        return "the scatter of check depths about the line, where it was not fitted to them"
+    level, source = s.settings["sigma_level"], ""
     if level is None:
-        level, source = LEVEL_M, " (assumed)"
-        if level_from_fit is not None and np.isfinite(level_from_fit):
-            level, source = level_from_fit, " (fitted)"
-    values = errors | {"level": level, "source": source, "settings": True}
-    return ", ".join(f"{name} {text}" for name, text in filled(_BUDGET, values))
+        fitted = (s.water_fit or {}).get("sigma_level_m")
+        is_fitted = fitted is not None and np.isfinite(fitted)
+        level, source = (fitted, " (fitted)") if is_fitted else (LEVEL_M, " (assumed)")
+    budget = filled(_BUDGET, s.settings | {"level": level, "source": source})
+    words = "Assumed standard deviations: " + ", ".join(f"{name} {text}" for name, text in budget)
+    known = s.uncertainty or {}
+    if (found := known.get("of_cloud")) is not None:
+        words += (
+            f". Estimated from the cloud: matching noise {found['scatter_m']:.3f} m, model"
+            f" uncertainty {100.0 * found['per_depth']:.1f} % of depth"
+        )
+    poses_m = known.get("poses_m")
+    return words if poses_m is None else f"{words}. Adjusted poses: {poses_m:.3f} m"
 
 
-def order_sentence(s: Summary) -> str:
-    """Return which order of S-44 the standard errors allow, or why none is claimed."""
-    if s.uncertainty is None or s.why_no_order:
+def order_sentence(s: Summary, measured: Plain | None = None) -> str:
+    """Return which order of S-44 the errors of a run allow, or why none is claimed.
+
+    `measured` is `Comparison.tvu` in plain values; without it the standard errors decide. Empty
+    where neither is known.
+    """
+    if measured is not None and measured["count"] < FEWEST:
+        return f"fewer than {FEWEST} points were measured, too few for an order"
+    if measured is None and s.uncertainty is not None and s.why_no_order:
         return f"no order is claimed: {s.why_no_order}"
-    return tvu_sentence(s.uncertainty)
+    known = measured or s.uncertainty
+    return "" if known is None else tvu_sentence(known)
 
 
 def tvu_sentence(uncertainty: Plain) -> str:
@@ -303,101 +360,3 @@ def tvu_sentence(uncertainty: Plain) -> str:
         return f"fewer than 95 % of the points meet any order of IHO S-44 ({within:.0%} order 2)"
     name = f"order {order}" if order[0].isdigit() else f"{order} Order"
     return f"{100.0 * shares[order]:.4g} % of the points are within the TVU of IHO S-44 {name}"
-
-
-def uncertainty_sentence(s: Summary, measured: Plain | None = None) -> str:
-    """Return TVU and order of S-44 of a run: as `measured` against a reference, else as predicted.
-
-    `measured` is `Comparison.tvu` in plain values. Empty where neither is known.
-    """
-    mean = "" if s.uncertainty is None else f"{s.uncertainty['tvu_95_m']['mean']:.3f} m on average"
-    if measured is None:
-        return f"TVU at 95 % {mean}, predicted; {order_sentence(s)}" if mean else ""
-    few = f"fewer than {FEWEST} points, too few for an order of IHO S-44"
-    return (
-        f"TVU at 95 %{f' predicted {mean},' if mean else ''} measured"
-        f" {measured['tvu_95_m']:.3f} m at {measured['count']:,} points of the bed;"
-        f" {few if measured['count'] < FEWEST else tvu_sentence(measured)}"
-    )
-
-
-def labelling_text(s: Figures) -> str:
-    """Return the summary of a labelling."""
-    values = vars(s) | {
-        "part_words": _part_words(s.part),
-        "submerged_share": share(s.submerged, s.points),
-        "has_band": s.settings["band"] > 0.0,
-        "stale_fate": "class 1" if s.settings["reset"] else "kept; --reset sets them to class 1",
-    }
-    rows = [*filled(_LABELLED, values), *_labelling_rows(s.labelling), ("Water", s.water)]
-    return aligned(_head("Labelled", s), rows)
-
-
-def cleaning_text(s: Figures) -> str:
-    """Return the summary of a cleaning."""
-    values = vars(s) | {
-        "noise_share": share(s.noise, s.points),
-        "fate": "dropped" if s.dropped else "class 7, withheld",
-        "near": s.neighbour_distance_m,
-        "flagged": [{"reason": k.replace("_", " "), "count": n} for k, n in s.reasons.items() if n],
-        "tests_not_run": [{"test": test} for test in s.not_run],
-    }
-    return aligned(_head("Cleaned", s), filled(_CLEANED, values))
-
-
-def dsm_text(s: Figures) -> str:
-    """Return the summary of a DSM."""
-    total = s.width * s.height
-    low, mean, high = (s.values.get(name, np.nan) for name in ("min", "mean", "max"))
-    values = s.as_dict() | {
-        "part_words": _part_words(s.part),
-        "low": low, "mean": mean, "high": high,
-        "chosen": ", chosen for 2 to 4 points each" if s.resolution_is == "chosen" else "",
-        "unit": " m at 95 % (predicted)" if s.what == "uncertainty" else "",
-        "crs_name": s.crs or "the cloud states none",
-        "heights_name": s.heights or "the cloud states no vertical datum",
-        "cells_share": share(s.cells, total),
-        "filled_share": share(s.filled, total),
-        "empty_share": share(s.empty, total),
-    }  # fmt: skip
-    surface = {"all": "land and bed", "bed": "bed, class 40"}[s.settings["surface"]]
-    points = f"{s.points_used:,} of {s.points:,} ({surface})"
-    return aligned(_head("Gridded", s, points), filled(_GRIDDED, values))
-
-
-def calm_text(s: Figures) -> str:
-    """Return the summary of an image through calm water."""
-    values = vars(s) | {"is_still": not s.corners, "found": s.water}
-    if s.water is not None:
-        values |= {"percent": 100 * s.water.explained, "height_cm": 100 * s.water.height_m,
-                   "sigma_cm": 100 * s.water.sigma_m}  # fmt: skip
-    head = (
-        f"Combined {s.input} -> {s.output}      {s.frames} frames of {s.columns:,} x {s.rows:,}"
-        f" pixels in {s.seconds:.1f} s"
-    )
-    return aligned(head, filled(_CALMED, values))
-
-
-def photos_text(s: Figures) -> str:
-    """Return the summary of photographs without water."""
-    head = f"Mapped {s.images - s.done_before:,} images in {s.seconds:.1f} s"
-    if s.seconds and s.images > s.done_before:
-        head += f" ({s.megapixels / s.seconds:.1f} Mpx/s)"
-    return aligned(head, filled(_MAPPED, vars(s) | {"black_percent": 100.0 * s.black_share}))
-
-
-def rounds_text(s: Figures) -> str:
-    """Return why the rounds ended, and where their clouds and the comparison are."""
-    values = vars(s) | {
-        "verdict": "settled" if s.settled else "not settled",
-        "less": "less" if s.settled else "more",
-        "cloud": s.rounds[-1].cloud,
-    }
-    return aligned(f"Rebuilt in {len(s.rounds)} rounds", filled(_REBUILT, values))
-
-
-def ortho_text(s: Figures) -> str:
-    """Return the summary of an orthophoto."""
-    traced = "without refraction" if s.water is None else f"traced through water {s.water}"
-    values = vars(s) | {"covered": 100 * s.covered_share, "traced": traced}
-    return aligned(f"Orthophoto {s.output} in {s.seconds:.1f} s", filled(_ORTHO, values))

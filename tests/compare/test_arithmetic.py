@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from pcfix.compare.figures import parse_line, section_along
 from pcfix.compare.match import heights_at
-from pcfix.compare.sections import parse_line, section_along
 from pcfix.compare.statistics import binned, fit_line, statistics_of
 
 pytestmark = pytest.mark.quick

@@ -24,7 +24,7 @@ from scipy.stats import linregress
 import pcfix
 from pcfix.lens.rotations import from_yaw_pitch_roll
 from pcfix.model import Lens, Views
-from pcfix.simulate.sight import starts
+from pcfix.simulate.scene import starts
 from pcfix.simulate.tracing import project, triangulate
 from tests.utils.bed_rays import piercing_points
 

@@ -12,7 +12,7 @@ import pcfix
 from pcfix.compare.statistics import tvu_of
 from pcfix.refract.tally import UncertaintyTally
 from pcfix.report.summary import Summary
-from pcfix.report.text import FEWEST, formal_words, summary_rows, tvu_sentence, uncertainty_sentence
+from pcfix.report.text import FEWEST, formal_words, order_sentence, summary_rows, tvu_sentence
 
 # Edition 6, table 1: the largest TVU at the surface and at 40 m, m, by hand
 BY_HAND = {
@@ -65,18 +65,16 @@ def summary(tmp_path_factory):
 
 
 def test_measured_replaces_predicted(summary):
-    assert summary.why_no_order in uncertainty_sentence(summary)
-    predicted = uncertainty_sentence(Summary(**vars(summary) | {"poses": {"absorbed": False}}))
-    assert "predicted" in predicted and "Exclusive Order" in predicted
+    assert summary.why_no_order in order_sentence(summary)
+    predicted = order_sentence(Summary(**vars(summary) | {"poses": {"absorbed": False}}))
+    assert "Exclusive Order" in predicted
     far = tvu_of(np.full(100, 0.3), np.full(100, 2.0)).as_dict()
-    found = uncertainty_sentence(summary, far)
-    mean = summary.uncertainty["tvu_95_m"]["mean"]
-    assert f"predicted {mean:.3f} m on average, measured 0.300 m at 100 points" in found
-    assert "order 1a/1b" in found and "Exclusive" not in found
-    unknown = Summary(**vars(summary) | {"uncertainty": None})
-    assert "predicted" not in uncertainty_sentence(unknown, far)
+    rows = dict(summary_rows(summary, far))
+    assert rows["Uncertainty"].endswith("(predicted)")
+    assert rows["Measured"].startswith("0.300 m at 95 %, at 100 points")
+    assert "order 1a/1b" in rows["IHO S-44"] and "Exclusive" not in rows["IHO S-44"]
     few = tvu_of(np.full(FEWEST - 1, 0.01), np.full(FEWEST - 1, 2.0)).as_dict()
-    assert f"fewer than {FEWEST} points, too few for an order" in uncertainty_sentence(summary, few)
+    assert f"fewer than {FEWEST} points" in order_sentence(summary, few)
 
 
 def test_model_uncertainty(summary):

@@ -22,9 +22,17 @@ from pcfix.model import (
     Views,
     WaterPlane,
 )
-from pcfix.simulate.scene import ORIGIN_M, cameras_in_world, lay_out, plane_in_world, points_on
+from pcfix.simulate.scene import (
+    ORIGIN_M,
+    Sight,
+    Site,
+    cameras_in_world,
+    lay_out,
+    plane_in_world,
+    points_on,
+    see,
+)
 from pcfix.simulate.settings import SceneSettings
-from pcfix.simulate.sight import Sight, Site, see
 
 _CANDIDATES = 4000
 _LEAST_TIES = 8

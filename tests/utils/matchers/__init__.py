@@ -8,9 +8,8 @@ from functools import lru_cache
 import numpy as np
 
 from pcfix.model import Views
-from pcfix.simulate.scene import Scene, lay_out, points_on, scene_of, simulate_scene
+from pcfix.simulate.scene import Scene, lay_out, points_on, scene_of, see, simulate_scene, starts
 from pcfix.simulate.settings import SceneSettings
-from pcfix.simulate.sight import see, starts
 from pcfix.simulate.terrain import Terrain
 from tests.utils.matchers.depth_maps import fuse_depth_maps, keep_single_maps, stereo_models
 from tests.utils.matchers.pairs import SAMPLE, TIES, match_pairs, neighbour_table, openmvs_partners

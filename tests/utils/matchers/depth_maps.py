@@ -32,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.model import Cameras, FloatArray, IntArray, Lens
-from pcfix.simulate.sight import Sight
+from pcfix.simulate.scene import Sight
 from pcfix.simulate.tracing import piercing_points_of_planes, project, rotations_of
 from tests.utils.bed_rays import bed_points
 from tests.utils.matchers.pairs import Partners, rows_of

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.model import FloatArray, IntArray
-from pcfix.simulate.sight import Sight, starts
+from pcfix.simulate.scene import Sight, starts
 from pcfix.simulate.tracing import rotations_of, triangulate
 
 SAMPLE = 1000
