@@ -25,7 +25,6 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
@@ -34,7 +33,7 @@ import numpy as np
 from pcfix.errors import PcfixError, SettingError, show_warning
 from pcfix.io.pdal import NAME, OUTCOME, Dimensions, PdalCloud, Results, metadata_of
 from pcfix.model import LOW_NOISE, WaterDimension, WaterSurface
-from pcfix.options.declare import Option, OptionSet, named, options_of
+from pcfix.options.declare import OptionSet, named, options_of
 from pcfix.options.shared import PartOptions
 
 Set = TypeVar("Set", bound=OptionSet)
@@ -219,31 +218,16 @@ def _options(namespace: dict[str, Any], kind: type[Set]) -> Set:
     given = {name.replace("-", "_"): value for name, value in given.items()}
     elsewhere = {"port", *(one.name for one in options_of(PartOptions))}  # readers choose points
     known = {one.name: one for one in options_of(kind) if one.name not in elsewhere}
-    values = {
-        name: _converted(known[name], value)
-        for name, value in named(given, known.values(), "pdalargs").items()
-        if value is not None
-    }
-    options = kind(**values)
+    values = named(given, known.values(), "pdalargs")
+    for name, value in values.items():
+        if known[name].type is Any and isinstance(value, list | dict | bool):
+            sentence = f"pdalargs: {name} must be a text or a number, not {json.dumps(value)}."
+            raise SettingError("option.type", sentence, option=name, value=value)
+    options = kind(**{name: value for name, value in values.items() if value is not None})
     if missing := options.missing():
         sentence = f"pdalargs: the option '{missing.name}' is needed."
         raise SettingError("option.missing", sentence, option=missing.name)
     return options
-
-
-def _converted(one: Option, value: Any) -> Any:
-    """Return a value of JSON as the options take it; numbers may be text, and a list one value."""
-    if one.repeats and not isinstance(value, list):
-        return (value,)
-    if isinstance(value, str) and one.parse is None and {int, float} & {*one.kinds}:
-        with suppress(ValueError):
-            return float(value)
-    if isinstance(value, int | float) and isinstance(one.default, tuple):
-        return str(value)
-    if one.type is Any and isinstance(value, list | dict | bool):
-        sentence = f"pdalargs: {one.name} must be a text or a number, not {json.dumps(value)}."
-        raise SettingError("option.type", sentence, option=one.name, value=value)
-    return value
 
 
 def _chunks(cloud: PdalCloud, water: WaterSurface | None) -> Iterator[tuple[slice, Points]]:

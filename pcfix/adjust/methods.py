@@ -35,7 +35,7 @@ from pcfix.adjust.result import Adjusted
 from pcfix.adjust.solve import reduced_at, solver
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
 from pcfix.model import Cameras, FloatArray, GroundControl, IntArray, TiePoints, WaterSurface
-from pcfix.options.survey import AdjustRules
+from pcfix.options.correct import AdjustRules
 from pcfix.refract.choice import views_in_frame
 from pcfix.water.surface import surface_above
 

@@ -1,4 +1,4 @@
-"""Options as flags of the command line, progress, and what is printed at the end."""
+"""Options as flags of the command line; progress; the printed summary."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Command(NamedTuple):
         return len(options_of(self.kind)) > MANY
 
     def flat(self, *, everything: bool = False) -> Callable[..., None]:
-        """Return the command as cyclopts takes it: a function with a keyword for each option."""
+        """Return a function with a keyword for each option, as cyclopts reads it."""
         every, options = everything or not self.has_many, options_of(self.kind)
         hints, shown = get_type_hints(self.call), []
         for name, one in inspect.signature(self.call).parameters.items():
@@ -57,16 +57,14 @@ class Command(NamedTuple):
             elif name == "quiet":
                 shown.append(one.replace(annotation=Annotated[bool, _QUIET], default=False))
             else:
-                asked = Parameter(help=self.helps[name], negative=())
-                if name in ("jobs", "stage"):
-                    asked = Parameter.combine(asked, Parameter(group=_GROUPS[Panel.OUTPUT]))
-                shown.append(one.replace(annotation=Annotated[hints[name], asked]))
+                place = Parameter(help=self.helps[name], negative=())
+                shown.append(one.replace(annotation=Annotated[hints[name], place]))
 
         def call(*places: Any, **given: Any) -> None:
             names = [one.name for one in options if one.name in given]
             asked = self.kind(**{name: given.pop(name) for name in names})
             missing = asked.missing()
-            if missing and given.get("config") is None:  # an earlier run says the rest
+            if missing and given.get("config") is None:  # run.json has the rest
                 other = f", or --{missing.instead}" if hasattr(asked, missing.instead) else ""
                 raise UsageError(f"{missing.flag} is needed{other}")
             quiet = {"quiet": given.pop("quiet", False)} if "quiet" in hints else {}

@@ -22,8 +22,8 @@ from pcfix.io.gnss_positions import read_gnss
 from pcfix.lens.frames import cameras_in_sight, footprint
 from pcfix.lens.imaging import unproject
 from pcfix.model import Cameras, FloatArray, Lens, TiePoints, WaterDimension
+from pcfix.options.correct import CamerasCheckOptions
 from pcfix.options.declare import File, taken
-from pcfix.options.survey import CamerasCheckOptions
 from pcfix.report.page import (
     AFTER,
     WATER,

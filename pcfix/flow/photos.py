@@ -32,7 +32,7 @@ from pcfix.io.rasters import filled_heights, open_raster
 from pcfix.io.water import rasters_of_images, read_water_raster
 from pcfix.model import Cameras, FloatArray, Lens, WaterDimension
 from pcfix.options.declare import File, taken
-from pcfix.options.photos import PhotosOptions
+from pcfix.options.steps import PhotosOptions
 from pcfix.photos.mapping import Ground, Photo, Scene, exact, ground_seen, nodes_of, paper, resample
 from pcfix.running import current, threads
 from pcfix.sums import Figures

@@ -22,9 +22,9 @@ from pcfix.io.files import belonging, file_state, files_in, read_json, refusing,
 from pcfix.io.rasters import open_raster
 from pcfix.io.tiles import Tiles, cloud_of, inputs_of, open_cloud, tiles_from, tiles_of
 from pcfix.model import Cameras, WaterSurface
+from pcfix.options.correct import RunOptions
 from pcfix.options.declare import named, options_of
 from pcfix.options.steps import DistanceOptions
-from pcfix.options.survey import RunOptions
 from pcfix.version import __version__
 from pcfix.water.index import with_index
 

@@ -37,10 +37,9 @@ from pcfix.io.members import FILE as MEMBERS
 from pcfix.io.tiles import Tiles, check_one_file
 from pcfix.libraries import analysis_library
 from pcfix.model import WaterDimension
-from pcfix.options.correct import CorrectOptions
+from pcfix.options.correct import AdjustOptions, CorrectOptions, RunOptions
 from pcfix.options.declare import File, options_of, taken
 from pcfix.options.steps import CleanOptions, DistanceOptions
-from pcfix.options.survey import AdjustOptions, RunOptions
 from pcfix.report.adjustment import adjustment_sentence, all_notes
 from pcfix.report.comparison import signed_statistics
 from pcfix.report.summary import Summary

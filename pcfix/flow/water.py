@@ -12,8 +12,8 @@ from pcfix.flow.surfaces import check_shoreline, find_surface, sample_of, view_o
 from pcfix.grid.shoreline import NearWater
 from pcfix.io.files import check_input
 from pcfix.model import FloatArray, WaterDimension
+from pcfix.options.correct import WaterCheckOptions
 from pcfix.options.declare import taken
-from pcfix.options.survey import WaterCheckOptions
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, draw_cloud, label_plan, new_figure
 from pcfix.report.text import Plain, RowTable, aligned, filled, shoreline_rows
 from pcfix.water.auto import WaterProposal

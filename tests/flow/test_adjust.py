@@ -9,7 +9,7 @@ import pytest
 import pcfix
 from pcfix.flow.adjust import adjust_cameras, correct_words
 from pcfix.lens.imaging import straight_images
-from pcfix.options.survey import AdjustOptions
+from pcfix.options.correct import AdjustOptions
 from pcfix.running import threads
 from tests.utils.adjust_files import IMAGE_PX, write_block
 from tests.utils.codes import refused

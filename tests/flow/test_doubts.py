@@ -195,7 +195,7 @@ def test_list_of_half(tmp_path):
     write_vis(tmp_path / "fused.ply.vis", images)
     write_ply(tmp_path / "fused.ply", scene.apparent_xyz[rows], position="double")
     path = as_file(tmp_path / "cloud.las", scene.apparent_xyz, 0)
-    given = {"cameras": scene.cameras, "water": scene.water, "exact": True}
+    given = {"cameras": scene.cameras, "water": scene.water}
     out = {}
     for name, views in (("half", tmp_path / "fused.ply.vis"), ("none", None)):
         summary = pcfix.correct_file(path, tmp_path / f"{name}.las", views=views, **given)
