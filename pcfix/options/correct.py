@@ -164,7 +164,7 @@ class RefractionOptions(BudgetOptions, MethodOptions, panel=Panel.OUTPUT):
 
     unsure: Unsure = option("keep", with_cameras=True)
     """Corrected points whose rays all have incidence angles above 35 deg, without a view list: keep
-    them as they are, or flag them as withheld."""
+    them, or flag them as withheld."""
     deep: bool = option(False, panel=Panel.WATER)
     """Accept depths of more than 60 m, which usually mean a wrong water level."""
 

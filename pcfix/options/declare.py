@@ -87,6 +87,8 @@ class Option(NamedTuple):
         words = self._text.partition(" [default: ")[2].removesuffix("]")
         if words or self.default in (None, ()) or self.default is False:
             return words
+        if self.default is True:
+            return "on"
         if isinstance(self.default, tuple):
             return ("," if self.parse else " ").join(f"{value:g}" for value in self.default)
         return f"{self.default:g}" if isinstance(self.default, float) else str(self.default)

@@ -25,7 +25,7 @@ class Panel(StrEnum):
     BUDGET = "Error budget"
     TESTS = "Tests"
     RASTER = "Raster"
-    FIGURES = "Figures"
+    FIGURES = "Comparison"
     UNKNOWNS = "Unknowns and weights"
     CLOUDS = "Clouds"
     ROUNDS = "Rounds"
@@ -160,9 +160,9 @@ class SurveyOptions(ViewOptions, CamerasOptions, NeededOptions, panel=Panel.CAME
     adjusted_from: Any = option(None, with_cameras=True, basic=True, metavar="PATH", needs="water")
     """Original camera file, if --cameras is the output of 'pcfix adjust'. The cloud is first
     transferred to the adjusted poses."""
-    check_depths: File | None = option(None, needs="method regression")
+    check_depths: File | None = option(None, needs="method regression", panel=Panel.METHOD)
     """Measured depths for --method regression: CSV x,y,depth. [m]"""
-    regression: File | None = option(None, needs="method regression")
+    regression: File | None = option(None, needs="method regression", panel=Panel.METHOD)
     """Line fitted to another cloud, from --save-regression; replaces --check-depths."""
     tide: File | None = option(None, with_cameras=True, panel=Panel.WATER, needs="water")
     """Tide table, CSV time,level_m: each image gets the water level at its time."""
