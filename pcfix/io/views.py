@@ -385,8 +385,8 @@ class ViewMatch:
         report.share_seen = views.share_seen
         report.image_order, report.unposed = order.what, order.unposed
         report.entries, report.unposed_entries = int(posed.sum()), int((~posed).sum())
-        report.beside_entries = int(outside.sum())
-        report.beside_points = int(np.count_nonzero(outside))
+        report.outside_entries = int(outside.sum())
+        report.outside_points = int(np.count_nonzero(outside))
         return listed, report
 
     def _rows(
@@ -431,8 +431,8 @@ class ViewReport(Sums):
     unmatched: int = 0
     entries: int = 0  # cameras of all lists that were matched
     unposed_entries: int = 0  # images without a pose, which are ignored
-    beside_entries: int = 0  # cameras that cannot have imaged their point, which are ignored
-    beside_points: int = 0  # points that these are listed for
+    outside_entries: int = 0  # cameras that cannot have imaged their point, which are ignored
+    outside_points: int = 0  # points that these are listed for
     unposed: tuple[str, ...] = field(default=(), metadata=SAME)  # that a list may name
     notes: list[PcfixWarning] = field(default_factory=list, metadata=SAME)
 
@@ -465,8 +465,8 @@ class ViewReport(Sums):
             named = f", such as {', '.join(self.unposed[:3])}" if self.unposed else ""
             sentence = f"{self.unposed_entries:,} entries without a pose{named} are ignored."
             note("views.unposed", sentence, count=self.unposed_entries)
-        if self.beside_entries:
-            note("views.not_in_frame", beside(self.beside_entries, self.beside_points))
+        if self.outside_entries:
+            note("views.not_in_frame", beside(self.outside_entries, self.outside_points))
         return notes
 
     def as_dict(self) -> dict[str, Any]:

@@ -314,7 +314,7 @@ def _read(
         top, bottom = (int(v) for v in np.clip([row.min() - 2, row.max() + 3], 0, bottom))
     if right - left < 2 or bottom - top < 2:
         sentence = "has fewer than two rows and columns near the cloud. Check its CRS."
-        raise bad_file(name, "water.raster_apart", sentence)
+        raise bad_file(name, "water.raster_far", sentence)
     _check_size((bottom - top) * (right - left), name)
     window = Window(left, top, right - left, bottom - top)
     stored = read_masked(source, window=window)

@@ -199,7 +199,7 @@ class Verdict(NamedTuple):
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
         return {
-            "made_of": self.chosen.words,
+            "type": self.chosen.words,
             "sure": self.is_sure,
             "confidence": round(self.confidence, 4),
             "share": round(self.share, 3),
@@ -211,7 +211,7 @@ class Verdict(NamedTuple):
             "patches": self.patches,
             "by": self.by,
             "scatter_m": round(self.model_uncertainty.scatter_m, 4),
-            "doubt_per_depth": round(self.model_uncertainty.per_depth, 4),
+            "per_depth": round(self.model_uncertainty.per_depth, 4),
         }
 
     def __str__(self) -> str:

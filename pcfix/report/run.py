@@ -107,7 +107,8 @@ def run_report(run: RunResults, inputs: Table, files: Sequence[Pair]) -> Report:
     ]
     # the rows of the terminal, with the detected reconstruction type in words
     facts = {"Cloud": name_of(s.input), "Points": f"{s.points:,}", **dict(rows)}
-    facts |= {"Method": f"{s.made['method']}. {s.made['because']}"} if s.made else {}
+    found = s.reconstruction
+    facts |= {"Method": f"{found['method']}. {found['because']}"} if found else {}
     # it names the order of S-44, by the measured differences where there are some
     facts |= {"Uncertainty": uncertainty_sentence(s, run.compared.get("tvu")), "IHO S-44": ""}
     settings = [

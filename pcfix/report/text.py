@@ -165,22 +165,22 @@ def filled(table: RowTable, values: Plain) -> Rows:
 
 def summary_text(summary: Summary) -> str:
     """Return the summary of a correction."""
-    return aligned(_head("Corrected", summary), summary_rows(summary), summary.told)
+    return aligned(_head("Corrected", summary), summary_rows(summary), summary.notes)
 
 
 def summary_rows(s: Summary) -> Rows:
     """Return the facts of a correction, for the terminal and the report page."""
-    fit, made = s.water_fit or {}, s.made
+    fit, found = s.water_fit or {}, s.reconstruction
     method = str(s.settings["method"])
-    if made is not None and made.get("made_of", "") not in ("", method):
-        sure = f"detected, confidence {100.0 * made['confidence']:.0f} %"
-        method = f"{made['method']}, {made['made_of']} ({sure})"
-    elif made is not None and "made_of" not in made:
-        method = f"{made['method']}. {made['because']}"
+    if found is not None and found.get("type", "") not in ("", method):
+        sure = f"detected, confidence {100.0 * found['confidence']:.0f} %"
+        method = f"{found['method']}, {found['type']} ({sure})"
+    elif found is not None and "type" not in found:
+        method = f"{found['method']}. {found['because']}"
     check = ""
     if s.fit is not None and s.cameras:
         check = "cameras match the cloud"
-        if s.fit["doubts"]:
+        if s.fit["problems"]:
             check = "cameras may not match the cloud; see the warnings"
         elif not s.fit["fits"]:
             check = "cameras and cloud could not be tested"

@@ -164,7 +164,7 @@ def test_measured_uncertainty(finished):
     assert f"measured {measured['tvu_95_m']:.3f} m at {measured['count']:,} points" in said
     assert said.endswith("IHO S-44 Exclusive Order")
     assert said in text
-    assert f"<td>consistent. {steps['correct']['made']['because']}</td>" in text
+    assert f"<td>consistent. {steps['correct']['reconstruction']['because']}</td>" in text
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -58,7 +58,7 @@ def tiles_in(folder):
 
 def test_default_method(corrected):
     folder, one, many = corrected
-    assert one.made["method"] == "consistent"
+    assert one.reconstruction["method"] == "consistent"
     assert np.array_equal(records(*tiles_in(folder / "tiles")), records(folder / "merged.las"))
     assert figures(one) == figures(many)
 
@@ -89,7 +89,7 @@ def test_view_list(tmp_path):
     write_ply(given["views"], scene.apparent_xyz, lists, weights, position="double")
     one = pcfix.correct_file(merged, tmp_path / "merged.las", **given)
     many = pcfix.correct_file(folder, tmp_path / "out", **given)
-    assert many.made == one.made
+    assert many.reconstruction == one.reconstruction
     names = ("by_row", "by_position", "unmatched", "entries", "farthest_m")
     assert [many.views[name] for name in names] == [one.views[name] for name in names]
     here, there = records(tmp_path / "merged.las"), records(*tiles_in(tmp_path / "out"))
