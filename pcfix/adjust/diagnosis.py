@@ -43,8 +43,11 @@ if TYPE_CHECKING:  # not quick to load
     from pcfix.adjust.from_cloud import Undone
     from pcfix.adjust.problem import Intersected
 
-ORDER = ("tie points", "GNSS", "bed", "land", "neighbours")
-"""The signs in the order in which they decide."""
+ORDER = {
+    "tie points": "tie points", "GNSS": "GNSS positions", "bed": "measured depths",
+    "land": "heights of land", "neighbours": "neighbouring points",
+}  # fmt: skip
+"""The signs in the order in which they decide, and what shows each."""
 
 LEAST_POINTS = 30
 """Tie points under water that are needed."""
@@ -89,6 +92,11 @@ class Sign:
     words: str  # what was found, or why it says nothing
     figures: dict[str, float] = field(default_factory=dict)
     error_m: float | None = None  # likely error of the heights, if it was absorbed
+
+    @property
+    def shown_by(self) -> str:
+        """The evidence, in the plural."""
+        return ORDER[self.name]
 
 
 @dataclass(frozen=True)
@@ -365,7 +373,7 @@ def diagnosed(
         signs += _signs_of_rays(cameras, water, n, ties, gnss, view, in_passing=in_passing)
     if view is not None:
         signs += _signs_of_surveys(cameras, water, n, view, control, reference)
-    return Diagnosis(tuple(sorted(signs, key=lambda sign: ORDER.index(sign.name))))
+    return Diagnosis(tuple(sorted(signs, key=lambda sign: [*ORDER].index(sign.name))))
 
 
 def _signs_of_rays(

@@ -101,8 +101,8 @@ def adjust(model: Path, out: Path, /, *, options: AdjustOptions, quiet: bool) ->
     with status_line("Adjusting", quiet) as progress:
         found = pcfix.adjust_cameras(model, out, options=options, progress=progress)
     say(adjustment_text(adjustment_dict(found, before_of(found))), quiet)
-    cloud = "" if options.cloud else " (CLOUD.laz is the cloud of the original cameras)"
-    say(f"Next{cloud}: {correct_words(found, model, out, options)}", quiet)
+    cloud = "" if options.cloud else ", with the cloud of the original cameras as CLOUD.laz"
+    say(f"Next step{cloud}:\n  {correct_words(found, model, out, options)}", quiet)
 
 
 @command("pcfix label cloud.laz labelled.laz --water shore.csv", input=TILED, output=CLOUD)

@@ -99,8 +99,9 @@ def diagnose_in_passing(
         f" quickly; {EXPORT}"
     )
     if decided is not None:
-        did = "absorbed" if diagnosis.absorbed else "did not absorb"
-        words = f"{did} the refraction, by {decided.name}{'; see the warning' * bool(sentence)}"
+        have = "have" if diagnosis.absorbed else "have not"
+        words = f"{have} absorbed the refraction, as {decided.shown_by} show"
+        words += "; see the warning" if sentence else ""
     signs = diagnosis.as_dict()["signs"]
     return {"absorbed": diagnosis.absorbed, "words": words, "signs": signs}, warning
 

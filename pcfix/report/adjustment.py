@@ -5,6 +5,8 @@ All words are made of the plain values of `adjustment_dict`, so that a resumed r
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from pcfix.adjust.block import words_of
@@ -14,7 +16,7 @@ from pcfix.grid.colours import DIFFERENCE, UNCERTAINTY
 from pcfix.grid.maps import Maps, MapsBuilder
 from pcfix.model import FloatArray
 from pcfix.report.page import Layer, Picture, Report, Table, label_plan, new_figure, render
-from pcfix.report.text import Rows, RowTable, filled, share
+from pcfix.report.text import Rows, RowTable, aligned, filled, share
 from pcfix.sums import nice_step
 
 MOST_POINTS = 6000
@@ -32,26 +34,25 @@ _FACTS: RowTable = (
     ("sigma0", "{sigma0:.3f}, redundancy {redundancy:,}, {rounds} rounds, {steps} steps", "images"),
     ("water", "{water[surface]}", "has_shape"),
     ("lens", "fixed", "lens_is_fixed"),
-    ("{label}", "{before:.6g} -> {after:.6g}{unit} ({added:+.3g}, standard error {sigma:.2g})",
-     "*unknowns"),
+    ("{label}", "{before} -> {after}{unit} ({added}, standard error {sigma:.2g})", "*unknowns"),
     ("{label}", "{added:+.3g}{unit} (standard error {sigma:.2g})", "*motions"),
     ("water", "none", "no_water"),
     ("port", "--port {port_found[port]}", "port"),
     ("{label}", "{after:.6g}{unit}, fixed", "*held"),
     ("on {surface}", "{points:,} marked points, distance RMS {rms_m:z.4f} m (given {sigma_m:g} m)",
      "*on_surfaces"),
-    ("poses", "RMS movement of the centres {poses[moved_rms_m]:.3f} m", "moved"),
-    ("", "mean east, north, up {poses[moved_mean_m]:+z.3f} m, largest"
-     " {poses[moved_largest_m]:.3f} m ({poses[moved_largest_image]}); RMS rotation"
-     " {poses[turned_rms_deg]:.4f} deg", "moved"),
-    ("precision", "standard errors of centres X, Y, Z: mean {precision[centre_mean_m]:z.4f} m,"
-     " largest {precision[centre_largest_m]:z.4f} m; of angles: mean"
-     " {precision[angle_mean_deg]:z.4f} deg, largest {precision[angle_largest_deg]:z.4f} deg",
-     "is_precise"),
-    ("GNSS", "{gnss[images]:,} images. Centres minus GNSS east, north, up: mean"
-     " {gnss[mean_m]:+z.3f} m, RMS {gnss[rms_m]:z.3f} m, largest {gnss[largest_m]:z.3f} m"
-     " ({gnss[largest_image]}); RMS before {gnss[rms_before_m]:z.3f} m", "gnss"),
-    ("{role} points", "{count}, adjusted minus surveyed X, Y, Z: mean {mean_m:+z.3f} m, RMS"
+    ("poses", "centres moved by {poses[moved_rms_m]:.3f} m RMS", "moved"),
+    ("", "mean (east, north, up) {poses[moved_mean_m]:+z.3f} m, largest"
+     " {poses[moved_largest_m]:.3f} m ({poses[moved_largest_image]}); images rotated by"
+     " {poses[turned_rms_deg]:.4f} deg RMS", "moved"),
+    ("standard errors", "of centres (X, Y, Z): mean {precision[centre_mean_m]:z.4f} m, largest"
+     " {precision[centre_largest_m]:z.4f} m", "is_precise"),
+    ("", "of angles (about x, y, z of the camera): mean {precision[angle_mean_deg]:z.4f} deg,"
+     " largest {precision[angle_largest_deg]:z.4f} deg", "is_precise"),
+    ("GNSS", "{gnss[images]:,} images. Centres minus GNSS (east, north, up): mean"
+     " {gnss[mean_m]:+z.3f} m, RMS {gnss[rms_m]:z.3f} m (before {gnss[rms_before_m]:z.3f} m);"
+     " largest distance {gnss[largest_m]:z.3f} m ({gnss[largest_image]})", "gnss"),
+    ("{role} points", "{count}. Adjusted minus surveyed (X, Y, Z): mean {mean_m:+z.3f} m, RMS"
      " {rms_m:z.3f} m, {rms_px:z.2f} {image_unit}", "*surveyed"),
 )  # fmt: skip
 
@@ -82,8 +83,9 @@ def adjustment_sentence(d: Plain) -> str:
 def adjustment_text(d: Plain) -> str:
     """Return the summary of an adjustment as text."""
     surveyed = _survey_table(d)
-    lines = [f"{label:<18} {words}" for label, words in _facts(d)] + _residual_table(d).lines()
-    lines += surveyed.lines()[: 1 + MOST_LISTED] if surveyed.rows else []
+    rows = [(label[:1].upper() + label[1:], words) for label, words in _facts(d)]
+    lines = [aligned("Refractive bundle adjustment", rows), "", *_residual_table(d).lines()]
+    lines += ["", *surveyed.lines()[: 1 + MOST_LISTED]] if surveyed.rows else []
     return "\n".join([*lines, *(f"Note: {note}" for note in all_notes(d))])
 
 
@@ -136,10 +138,10 @@ def _facts(d: Plain) -> Rows:
     unknowns, held = [_lens_row(d, row) for row in d["lens"]], []
     for name, row in (water or d["port_found"] or {}).items():
         if isinstance(row, dict):
-            named = _named(name) | row | {"added": row["after"] - row["before"]}
+            named = _named(name) | row
             # a level surface has no tilt to show
             if row["free"]:
-                unknowns.append(named)
+                unknowns.append(named | _change(row))
             elif not (name.startswith("tilt") and row["after"] == 0.0):
                 held.append(named)
     motions = []
@@ -180,7 +182,21 @@ def _lens_row(d: Plain, row: Plain) -> Plain:
     if len({one["sensor"] for one in d["lens"]}) > 1:
         label += f", {row['sensor']}"
     unit = f" {d['image_unit']}" if row["name"] in ("f", "cx", "cy", "b1", "b2") else ""
-    return row | {"label": label, "unit": unit, "added": row["after"] - row["before"]}
+    return row | {"label": label, "unit": unit} | _change(row)
+
+
+def _change(row: Plain) -> Plain:
+    """Return an unknown before and after and its change, to two digits of its standard error."""
+    before, after, sigma = row["before"], row["after"], row["sigma"]
+    if not sigma:
+        return {
+            "before": f"{before:.6g}",
+            "after": f"{after:.6g}",
+            "added": f"{after - before:+.3g}",
+        }
+    digits = max(0, 1 - math.floor(math.log10(sigma)))
+    values = {"before": (before, ""), "after": (after, ""), "added": (after - before, "+")}
+    return {name: fixed(value, digits, sign) for name, (value, sign) in values.items()}
 
 
 def _fact_table(d: Plain) -> Table:

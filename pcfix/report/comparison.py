@@ -115,7 +115,7 @@ def comparison_text(c: Comparison) -> str:
     if c.own is not None:
         own, noise = plain["own"], noise_sentence(plain["own"], raw_of(plain)["after"])
         if own["rmse_m"] is not None:
-            noise = f"RMSE {own['rmse_m']:.3f} m, 95 % {own['within_95_m']:.3f} m, {noise}"
+            noise = f"RMSE {own['rmse_m']:.3f} m, 95 % within {own['within_95_m']:.3f} m, {noise}"
         rows.append(("Bed" if own["of"] == "bed" else "Cloud", noise))
     if c.m3c2 is not None:
         m = c.m3c2.after
@@ -124,7 +124,7 @@ def comparison_text(c: Comparison) -> str:
                      f" of detection {m.mean_level_of_detection_m:.3f} m,"
                      f" {100 * m.significant_share:.0f} % of the distances beyond it"))  # fmt: skip
     head = f"Compared {c.cloud} with {c.reference} in {c.seconds:.1f} s"
-    tables = [line for table in _tables(plain) for line in table.lines()]
+    tables = [line for table in _tables(plain) for line in ("", *table.lines())]
     return "\n".join([aligned(head, rows), *tables, *(f"Note: {note}" for note in c.notes)])
 
 
@@ -134,7 +134,10 @@ def noise_sentence(own: Plain, raw: Plain) -> str:
     noise = f"the reference's noise ({own['sigma_reference_m']:.3f} m, {source})"
     if own["rmse_m"] is None:
         return f"the differences scatter no more than {noise}, so the cloud's error is not known."
-    return f"without {noise}; with it RMSE {raw['rmse_m']:.3f} m, 95 % {raw['within_95_m']:.3f} m."
+    return (
+        f"without {noise}; with it RMSE {raw['rmse_m']:.3f} m, 95 % within"
+        f" {raw['within_95_m']:.3f} m."
+    )
 
 
 def signed(value_m: float) -> str:
@@ -161,7 +164,7 @@ def _tables(compared: Plain) -> list[Table]:
     for title, s in found:
         marks = s["percentiles_m"]
         values = [*(s[key] for key in MOMENTS.values()), marks["p5"], marks["p95"], s["max_m"]]
-        rows.append([title, f"{s['count']:,}", *(f"{value:.3f}" for value in values)])
+        rows.append([title, f"{s['count']:,}", *(f"{value:z.3f}" for value in values)])
     title = f"Against {name_of(compared['reference'])} (m)"
     tables = [Table(title, ["", "points", *MOMENTS, "5 %", "95 %", "max"], rows)]
 
@@ -176,11 +179,11 @@ def _tables(compared: Plain) -> list[Table]:
         ]
         for way, name, _, of in c2c
     ]  # fmt: skip
-    tables.append(Table("C2C: Gauss as CloudCompare fits it", header, rows))
+    tables.append(Table("C2C, normal distribution", header, rows))
 
     lines = [(name, (compared["depth"] or {}).get(when)) for when, name, _ in TIMES]
     rows = [
-        [name, f"{fit['slope']:.4f}", f"{fit['intercept_m']:+.3f}", f"{fit['r2']:.4f}"]
+        [name, f"{fit['slope']:.4f}", f"{fit['intercept_m']:+z.3f}", f"{fit['r2']:.4f}"]
         for name, fit in lines
         if fit is not None
     ]
@@ -189,12 +192,13 @@ def _tables(compared: Plain) -> list[Table]:
 
     # of each class of depth or of distance from the shore
     figures = {"bias": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m"}
-    header = ["", "points", *(f"{one}, {name}" for name in names.values() for one in figures)]
+    first, *others = figures
+    header = ["", "points", *(one for n in names.values() for one in (f"{n}: {first}", *others))]
     for key, (title, _, _) in BINS.items():
         rows = []
         for one in compared[key]:
             both = [one[when] for when in names]
-            cells = ["" if s is None else f"{s[of]:.3f}" for s in both for of in figures.values()]
+            cells = ["" if s is None else f"{s[of]:z.3f}" for s in both for of in figures.values()]
             name = f"{one['from_m']:g} to {one['to_m']:g}"
             rows.append([name, f"{one['after']['count']:,}", *cells])
         tables.append(Table(title, header, rows))

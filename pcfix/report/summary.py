@@ -25,7 +25,7 @@ class Summary(Figures):
         if found.get("method") != "consistent" or not is_sure:
             return "the reconstruction type is uncertain, or the method assumes another one"
         return {
-            True: "the poses absorbed the refraction",
+            True: "the poses have absorbed the refraction",
             None: "the poses were not checked for absorbed refraction",
             False: "",
         }[self.absorbed]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from string import Formatter
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,6 +28,8 @@ RowTable = tuple[tuple[str, str, str], ...]
 FEWEST = 59
 """Differences of which all keep an order before 95 % of all are likely to: 0.95^59 is 0.05."""
 SHOWN_NAMES = 5
+WIDTH = 100
+"""Columns of a printed line."""
 
 _PART = ("Read", "{part_words}", "part_words")
 _NO_SURFACE = ("No surface", "{water_unknown:,} points have no water surface", "water_unknown")
@@ -36,10 +39,12 @@ _SHORELINE: RowTable = (
     ("Shoreline", "none: the water does not intersect the cloud; {path} is empty", "is_empty"),
 )  # fmt: skip
 _LABELLING: RowTable = (
-    ("Mask", "{outside_mask:,} points below the surface are outside: land", "water_mask"),
-    ("Respected", "{respected:,} points below the surface have classes of land", "respected"),
-    ("Pools", "{pools[points]:,} points in {pools[pools]:,} separate pools: land", "pools"),
-    ("Pools", "none separate from the water", "no_pools"),
+    ("Mask", "{outside_mask:,} points below the surface are outside of it and count as land",
+     "water_mask"),
+    ("Classes", "{respected:,} points below the surface count as land (--respect-classes)",
+     "respected"),
+    ("Pools", "{pools[points]:,} points in {pools[pools]:,} separate pools count as land", "pools"),
+    ("Pools", "no pool is separate from the water", "no_pools"),
 )  # fmt: skip
 _CORRECTED: RowTable = (
     _PART,
@@ -51,8 +56,8 @@ _CORRECTED: RowTable = (
     ("Submerged", "{submerged:,} points ({submerged_share}), {corrected_words}", "points"),
     ("", "{count:,} not corrected: {reason} ({fate})", "*not_corrected"),
     _NO_SURFACE,
-    ("Withheld", "{unsure:,} corrected points ({unsure_share}) are seen at large incidence angles"
-     " only", "unsure"),
+    ("Withheld", "{unsure:,} corrected points ({unsure_share}) are visible at large incidence"
+     " angles only", "unsure"),
     ("Depth", "{depth_m[min]:.2f} to {depth_m[max]:.2f} m, mean {depth_m[mean]:.2f} m", "depth_m"),
     ("Z shift", "mean {shift_z_m[mean]:.3f} m (5th to 95th percentile {shift_z_m[p5]:.3f} to"
      " {shift_z_m[p95]:.3f} m)", "shift_z_m"),
@@ -60,9 +65,9 @@ _CORRECTED: RowTable = (
     ("Cameras", "{cameras_used} of {cameras} used, {rays_per_point:.1f} rays per point, incidence"
      " angles up to {incidence_deg:.0f} deg", "cameras"),
     ("Cameras", "none; ray counts of 1 and incidence angles of 0 are placeholders", "no_cameras"),
-    ("Unused", "{unused_count} see no corrected point: {unused}", "unused"),
+    ("Unused", "{unused_count} cameras without corrected points: {unused}", "unused"),
     ("Water", "{water}, refractive index {settings[index]:.6g}", "water"),
-    ("", "fitted: {water_fit[model]}{fit_points}, standard error {water_fit[sigma_level_m]:.3f} m",
+    ("", "fitted {water_fit[model]}{fit_points}, standard error {water_fit[sigma_level_m]:.3f} m",
      "water_fit"),
 )  # fmt: skip
 _UNCERTAINTY: RowTable = (
@@ -76,14 +81,15 @@ _LABELLED: RowTable = (
     _PART,
     ("Class 40", "{submerged:,} points ({submerged_share})", "points"),
     ("Class 41", "{water_surface:,} points within {settings[band]:g} m of the surface", "has_band"),
-    ("Reclassified", "{stale:,} former points of class 40 or 41: {stale_fate}", "stale"),
+    ("Formerly", "{stale:,} points of class 40 or 41 are in neither class now: {stale_fate}",
+     "stale"),
     _NO_SURFACE,
 )  # fmt: skip
 _CLEANED: RowTable = (
     ("Noise", "{noise:,} points ({noise_share}), {fate}", "points"),
     ("", "{count:,} {reason}", "*flagged"),
     ("Ignored", "{set_aside:,} points were withheld or noise before", "set_aside"),
-    ("Bed", "{submerged:,} submerged points tested against it", "submerged"),
+    ("Bed", "{submerged:,} submerged points were tested against it", "submerged"),
     ("Neighbours", "mean distance {near[mean]:.3f} m, standard deviation {near[sd]:.3f} m, limit"
      " {near[limit]:.3f} m", "near"),
     ("Not run", "{test}", "*tests_not_run"),
@@ -103,9 +109,9 @@ _GRIDDED: RowTable = (
     ("Counts", "{counts}", "counts"),
 )  # fmt: skip
 _CALMED: RowTable = (
-    ("Registered", "by {corners:,} corners with a median scatter of {scatter_px:.2f} px; the camera"
+    ("Aligned", "by {corners:,} corners with a median scatter of {scatter_px:.2f} px; the camera"
      " moved by up to {moved_px:.1f} px", "corners"),
-    ("Registered", "no: the camera stood still", "is_still"),
+    ("Aligned", "no: the camera did not move (--still)", "is_still"),
     ("Spread", "median {spread:.1f} grey values: {spread_file}", "frames"),
     ("Water", "{found.waves} waves; slopes {found.slope_deg:.2f} deg rms, {percent:.0f} % of them"
      " explained", "found"),
@@ -136,9 +142,24 @@ _FATE = {"withhold": "not moved, withheld", "keep": "not moved", "drop": "droppe
 
 
 def aligned(head: str, rows: Iterable[tuple[str, str]], notes: Iterable[object] = ()) -> str:
-    """Return a summary: a line that says what was done, labelled rows, and notes."""
-    lines = [head, *(f"  {label:<13} {text}" for label, text in rows)]
-    return "\n".join([*lines, *(f"Note: {note}" for note in notes)])
+    """Return a summary: a line that says what was done, labelled rows, and notes.
+
+    Long texts are wrapped, except for commands, so that these can be copied.
+    """
+    rows = list(rows)
+    width = max([13, *(len(label) for label, _ in rows)])
+    lines = [(f"  {label:<{width}} ", text) for label, text in rows]
+    lines += [("", f"Note: {note}") for note in notes]
+    return "\n".join([head, *(_wrapped(start, text) for start, text in lines)])
+
+
+def _wrapped(start: str, text: str) -> str:
+    if "pcfix " in text:
+        return start + text
+    return fill(
+        text, WIDTH, initial_indent=start, subsequent_indent=" " * len(start),
+        break_long_words=False, break_on_hyphens=False,
+    )  # fmt: skip
 
 
 class _Numbers(Formatter):
@@ -202,7 +223,7 @@ def summary_rows(s: Summary) -> Rows:
         "fit_points": ", {accepted} of {points} points".format(**fit) if "points" in fit else "",
         "no_uncertainty": s.uncertainty is None and s.settings["dimensions"] == "all"
         and not s.cameras,
-        "order": order_sentence(s),
+        "order": _order_words(s),
         "check": check,
     }  # fmt: skip
     rows = filled(_CORRECTED, values) + shoreline_rows(s.shoreline)
@@ -297,12 +318,29 @@ def order_sentence(s: Summary) -> str:
 def tvu_sentence(uncertainty: Plain) -> str:
     """Return the strictest order of S-44 whose TVU 95 % of the points keep, in words."""
     shares = uncertainty["s44"]
-    order = next((one.name for one in ORDERS if shares[one.name] >= 0.95), None)
-    if order is None:
+    name, percent = _order(shares)
+    if not name:
         within = shares[ORDERS[-1].name]
         return f"fewer than 95 % of the points meet any order of IHO S-44 ({within:.0%} order 2)"
-    name = f"order {order}" if order[0].isdigit() else f"{order} Order"
-    return f"{100.0 * shares[order]:.4g} % of the points are within the TVU of IHO S-44 {name}"
+    return f"{percent:.4g} % of the points are within the TVU of IHO S-44 {name}"
+
+
+def _order(shares: Plain) -> tuple[str, float]:
+    """Return the strictest order that 95 % of the points keep, empty if none, and their percent."""
+    order = next((one.name for one in ORDERS if shares[one.name] >= 0.95), None)
+    if order is None:
+        return "", 0.0
+    return f"order {order}" if order[0].isdigit() else f"{order} Order", 100.0 * shares[order]
+
+
+def _order_words(s: Summary) -> str:
+    """Return the order of S-44 for the summary, or why none is claimed."""
+    if s.uncertainty is None or s.why_no_order:
+        return f"no order claimed: {s.why_no_order}"
+    name, percent = _order(s.uncertainty["s44"])
+    if not name:
+        return "no order: fewer than 95 % of the points are within the TVU of order 2"
+    return f"{name} ({percent:.4g} % of the points are within its TVU)"
 
 
 def uncertainty_sentence(s: Summary, measured: Plain | None = None) -> str:
@@ -327,7 +365,9 @@ def labelling_text(s: Figures) -> str:
         "part_words": _part_words(s.part),
         "submerged_share": share(s.submerged, s.points),
         "has_band": s.settings["band"] > 0.0,
-        "stale_fate": "class 1" if s.settings["reset"] else "kept; --reset sets them to class 1",
+        "stale_fate": "set to class 1"
+        if s.settings["reset"]
+        else "unchanged; --reset sets class 1",
     }
     rows = [*filled(_LABELLED, values), *_labelling_rows(s.labelling), ("Water", s.water)]
     return aligned(_head("Labelled", s), rows)

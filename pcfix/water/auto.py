@@ -357,9 +357,11 @@ class Cue(NamedTuple):
     amplitude: float | None = None  # given by physics, or negative and free
 
 
-SLOPE = Cue("slope", "the ground looks flatter below", None, 12.0, 0.6, amplitude=LIFT)
-RED = Cue("red/green", "red fades against green below", 0, 24.0, 0.8, scale_m=0.7)
-BLUE = RED._replace(name="blue/green", meaning="blue fades against green below", colour=2)
+SLOPE = Cue("slope", "the ground is flatter below the surface", None, 12.0, 0.6, amplitude=LIFT)
+RED = Cue("red/green", "red fades faster than green below the surface", 0, 24.0, 0.8, scale_m=0.7)
+BLUE = RED._replace(
+    name="blue/green", meaning="blue fades faster than green below the surface", colour=2
+)
 
 
 class Moments(NamedTuple):
