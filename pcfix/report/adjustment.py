@@ -188,14 +188,10 @@ def _lens_row(d: Plain, row: Plain) -> Plain:
 def _change(row: Plain) -> Plain:
     """Return an unknown before and after and its change, to two digits of its standard error."""
     before, after, sigma = row["before"], row["after"], row["sigma"]
-    if not sigma:
-        return {
-            "before": f"{before:.6g}",
-            "after": f"{after:.6g}",
-            "added": f"{after - before:+.3g}",
-        }
-    digits = max(0, 1 - math.floor(math.log10(sigma)))
     values = {"before": (before, ""), "after": (after, ""), "added": (after - before, "+")}
+    if not sigma:
+        return {name: f"{value:{sign}.6g}" for name, (value, sign) in values.items()}
+    digits = max(0, 1 - math.floor(math.log10(sigma)))
     return {name: fixed(value, digits, sign) for name, (value, sign) in values.items()}
 
 

@@ -365,9 +365,7 @@ def labelling_text(s: Figures) -> str:
         "part_words": _part_words(s.part),
         "submerged_share": share(s.submerged, s.points),
         "has_band": s.settings["band"] > 0.0,
-        "stale_fate": "set to class 1"
-        if s.settings["reset"]
-        else "unchanged; --reset sets class 1",
+        "stale_fate": "class 1 now" if s.settings["reset"] else "unchanged; --reset sets class 1",
     }
     rows = [*filled(_LABELLED, values), *_labelling_rows(s.labelling), ("Water", s.water)]
     return aligned(_head("Labelled", s), rows)

@@ -277,10 +277,10 @@ def _judged(coarse: Scan) -> WaterProposal:
         if gain >= LEAST_EACH:
             strong.append(cue.name)
             evidence[f"{cue.name} amplitude"], evidence[f"{cue.name} sigma"] = size, sigma
-            text = f"the logarithm of the ratio falls by {-size:.2f} ± {sigma:.2f} per metre"
+            text = f"the logarithm of their ratio falls by {-size:.3f} per metre"
             if cue == SLOPE:
-                text = f"true slopes are {1.0 + size:.2f} ± {sigma:.2f} times the apparent ones"
-            sentences.append(f"{cue.meaning}: {text}")
+                text = f"true slopes are {1.0 + size:.2f} times the apparent ones"
+            sentences.append(f"{cue.meaning}: {text} (standard error {sigma:.3f})")
     # the rival: the best height elsewhere
     elsewhere = np.abs(coarse.heights_m - peak.level_m) > SAME_PLACE_M
     rivals = np.where(elsewhere, _gains(coarse, peak.tilt), 0.0)
