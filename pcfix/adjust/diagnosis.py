@@ -135,7 +135,7 @@ class Diagnosis:
         have = "seem to have" if self.decided_by.name == "neighbours" else "have"
         return (
             f"The poses {have} absorbed the refraction: {self.decided_by.words}.{error} Correcting"
-            f" the cloud alone makes it worse; adjust the poses first{because}: {command}"
+            f" only the cloud makes it worse; adjust the poses first{because}: {command}"
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -453,7 +453,7 @@ def _signs_of_surveys(
         signs.append(land_sign(cloud_z(dry) - dry[:, 2], gsd, "the control points"))
         deep = used_as_dry(control, water)
         if deep:
-            words = f"control points {', '.join(deep)} lie below the water: mark them under_water"
+            words = f"control points {', '.join(deep)} are below the water: mark them under_water"
             signs.append(Sign("land", None, words))
     if reference is None:
         return signs

@@ -97,7 +97,7 @@ def adjust_block(
     wet = len(xyz) if water is None else int((surface_above(water, xyz).height_m > xyz[:, 2]).sum())
     if wet < SMALL_WATER:
         words = (
-            f"Only {wet} of {len(xyz):,} points lie below the water, so there is no refraction to"
+            f"Only {wet} of {len(xyz):,} points are below the water, so there is no refraction to"
             " adjust. Check the water level, or use an ordinary bundle adjustment."
         )
         raise GeometryError("water.below_points", words, wet=wet, points=len(xyz))
@@ -206,7 +206,7 @@ def check_marks(
     if is_placed and np.abs(middle).max() > ELSEWHERE * height > 0.0:
         x, y, z = (-middle).tolist()
         words = (
-            f"{name}: the control points lie {x:.1f}, {y:.1f}, {z:.1f} m (x, y, z; median) from the"
+            f"{name}: the control points are {x:.1f}, {y:.1f}, {z:.1f} m (x, y, z; median) from the"
             " intersections of their marks, while the GNSS positions fit. One of the two has"
             " another CRS or height datum; name it with --gcps-crs or --gnss-crs."
         )
@@ -233,7 +233,7 @@ def _check_dry(water: WaterSurface | None, found: Adjusted) -> list[PcfixWarning
     above, count = int((found.is_observed & ~found.is_wet).sum()), int(found.is_observed.sum())
     if above >= SMALL_WATER:
         return []
-    few = f"Only {above} of {count:,} points lie above the water"
+    few = f"Only {above} of {count:,} points are above the water"
     if any(found.unknowns.water_sigma):
         words = (
             f"{few}, so level, tilt and index cannot be separated from the height of the block."
@@ -353,7 +353,7 @@ def datum_notes(found: Adjusted) -> list[PcfixWarning]:
     if is_off[2] and found.water is not None:
         level = f", or a water level that is too {'low' if offset_m[2] > 0.0 else 'high'}"
     words = (
-        f"The GNSS positions lie {' and '.join(parts)}: an antenna lever arm, another datum{level}."
+        f"The GNSS positions are {' and '.join(parts)}: an antenna lever arm, another datum{level}."
         " The block followed them. Correct them, or omit them if there are control points."
     )
     more = {"offset_m": offset_m.tolist(), "sigma_m": sigma_m.tolist()}
@@ -373,7 +373,7 @@ def bed_notes(found: Adjusted) -> list[PcfixWarning]:
         return []
     words = (
         f"The heights of the bed have a standard error of {sigma_m:.2f} m ({gsd:.1f} ground"
-        " pixels). Give control points, GNSS positions of more images that do not lie on one line,"
+        " pixels). Give control points, GNSS positions of more images that are not on one line,"
         " or a calibrated lens."
     )
     return [PcfixWarning("adjust.imprecise_bed", words, sigma_m=sigma_m, gsd=gsd)]

@@ -246,7 +246,7 @@ def _directions(cameras: Cameras, xyz: FloatArray) -> Iterator[Finding]:
             turn_deg=turn,
         )
     elif abs(turn) < 180.0 - MOST_TURN_DEG:  # as cameras are mounted in aircraft
-        yield "unchecked", "yaw (the images lie across the flight lines)"
+        yield "unchecked", "yaw (the images are across the flight lines)"
     else:
         yield _doubt(
             "cameras.yaw",

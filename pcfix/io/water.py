@@ -126,7 +126,7 @@ def _mesh(path: Path) -> WaterMesh:
     double, area_m2 = in_two_sheets(tin)
     share = float(area_m2[double].sum() / area_m2.sum())
     if share > MOST_OVERLAP:
-        sentence = f"{100.0 * share:.0f} % of the mesh lies above another part. Export one surface."
+        sentence = f"{100.0 * share:.0f} % of the mesh is above another part. Export one surface."
         raise bad_file(path, "water.mesh_overlap", sentence, share=share)
     return mesh
 

@@ -435,7 +435,7 @@ def _remarks(part: Batch, place: IntArray) -> tuple[str, ...]:
     step = patches.grid_m(part.xyz)
     if step is not None:
         return (
-            f"The points lie on a grid of {step:.3g} m, like the heights of a raster, which smooths"
+            f"The points are on a grid of {step:.3g} m, like the heights of a raster, which smooths"
             " the evidence of the reconstruction type. Give the cloud as the matcher wrote it.",
         )
     has_lenses, z = part.survey.cameras.lenses is not None, part.xyz[:, 2]
