@@ -1,7 +1,7 @@
 """The functions of PDAL's ``filters.python``: correct, label, clean and compare.
 
-A pipeline imports one of them, which belongs to the stage that imports it: PDAL passes options,
-metadata and the report through the globals of the stage's source::
+A pipeline imports one of them. PDAL passes options, metadata and the report through the globals of
+the source of the stage::
 
     {
       "type": "filters.python",
@@ -49,7 +49,7 @@ COLOURS = ("Red", "Green", "Blue")
 
 
 def __getattr__(name: str) -> Stage:
-    """Return the function of that name for the globals of the module that imports it."""
+    """Return the stage of this name, bound to the globals of the module that imports it."""
     work = {"correct": _correct, "label": _label, "clean": _clean, "compare": _compare}.get(name)
     if work is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -64,7 +64,7 @@ def __getattr__(name: str) -> Stage:
 def _run(work: Work, namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> bool:
     """Run with libraries separate from PDAL's, and leave the process usable after a failure."""
     before = sys.getdlopenflags()
-    # PDAL links to a PROJ and a GDAL of its own; two of a kind crash the program at its exit
+    # PDAL links to its own PROJ and GDAL; sharing symbols with ours crashes the program at its exit
     sys.setdlopenflags(os.RTLD_NOW | getattr(os, "RTLD_DEEPBIND", 0))
     in_program = "redirector" in sys.modules and "pdal" not in sys.modules
     try:
@@ -83,8 +83,8 @@ def _run(work: Work, namespace: dict[str, Any], ins: Dimensions, outs: Dimension
         sys.setdlopenflags(before)
     sentence = str(mistake)
     if in_program:
-        # the program prints an error as the repr of each line of a traceback, and always one: the
-        # sentence is printed before that, and the traceback cut down to its last line
+        # The program always prints a traceback, each line as a repr. So the sentence is printed
+        # before it, and the traceback is reduced to its last line.
         sys.stderr.write(f"pcfix: {mistake}\n")
         sys.tracebacklimit = 0
         sentence = "refused, see the line above"
@@ -179,7 +179,7 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
 
 
 def _compare(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
-    """Compare, and pass all points on unchanged."""
+    """Compare the cloud, and pass all points on unchanged."""
     from pcfix.flow.compare import Held, compare_clouds
     from pcfix.options.steps import StageCompareOptions
 
@@ -206,7 +206,7 @@ def _survey(cloud: PdalCloud, water: WaterSurface | None) -> SurveyCloud:
 
 
 def _options(namespace: dict[str, Any], kind: type[Set]) -> Set:
-    """Return the stage's options, of the right types."""
+    """Return the options of the stage, checked."""
     given = namespace.get("pdalargs") or {}
     if not isinstance(given, dict):
         sentence = f"pdalargs: must be an object of options, not {given!r}."
@@ -250,7 +250,7 @@ def _chunks(cloud: PdalCloud, water: WaterSurface | None) -> Iterator[tuple[slic
 
 
 def _view(cloud: PdalCloud) -> CloudView:
-    """Return what is known of the cloud, and all its points."""
+    """Return the facts of the cloud, and its points."""
     from pcfix.flow.surfaces import CloudView, corners
 
     def chunks(water: WaterSurface | None = None) -> Iterator[Points]:
@@ -264,8 +264,8 @@ def _view(cloud: PdalCloud) -> CloudView:
 def _repair_process(error: BaseException) -> None:
     """Undo what PDAL's plugin does to a Python process when a stage fails.
 
-    It releases one reference too many to the exception's class, which in the end frees the class;
-    and it leaves stdout redirected until a pipeline succeeds.
+    It releases one reference too many to the class of the exception, which finally frees the class.
+    And it leaves stdout redirected until a pipeline succeeds.
     """
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(type(error)))
     pdal = sys.modules.get("pdal")

@@ -1,4 +1,4 @@
-"""The commands: each turns its flags into one call of the Python interface."""
+"""The commands: each calls one function of the Python interface."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ CLOUD = "LAS or LAZ to write; a folder for tiles."
 def _summarized(
     title: str, text: str, quiet: bool, work: Callable[..., Any], *given: Any, unit: str = "points"
 ) -> None:
-    """Call a function of two files and options with a bar, and print its summary as a text."""
+    """Call a function of two files and options with a progress bar, and print its summary."""
     from pcfix.report import text as texts
 
     with progress_bar(title, quiet, unit=unit) as progress:

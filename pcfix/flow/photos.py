@@ -244,7 +244,7 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
     if not any(ground_seen(photo, scene, nodes)[2].any() for photo, nodes in coarse):
         raise GeometryError(
             "cameras.no_overlap",
-            f"{given.dsm}: it is in none of the {len(photos)} photographs. Check its CRS and that of"
+            f"{given.dsm}: is in none of the {len(photos)} photographs. Check its CRS and that of"
             f" {given.cameras} (--cameras-crs, --cameras-offset).",
             path=given.dsm,
         )

@@ -46,7 +46,7 @@ LEVEL_M = 0.02
 
 
 class MethodOptions(IndexOptions, panel=Panel.METHOD):
-    """The rays that are used, and how the true point follows from the apparent one."""
+    """The choice of rays and the method of correction."""
 
     method: Method = option("auto", basic=True)
     """Correction method. auto: consistent if the cameras have angles and lenses, else snell."""
@@ -86,10 +86,10 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     least_r2: float = option(0.5, least=0, most=1)
     """Minimum r2 of the fit of --method regression."""
     index_from: str = ""
-    """Which water the index is of, if it was not given as a number; not an option."""
+    """The water of the index, if it was not given as a number; not an option."""
 
     def check(self) -> None:
-        """Check that one ray is enough for the method."""
+        """Check the method for a single ray."""
         if self.max_cameras == 1 and self.method not in ("butler", "dietrich"):
             raise SettingError(
                 "option.range",
@@ -105,7 +105,7 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
         return self.method not in WITHOUT_CAMERAS or self.depth_factor == "auto"
 
     def check_no_cameras(self) -> None:
-        """Refuse what cannot be done, or has no effect, without cameras."""
+        """Raise SettingError for methods and options that need cameras."""
         if self.needs_cameras:
             factor = self.method in WITHOUT_CAMERAS
             wanted = "depth-factor auto" if factor else f"method {self.method}"
@@ -125,7 +125,7 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
 
     @property
     def limit_deg(self) -> float | None:
-        """The maximum incidence angle; None for no limit, or if it is not known yet."""
+        """The maximum incidence angle; None for no limit, or if it is not estimated yet."""
         return None if self.max_angle in (None, "auto") else float(self.max_angle)
 
     @property
@@ -160,7 +160,7 @@ class BudgetOptions(OptionSet, panel=Panel.BUDGET):
 
 
 class RefractionOptions(BudgetOptions, MethodOptions, panel=Panel.OUTPUT):
-    """Everything that the correction of points depends on."""
+    """All options that affect the correction of points."""
 
     unsure: Unsure = option("keep", with_cameras=True)
     """Corrected points whose rays all have incidence angles above 35 deg, without a view list: keep
@@ -174,7 +174,7 @@ class PointsOptions(RefractionOptions, WaterPerImageOption):
 
 
 class ScienceOptions(RefractionOptions, panel=Panel.OUTPUT):
-    """Everything that a corrected file depends on, besides its inputs; the file records it."""
+    """All options that affect a corrected file; the file records them."""
 
     uncorrected: Literal["withhold", "keep", "drop"] = option("withhold", basic=True)
     """Submerged points with fewer than two usable rays: flag, keep or drop them."""
@@ -193,7 +193,7 @@ class CorrectOptions(
 
 
 class LabelRules(LandRules, panel=Panel.WATER):
-    """Which points count as submerged, besides those below the surface; see `pcfix.label`."""
+    """The rules of a labelling; see `pcfix.label`."""
 
     band: float = option(0.0, least=0)
     """Points up to this distance from the surface, above or below, become class 41. [m] [default:
@@ -205,7 +205,7 @@ class LabelRules(LandRules, panel=Panel.WATER):
     """Set points of class 40 or 41 to class 1 if they are no longer in either class."""
 
     def check(self) -> None:
-        """Check that the dead band is wider."""
+        """Check that the dead band is wider than the band."""
         if 0.0 < self.dead_band <= self.band:
             raise SettingError(
                 "option.range",
@@ -218,7 +218,7 @@ class LabelRules(LandRules, panel=Panel.WATER):
 
 
 class StageLabelOptions(LabelRules, MaskOption, NeededOptions):
-    """The options of the stage ``label`` of PDAL, which writes no files."""
+    """The options of the PDAL stage ``label``, which writes no files."""
 
 
 class LabelOptions(PartOptions, TileOptions, SummaryOption, StageLabelOptions):
@@ -277,7 +277,7 @@ class RunOptions(
     ReferenceOption, ShorelineOption, TileOptions, DistanceOptions, SurveyedOptions,
     RefractionOptions, MaskOption, LandRules, SurveyOptions, panel=Panel.OUTPUT,
 ):  # fmt: skip
-    """The options of ``pcfix run``: everything that its results depend on is in ``run.json``."""
+    """The options of ``pcfix run``; ``run.json`` records all that affect its results."""
 
     resolution: float | None = option(None, basic=True, above=0)
     """Cell size of the rasters. [m] [default: 2 to 4 points a cell]"""
@@ -296,7 +296,7 @@ def _lens_names(text: str) -> tuple[str, ...]:
 
 
 class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
-    """How a block is adjusted."""
+    """The unknowns and weights of an adjustment."""
 
     free: tuple[WaterUnknown, ...] = option((), basic=True, parse=words, metavar="NAMES")
     """Unknowns of the water: any of level,tilt,index,shape (second-order curvature); of a port:
@@ -346,4 +346,4 @@ class AdjustOptions(
 
 
 Options = CorrectOptions
-"""The name of the front door."""
+"""The public name of the options of a correction."""

@@ -39,11 +39,11 @@ SurfaceChoice = Literal["all", "bed"]
 class CleanRules(OptionSet, panel=Panel.TESTS):
     """Thresholds of the tests; None switches a test off.
 
-    The fences are those of Tukey (Exploratory Data Analysis, 1977): three ranges are 4.7 standard
-    deviations of a normal distribution. Up to a quarter of the neighbours may be noise on one
-    side. On a slope, at a wall or on a rock that holds a quarter of the neighbours the range is
-    as large as the terrain is high, so that nothing is taken for noise there. The mean distance
-    to the neighbours finds, in a cloud of even spacing, also its edges and corners.
+    The fences are those of Tukey (Exploratory Data Analysis, 1977): three interquartile ranges are
+    4.7 standard deviations of a normal distribution. Up to a quarter of the neighbours may be noise
+    on one side. On a slope, at a wall, or on a rock with a quarter of the neighbours the range is
+    as large as the height of the terrain, so no point is flagged there. In a cloud of even spacing,
+    the mean distance to the neighbours also flags points at edges and corners.
     """
 
     statistical: bool = option(True)
@@ -77,7 +77,7 @@ class CleanRules(OptionSet, panel=Panel.TESTS):
     """Minimum distance of noise above the bed. [m]"""
 
     def check(self) -> None:
-        """Switch off what is not asked for; something must be left."""
+        """Switch off the limits of tests that are off; at least one test must be on."""
         weak = ("min_rays", "max_ray_miss", "max_incidence")
         for switch, limits in {"statistical": ("deviations",), "weak": weak}.items():
             for name in () if getattr(self, switch) else limits:
@@ -94,7 +94,7 @@ class CleanRules(OptionSet, panel=Panel.TESTS):
 
     @property
     def nearest(self) -> int:
-        """How many neighbours in space are needed, including the point itself; 0 for none."""
+        """The number of neighbours in space that are needed, with the point itself; 0 for none."""
         statistical = self.neighbours if self.statistical else 0
         return max(statistical, 0 if self.radius is None else self.radius_neighbours + 1)
 
@@ -110,7 +110,7 @@ class CleanOptions(TileOptions, SummaryOption, CleanRules, panel=Panel.OUTPUT):
 
 
 class DsmRules(OptionSet, panel=Panel.RASTER):
-    """How a cloud becomes a raster."""
+    """How to grid a cloud."""
 
     resolution: float | None = option(None, basic=True, least=MIN_RESOLUTION_M)
     """Cell size. [m] [default: 2 to 4 points a cell]"""
@@ -130,7 +130,7 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
 
     @property
     def cell_m(self) -> float:
-        """The resolution, once there is one."""
+        """The resolution; it must be known."""
         if self.resolution is None:
             raise SettingError(
                 "option.missing", "resolution is missing. Give the cell size in metres."
@@ -138,7 +138,7 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
         return self.resolution
 
     def check(self) -> None:
-        """Check that the other options fit to the value, and the width of holes to the cells."""
+        """Check the rules between the value, the surface and the width of holes."""
         if self.what == "uncertainty" and (self.method != "mean" or self.fill is not None):
             raise SettingError(
                 "option.excludes",
@@ -174,16 +174,16 @@ class DsmOptions(PartOptions, OverwriteOption, SummaryOption, DsmRules, panel=Pa
 
 
 LAYERS = ("water", "apparent", "corrected", "reference")
-"""Lines of a cross-section; a further cloud must have another name."""
+"""Names of the lines of a cross-section; other clouds must have other names."""
 _NAME = re.compile(r"[\w .+-]*\w[\w .+-]*")
 
 
 SIGMA_REFERENCE_M = {"cloud": 0.03, "raster": 0.03, "table of check points": 0.02}
-"""Assumed noise of a height by kind of reference: LiDAR over hard ground, RTK or levelling."""
+"""Assumed standard deviation of a height by kind of reference: LiDAR on hard ground, RTK."""
 
 
 def _bands(given: Any) -> tuple[tuple[float, ...], ...]:
-    """Return the bounds of shares, each of which may be a text."""
+    """Return the bounds of each share; they may be given as text."""
     bands = list[tuple[float, ...]]()
     for one in given:
         band: tuple[float, ...] = ()
@@ -220,10 +220,10 @@ def _named_clouds(given: Any) -> tuple[tuple[str, str], ...]:
 
 
 class DistanceOptions(OptionSet, panel=Panel.FIGURES):
-    """What a comparison, or that of a run, measures besides the vertical error.
+    """What a comparison measures in addition to the vertical error.
 
-    `share` and `also` hold pairs: of bounds in metres, and of a name and a path. They may be given
-    as texts; `also` may be a dict too.
+    `share` has pairs of bounds in metres, and `also` pairs of a name and a path. Both may be given
+    as text; `also` may be a dict, too.
     """
 
     m3c2: bool = option(False, needs="reference")
@@ -247,12 +247,12 @@ class DistanceOptions(OptionSet, panel=Panel.FIGURES):
 
     @property
     def from_reference(self) -> bool:
-        """Whether C2C is wanted from each point of the reference."""
+        """Whether C2C is computed from each point of the reference."""
         return self.direction in ("from-reference", "both")
 
 
 class CompareRules(DistanceOptions, panel=Panel.FIGURES):
-    """What is measured of two clouds."""
+    """What a comparison of two clouds measures."""
 
     submerged: bool = option(False, basic=True)
     """Compare only points of class 40, or below --water."""
@@ -274,7 +274,7 @@ class CompareRules(DistanceOptions, panel=Panel.FIGURES):
 
     @property
     def vertical(self) -> bool:
-        """Whether signed differences are wanted, and all that is computed from them."""
+        """Whether signed differences, and all that follows from them, are computed."""
         return not self.c2c_only
 
 
@@ -299,7 +299,7 @@ class CompareOptions(OverwriteOption, SummaryOption, CompareRules, panel=Panel.O
 
 
 class StageCompareOptions(ReferenceOption, CompareOptions):
-    """The options of the stage ``compare`` of PDAL, whose cloud is in no file."""
+    """The options of the PDAL stage ``compare``, whose cloud is not a file."""
 
     reference: File | None = option(None, basic=True, needed="needed")
 
@@ -337,7 +337,7 @@ class OrthoOptions(
 
 
 def _command(given: str) -> str:
-    """Check that a command names what it reads and writes."""
+    """Check that a command has the places for images and cloud."""
     missing = [one for one in ("{images}", "{cloud}") if one not in given]
     if given not in ("stereo", "") and missing:
         raise SettingError(
@@ -351,7 +351,7 @@ def _command(given: str) -> str:
 
 
 class RebuildOptions(OptionSet, panel=Panel.ROUNDS):
-    """Rounds of photographs without refraction and clouds from them."""
+    """Rounds that remove refraction from photographs and reconstruct a cloud from them."""
 
     rebuild: str | None = option(None, basic=True, then=_command, metavar="COMMAND")
     """Reconstruct the cloud from the photographs, in rounds: stereo (built in), or the command of

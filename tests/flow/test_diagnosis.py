@@ -66,7 +66,7 @@ def test_every_sign():
     # the README of the data: the land is 0.96 m too low
     assert report.figures["refraction"]["likely_error_m"] == pytest.approx(0.96, abs=0.05)
     text = cameras_text(report)
-    assert "The poses have absorbed the refraction" in text
+    assert "the poses have absorbed the refraction" in text
     assert "--gcps" in text
 
 
