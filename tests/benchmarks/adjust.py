@@ -1,11 +1,7 @@
-"""Adjustments of simulated blocks: how fast, whether their standard errors hold, how far off.
+"""Adjustments of simulated blocks: whether their standard errors hold, and how far off they are.
 
-    python -m tests.benchmarks.adjust speed [--points 25000 50000 100000]
     python -m tests.benchmarks.adjust errors [--blocks 40] [--seed 1000]
     python -m tests.benchmarks.adjust kinds [--kinds "no land"] [--seeds 0 1] [--ties cloud]
-
-speed : Blocks of nadir images over land and bed, from poses that are off; kernels are compiled
-    before. The peak memory is that of the process so far.
 
 errors : Blocks of a dozen or two images from poses that an adjustment without water left, adjusted
     as ``pcfix adjust`` does by default: with a lens that has a term of 0.2 to 0.5 px at the corner
@@ -21,9 +17,7 @@ kinds : Blocks of other shapes. Poses as an unaware adjustment left them, GNSS o
 """
 
 import argparse
-import resource
 import tempfile
-import time
 import warnings
 from collections import Counter, defaultdict
 from pathlib import Path
@@ -32,36 +26,11 @@ import laspy
 import numpy as np
 
 import pcfix
-from pcfix.adjust.block import Unknowns
-from pcfix.adjust.problem import solved_cameras
 from pcfix.errors import PcfixError, PcfixWarning
 from tests.utils import block_kinds, model_errors
-from tests.utils.tie_blocks import adjusted, block_of
-from tests.utils.tie_points import simulate_tie_points
 
 COLUMNS = ("f", "cx", "cy", "omega", "phi", "kappa", "X", "Y", "Z")
 GOOD_GSD, COVERED = 1.5, 0.8
-
-
-def speed(given):
-    print("points   observations   wall s    cpu s  steps  us/obs    MB  centres m")
-    for points in (1000, *given.points):
-        scene = simulate_tie_points(
-            points=points, area_m=(240.0, 160.0), position_noise_m=0.05, attitude_noise_deg=0.06
-        )
-        block = block_of(scene)
-        started, cpu = time.perf_counter(), time.process_time()
-        problem, found = adjusted(block, Unknowns(lens=("f",)))
-        off = solved_cameras(problem, found).centres - scene.true_cameras.centres
-        wall, cpu = time.perf_counter() - started, time.process_time() - cpu
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-        if points > 1000:  # the first block compiles the kernels
-            print(
-                f"{points:<8} {len(block.camera):>12} {wall:>8.1f} {cpu:>8.1f} {len(found.log):>6}"
-                f" {1e6 * cpu / len(block.camera):>7.1f} {peak:>5.0f}"
-                f" {np.sqrt((off**2).sum(axis=1).mean()):>10.4f}",
-                flush=True,
-            )
 
 
 def errors(given):
@@ -151,9 +120,6 @@ def one_kind(folder, kind, seed, ties):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     actions = parser.add_subparsers(required=True)
-    action = actions.add_parser("speed")
-    action.set_defaults(run=speed)
-    action.add_argument("--points", type=int, nargs="+", default=[25_000, 50_000, 100_000])
     action = actions.add_parser("errors")
     action.set_defaults(run=errors)
     action.add_argument("--blocks", type=int, default=40, help="of each kind")
