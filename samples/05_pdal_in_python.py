@@ -16,5 +16,5 @@ pipeline.execute()
 points = pipeline.arrays[0]
 moved = points["RayCount"] > 0
 print(
-    f"{moved.sum():,} of {len(points):,} points moved, deepest {points['WaterDepth'].max():.2f} m"
+    f"{moved.sum():,} of {len(points):,} points corrected, deepest {points['WaterDepth'].max():.2f} m"
 )
