@@ -7,6 +7,7 @@ glass and water. The correction uses Snell's law instead, and shares nothing wit
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -107,7 +108,7 @@ def fermat_directions(points: FloatArray, port: Port, n: float) -> FloatArray:
         """Return the derivatives of the optical length by the places at the faces."""
         at = [place(face, s[:, i]) for i, face in enumerate(faces)]
         nodes = [ends[0], *(where for where, _ in at), ends[1]]
-        ways = [b - a for a, b in zip(nodes, nodes[1:], strict=False)]
+        ways = [b - a for a, b in pairwise(nodes)]
         pulls = [
             index * way / np.linalg.norm(way, axis=1)[:, None]
             for index, way in zip(indices, ways, strict=True)
