@@ -101,9 +101,9 @@ class Inputs(MaskOption, InputOptions):
             cameras, to_cloud = self.cameras, None
         else:
             read = self.read() if read is None else read
-            way = self._georeferenced(read, cloud_crs)
-            cameras, to_cloud = way.cameras(read), way.points
-            _warn(way.notes)
+            placement = self._georeferenced(read, cloud_crs)
+            cameras, to_cloud = placement.cameras(read), placement.points
+            _warn(placement.notes)
         if self.views is None:
             return cameras, None
         if read is not None and Path(self.views) == Path(str(self.cameras)):
@@ -142,9 +142,9 @@ class Inputs(MaskOption, InputOptions):
         known = np.isfinite(ties.xyz).all(axis=1)
         if placed and not known.any():
             return None
-        way = self._georeferenced(read, cloud_crs)
+        placement = self._georeferenced(read, cloud_crs)
         xyz = np.full((len(ties.xyz), 3), np.nan)
-        xyz[known] = way.points(ties.xyz[known])
+        xyz[known] = placement.points(ties.xyz[known])
         return replace(ties, xyz=xyz)
 
 
@@ -203,17 +203,23 @@ def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:
         both = _without(both, [not one for one in tied], cameras_crs=None, cameras_offset=None)
     elif inputs.cameras_offset is not None and not any(tied):
         # It is unknown which of the two files is shifted: try the offset on both, and on either.
-        apart = adjusted.centres - original.centres[_rows(original.labels, adjusted.labels)]
+        difference = adjusted.centres - original.centres[_rows(original.labels, adjusted.labels)]
         offset = np.array(inputs.cameras_offset)
-        moves = {(True, True): apart, (True, False): apart - offset, (False, True): apart + offset}
-        best = min(moves, key=lambda way: np.median(np.linalg.norm(moves[way], axis=1)))
+        moves = {
+            (True, True): difference,
+            (True, False): difference - offset,
+            (False, True): difference + offset,
+        }
+        best = min(moves, key=lambda one: np.median(np.linalg.norm(moves[one], axis=1)))
         both = _without(both, best, cameras_offset=None)
     return both[0], both[1]
 
 
-def _without(both: list[Inputs], kept: Sequence[bool], **changes: Any) -> list[Inputs]:
-    """Return the inputs, with changes where `kept` is false."""
-    return [one if keep else replace(one, **changes) for one, keep in zip(both, kept, strict=True)]
+def _without(both: list[Inputs], unchanged: Sequence[bool], **changes: Any) -> list[Inputs]:
+    """Return the inputs, with changes where `unchanged` is false."""
+    return [
+        one if keep else replace(one, **changes) for one, keep in zip(both, unchanged, strict=True)
+    ]
 
 
 def original_ties(

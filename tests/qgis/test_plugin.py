@@ -60,7 +60,7 @@ def test_command_line(commands):
         "sigma_index": 0.01, "method": "auto", "overwrite": False, "views": "", "max_angle": None,
     }  # fmt: skip
     assert words_of(commands["correct"], values) == [
-        "correct", "a b.laz", "o.laz", "--water=-0.37", "--deep", "--sigma-index=0.01",
+        "correct", "a b.laz", "o.laz", "--water=-0.37", "--sigma-index=0.01", "--deep",
     ]  # fmt: skip
     sections = {"cloud": "a.laz", "reference": "b.laz", "section": "0,0,1,1; 2,2,3,3"}
     expected = ["compare", "a.laz", "b.laz", "--section=0,0,1,1", "--section=2,2,3,3"]
