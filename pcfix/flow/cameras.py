@@ -279,15 +279,15 @@ def cameras_text(report: CamerasReport) -> str:
     if gnss is not None and gnss["reason"]:
         rows.append(("GNSS", gnss["reason"]))
     if fit is not None:
-        seen = (f"{100.0 * part:.1f} % in {name}" for name, part in fit["seen_by"].items())
+        shares = ", ".join(f"{100.0 * part:.1f}" for part in fit["seen_by"].values())
         match = "cameras and cloud match" if fit["tested"] else "nothing could be tested"
         rows += [
             ("Cloud", f"{fit['cloud']} ({fit['points_sampled']:,} points sampled)"),
-            ("Visible", f"share of the points by number of images: {', '.join(seen)}"),
+            ("Visible", f"{shares} % of the points in {', '.join(fit['seen_by'])} images"),
             ("Check", fit["verdict"] or match),
-            *(("Tested", one) for one in fit["tested"]),
-            *(("Not tested", one) for one in fit["not_tested"]),
         ]
+        for label, tests in (("Tested", fit["tested"]), ("Not tested", fit["not_tested"])):
+            rows += [("" if i else label, one) for i, one in enumerate(tests)]
     if (found := report.diagnosis) is not None:
         says = {True: "absorbed: ", False: "not absorbed: ", None: "no evidence: "}
         verdict = f"not known; give control points (--gcps), or {EXPORT}"

@@ -125,7 +125,7 @@ def water_text(report: WaterReport) -> str:
         words += f"; {unknown:.1f} % have no surface above them" if unknown else ""
         rows.append(("Cloud", words))
     rows += shoreline_rows(r["shoreline"])
-    return aligned(f"Water surface {r['water']}: {r['surface']}", rows, found.notes)
+    return aligned(f"Water surface ({r['water']}): {r['surface']}", rows, found.notes)
 
 
 def water_figure(found: FoundSurface, cloud_xyz: FloatArray) -> Figure:
