@@ -16,7 +16,7 @@ from pcfix.grid.colours import DIFFERENCE, UNCERTAINTY
 from pcfix.grid.maps import Maps, MapsBuilder
 from pcfix.model import FloatArray
 from pcfix.report.page import Layer, Picture, Report, Table, label_plan, new_figure, render
-from pcfix.report.text import Rows, RowTable, aligned, filled, share
+from pcfix.report.text import Rows, RowTable, aligned, filled, share, wrapped
 from pcfix.sums import nice_step
 
 MOST_POINTS = 6000
@@ -86,7 +86,7 @@ def adjustment_text(d: Plain) -> str:
     rows = [(label[:1].upper() + label[1:], words) for label, words in _facts(d)]
     lines = [aligned("Refractive bundle adjustment", rows), "", *_residual_table(d).lines()]
     lines += ["", *surveyed.lines()[: 1 + MOST_LISTED]] if surveyed.rows else []
-    return "\n".join([*lines, *(f"Note: {note}" for note in all_notes(d))])
+    return "\n".join([*lines, *(wrapped("", f"Note: {note}") for note in all_notes(d))])
 
 
 def adjustment_page(adjusted: Adjusted, before: Intersected) -> str:

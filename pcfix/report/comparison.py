@@ -24,7 +24,7 @@ from pcfix.report.page import (
     name_of,
     new_figure,
 )
-from pcfix.report.text import aligned, share
+from pcfix.report.text import aligned, share, wrapped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -125,13 +125,14 @@ def comparison_text(c: Comparison) -> str:
                      f" {100 * m.significant_share:.0f} % of the distances beyond it"))  # fmt: skip
     head = f"Compared {c.cloud} with {c.reference} in {c.seconds:.1f} s"
     tables = [line for table in _tables(plain) for line in ("", *table.lines())]
-    return "\n".join([aligned(head, rows), *tables, *(f"Note: {note}" for note in c.notes)])
+    notes = [wrapped("", f"Note: {note}") for note in c.notes]
+    return "\n".join([aligned(head, rows), *tables, *notes])
 
 
 def noise_sentence(own: Plain, raw: Plain) -> str:
     """Return how the noise of the reference changes the errors of the cloud."""
     source = "assumed" if own["is_assumed"] else "stated"
-    noise = f"the reference's noise ({own['sigma_reference_m']:.3f} m, {source})"
+    noise = f"the noise of the reference ({own['sigma_reference_m']:.3f} m, {source})"
     if own["rmse_m"] is None:
         return f"the differences scatter no more than {noise}, so the cloud's error is not known."
     return (

@@ -7,6 +7,7 @@ repeated with the values by name of each. Terminal and report page use the same 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from string import Formatter
 from textwrap import fill
@@ -30,6 +31,8 @@ FEWEST = 59
 SHOWN_NAMES = 5
 WIDTH = 100
 """Columns of a printed line."""
+UNIT = re.compile(r"(?<=\d) (?=(?:m|cm|px|deg|%)(?:\W|$))")
+"""The space between a number and its unit."""
 
 _PART = ("Read", "{part_words}", "part_words")
 _NO_SURFACE = ("No surface", "{water_unknown:,} points have no water surface", "water_unknown")
@@ -150,16 +153,19 @@ def aligned(head: str, rows: Iterable[tuple[str, str]], notes: Iterable[object] 
     width = max([13, *(len(label) for label, _ in rows)])
     lines = [(f"  {label:<{width}} ", text) for label, text in rows]
     lines += [("", f"Note: {note}") for note in notes]
-    return "\n".join([head, *(_wrapped(start, text) for start, text in lines)])
+    return "\n".join([head, *(wrapped(start, text) for start, text in lines)])
 
 
-def _wrapped(start: str, text: str) -> str:
+def wrapped(start: str, text: str) -> str:
+    """Return a text in lines of `WIDTH` with a hanging indent, unless it has a command."""
     if "pcfix " in text:
         return start + text
-    return fill(
+    text = UNIT.sub("\xa0", text)  # a number and its unit stay together
+    lines = fill(
         text, WIDTH, initial_indent=start, subsequent_indent=" " * len(start),
         break_long_words=False, break_on_hyphens=False,
     )  # fmt: skip
+    return lines.replace("\xa0", " ")
 
 
 class _Numbers(Formatter):
