@@ -57,7 +57,9 @@ class Command(NamedTuple):
             elif name == "quiet":
                 shown.append(one.replace(annotation=Annotated[bool, _QUIET], default=False))
             else:
-                place = Parameter(help=self.helps[name], negative=())
+                place = Parameter(help=self.helps[name], negative=(), show_default=False)
+                if one.kind is one.KEYWORD_ONLY:
+                    place = Parameter.combine(place, Parameter(group=_GROUPS[Panel.OUTPUT]))
                 shown.append(one.replace(annotation=Annotated[hints[name], place]))
 
         def call(*places: Any, **given: Any) -> None:
