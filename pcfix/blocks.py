@@ -1,7 +1,7 @@
-"""Arrays that are larger than memory: they are in files, and are processed in blocks of rows.
+"""Arrays larger than memory: they are stored in files and processed in blocks of rows.
 
-Operations on single rows go through blocks of `ROWS` rows in the order of the file. So a result
-depends neither on tiles nor on threads. An array of one block is plain numpy.
+Blocks of `ROWS` rows are processed in the order of the file, so results depend neither on tiles nor
+on threads. An array of one block is plain numpy.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ ROWS = 1_000_000
 FEW_ROWS = 65_536
 """Rows of a block whose intermediate arrays fit into the processor's cache."""
 LARGE = 2_000_000
-"""An array with more rows is on disk, if there is a folder for it."""
+"""An array with more rows is stored on disk, if there is a folder for it."""
 
 
 def empty(shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64) -> Array:
-    """Return an array, on disk where it is large, values not set."""
+    """Return an array with undefined values, on disk if it is large."""
     return current().empty(shape, dtype) if shape[0] > LARGE else np.empty(shape, dtype)
 
 
 def release() -> None:
-    """Remove what was read of arrays on disk from memory; it is read again where it is used."""
+    """Free the memory of arrays on disk; they are read again when they are used."""
     current().release()
 
 
@@ -41,7 +41,7 @@ def blocks(count: int, most: int = ROWS) -> Iterator[slice]:
 
 
 def mapped(function: Callable[..., Any], *arrays: Array) -> Array:
-    """Return a function of arrays, (n, ...), that is computed row by row."""
+    """Apply a function that works row by row to arrays, (n, ...), block by block."""
     count, result = len(arrays[0]), None
     if count <= ROWS:
         return np.asarray(function(*arrays))
@@ -54,7 +54,7 @@ def mapped(function: Callable[..., Any], *arrays: Array) -> Array:
 
 
 def kept(mask: Array, array: Array) -> Array:
-    """Return the rows of an array, (n, ...), where a mask, (n,), is true; itself where all are."""
+    """Return the rows of an array, (n, ...), where a mask, (n,), is true."""
     count, done = int(np.count_nonzero(mask)), 0
     if count == len(mask):
         return array
@@ -67,7 +67,7 @@ def kept(mask: Array, array: Array) -> Array:
 
 
 def bounds(points: Array) -> tuple[Array, Array]:
-    """Return least and largest of each column of points, (n, d), both of shape (d,)."""
+    """Return the minimum and maximum of each column of points, (n, d), both of shape (d,)."""
     ends = [
         [(column.min(), column.max()) for column in points[rows].T] for rows in blocks(len(points))
     ]
@@ -83,7 +83,7 @@ def row_numbers(count: int) -> Array:
 
 
 def grouped(number: Array, groups: int, *columns: Array) -> tuple[Array, list[Array]]:
-    """Sort columns, (n, ...), by the number of their rows' group, (n,); rows of one keep order.
+    """Sort columns, (n, ...), by the group number of their rows, (n,), in a stable order.
 
     Returns
     -------

@@ -1,7 +1,7 @@
-"""Square cells over a cloud, whose values are collected chunk by chunk.
+"""Square cells over a cloud, with values that are accumulated chunk by chunk.
 
-The sides of cells are powers of two, in metres, and cells count from the origin of the world frame.
-So the cell of a point depends neither on other points nor on their order.
+The sides of cells are powers of two, in metres, and cells are numbered from the origin of the world
+frame. So the cell of a point depends neither on other points nor on their order.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ import numpy.typing as npt
 from pcfix.model import BoolArray, FloatArray, IntArray
 
 MOST_CELLS = 2**24
-"""Limits the memory; a larger cloud has larger cells."""
+"""Maximum number of cells, for the memory; a larger cloud has larger cells."""
 POINTS_A_CELL = 4.0
-"""Least mean number of points per occupied cell; cells are the smallest that have it."""
+"""Minimum mean number of points per occupied cell."""
 FINEST_M = 2.0**-10
 
 Values = npt.NDArray[Any]
 
 
 class CellFrame(NamedTuple):
-    """The side of square cells, and which is the first."""
+    """The side of square cells, and the number of the first one."""
 
     side_m: float
-    first_row: int  # northwards from the origin of the world frame
+    first_row: int  # counted northwards from the origin of the world frame
     first_column: int
 
     def cells(self, x: FloatArray, y: FloatArray) -> tuple[IntArray, IntArray]:
@@ -37,17 +37,17 @@ class CellFrame(NamedTuple):
 
 
 class Layer(NamedTuple):
-    """A value of each cell, or several."""
+    """The type of one value, or of several, of each cell."""
 
     empty: Values  # the value of a cell without points, with its type
-    merged: Callable[[Values, Values], Values]  # the values of two cells as of one
+    merged: Callable[[Values, Values], Values]  # combines the values of two cells
 
 
 class Cells:
-    """The finest cells, at most `most`, over a rectangle that grows with the points.
+    """At most `most` cells over a rectangle that grows with the points, as small as possible.
 
-    `low` and `high`, shape (2,), are its corners in metres, if they are known. `values` are those
-    of each layer, shape (..., rows, columns).
+    `low` and `high`, shape (2,), are the corners of the rectangle in metres, if they are known.
+    `values` has an array for each layer, shape (..., rows, columns).
     """
 
     def __init__(
@@ -61,9 +61,8 @@ class Cells:
         self.values = [np.empty((*layer.empty.shape, 0, 0), layer.empty.dtype) for layer in layers]
 
     def cover(self, low: FloatArray, high: FloatArray) -> None:
-        """Make the cells cover a rectangle too; they get larger if there would be too many."""
-        is_made = self.values[0].size > 0
-        if is_made and (low >= self._low).all() and (high <= self._high).all():
+        """Extend the cells to a rectangle; they get larger if there would be too many."""
+        if self.values[0].size > 0 and (low >= self._low).all() and (high <= self._high).all():
             return
         self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
         while True:
@@ -84,11 +83,11 @@ class Cells:
             self.values[i] = new
 
     def halve(self) -> None:
-        """Merge each four cells into one of twice the side."""
+        """Merge four cells at a time into one with twice the side."""
         side, row, column = self.frame
         for i, (layer, values) in enumerate(zip(self._layers, self.values, strict=True)):
             for first in (column, row):
-                # the first cell of a pair has an even number
+                # pad, so that the first cell of each pair has an even number
                 spare = first % 2, (first % 2 + values.shape[-1]) % 2
                 pad = [*[(0, 0)] * (values.ndim - 1), spare]
                 values = np.pad(values, pad, constant_values=layer.empty.flat[0])
@@ -97,9 +96,9 @@ class Cells:
         self.frame = CellFrame(2.0 * side, row // 2, column // 2)
 
     def coarsen(self, points: int, occupied: Callable[[Values], BoolArray]) -> None:
-        """Merge cells until those that are occupied have enough of some points on average.
+        """Merge cells until the occupied ones have enough of these points on average.
 
-        `occupied` says it of cells by the values of the first layer.
+        `occupied` returns which cells are occupied, from the values of the first layer.
         """
         while max(self.values[0].shape[-2:]) > 2:
             if points >= POINTS_A_CELL * np.count_nonzero(occupied(self.values[0])):

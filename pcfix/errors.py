@@ -43,41 +43,41 @@ class CodedError(Exception):
 
 
 class PcfixError(CodedError):
-    """A mistake that the user can correct; the command line prints it and exits with 1."""
+    """A mistake that the user can correct. The command line prints it and exits with code 1."""
 
 
 class InputError(PcfixError):
-    """A file that is missing, damaged, or not what it should be."""
+    """A file is missing, damaged, or of another kind."""
 
 
 def bad_file(path: object, code: str, sentence: str, **values: Any) -> InputError:
-    """Return the error of a file; the message is its path and a sentence."""
+    """Return an error whose message is the path of a file and a sentence."""
     return InputError(code, f"{path}: {sentence}", path=path, **values)
 
 
 class NoTiePointsError(InputError):
-    """A camera file without tie points; most steps do not need them."""
+    """A camera file has no tie points, which most steps do not need."""
 
 
 class SettingError(PcfixError, ValueError):
-    """An option or argument that breaks its rule."""
+    """An option or argument has a wrong value."""
 
 
 class GeometryError(PcfixError):
-    """Cloud, cameras and water that do not fit together."""
+    """Cloud, cameras and water do not match."""
 
 
 class PcfixWarning(CodedError, UserWarning):  # noqa: N818
-    """Something that affects the result and that the user can act on."""
+    """A warning: it affects the result, and the user can do something about it."""
 
 
 def coded(code: str, notes: Iterable[object]) -> list[PcfixWarning]:
-    """Return notes as warnings; those that are sentences only get a code."""
+    """Return notes as warnings; plain sentences get this code."""
     return [one if isinstance(one, PcfixWarning) else PcfixWarning(code, one) for one in notes]
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON can hold it: arrays as lists, None for numbers that are not finite."""
+    """Return a value in the types of JSON; numbers that are not finite become None."""
     if isinstance(value, PcfixWarning):
         return value.as_dict()
     if is_dataclass(value) and not isinstance(value, type):
@@ -100,10 +100,10 @@ _LIST = re.compile(r"\n(?=  )")
 
 
 def printable(message: str) -> str:
-    """Escape what a terminal cannot show, as messages quote the contents of files.
+    """Escape characters that a terminal cannot show, because messages quote the contents of files.
 
-    The result is one line, plus one for each entry of a list (lines that two spaces begin). A line
-    of more than 800 characters loses its middle: the file comes first and the remedy last.
+    The result is one line, plus one for each entry of a list (lines that start with two spaces).
+    Lines of more than 800 characters lose their middle: the file comes first, and the remedy last.
     """
 
     def one_line(text: str) -> str:
@@ -130,7 +130,7 @@ def refusal(error: Exception) -> str:
 
 
 def shown_once(read: Callable[[], _Found], notes: Callable[[_Found], Iterable[object]]) -> _Found:
-    """Call a function, and show those of its warnings that its result does not hold as notes."""
+    """Call a function, and show only the warnings that are not among the notes of its result."""
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("always", PcfixWarning)
         found = read()

@@ -30,13 +30,13 @@ KERNEL_SOURCES = (
     "label/*.py", "lens/*.py", "port/*.py", "refract/**/*.py", "water/*.py",
 )  # fmt: skip
 """Files with kernels, and those whose constants are compiled into them."""
-CACHES_KEPT = 5
-"""Compiled kernels of older versions that stay in the user's cache."""
+MOST_CACHES = 5
+"""Maximum number of folders of compiled kernels, of this and of older versions."""
 
 
 @cache
 def cache_folder() -> Path | None:
-    """Return the folder of the compiled kernels, made if need be; None if none can be written.
+    """Return the folder of the compiled kernels, created if necessary; None if it cannot be.
 
     numba compares a cached kernel with its own source file only, and does not see edits of the
     files that it imports. So the name of the folder has the version and a hash of the sources.
@@ -54,7 +54,7 @@ def cache_folder() -> Path | None:
     except (OSError, RuntimeError):  # a user without a home
         return None
     older = sorted(root.glob("kernels-*"), key=lambda path: path.stat().st_mtime)
-    for path in older[:-CACHES_KEPT]:
+    for path in older[:-MOST_CACHES]:
         shutil.rmtree(path, ignore_errors=True)
     return folder
 
@@ -66,8 +66,9 @@ def kernel(*, allocates: bool) -> Callable[[_Function], _Function]: ...
 def kernel(function: Any = None, *, allocates: bool = False) -> Any:
     """Compile a function that Python calls, and cache the result.
 
-    With `allocates` it may make arrays. Without, numba counts no references to arrays, which takes
-    two locked operations for every array of every argument: a third of the time of a correction.
+    With `allocates` the function may create arrays. Without it, numba does not count references to
+    arrays. Counting takes two locked operations for every array of every argument: a third of the
+    time of a correction.
     """
     if function is None:
         return partial(_compile, allocates=allocates)
@@ -80,7 +81,7 @@ def _compile(function: _Function, *, allocates: bool = False) -> _Function:
     if folder is None:
         _warn_of_no_cache()
         return cast(_Function, numba.njit(**options)(function))
-    # numba reads its setting when the function is declared; functions of others keep theirs
+    # numba reads its setting when a function is declared; those of other packages keep theirs
     before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
     try:
         return cast(_Function, numba.njit(cache=True, **options)(function))
@@ -95,8 +96,8 @@ def device(*, allocates: bool = False, **options: Any) -> Callable[[_Function], 
 def device(function: Any = None, *, allocates: bool = False, **options: Any) -> Any:
     """Compile a function that only kernels call; it becomes part of their cached code.
 
-    It has no wrappers for Python and C, which would take a third of the first run: a call from
-    Python ends the process. Tests call it through ``tests.utils.compiled``.
+    It has no wrappers for Python and C, whose compilation would take a third of the first run.
+    Therefore a call from Python ends the process; tests use ``tests.utils.compiled``.
     `allocates` is as for `kernel`; `options` are further options of ``numba.njit``.
     """
     decorator = numba.njit(
@@ -120,21 +121,21 @@ def _warn_of_no_cache() -> None:
 
 
 Span: TypeAlias = tuple[int, int]
-"""The first of the rows of a tile, and the one after its last."""
+"""The first row of a tile, and the row after its last."""
 
 TILES_A_THREAD = 8
-"""Tiles for each thread: some take longer than others."""
+"""Number of tiles for each thread, because some take longer than others."""
 
-ALONE_S = 2e-4
-"""About as long as a thread takes to begin."""
+THREAD_START_S = 2e-4
+"""Approximate time that a thread takes to start."""
 
 
 def in_tiles(run: Callable[..., Any], rows: int, *given: Any, points: int = 0) -> None:
-    """Call ``run((first, last), *given)`` for all rows, a tile of them at a time in each thread.
+    """Call ``run((first, last), *given)`` for tiles of rows, in several threads.
 
-    No row may depend on another one: which share a tile depends on the number of threads. Other
-    threads help if there is work for more than `ALONE_S`, or so few rows that each is a tile. The
-    progress of `points` points, in all rows, goes to `pcfix.running.Run.report`.
+    The result of a row must not depend on other rows, because the tiles depend on the number of
+    threads. Further threads start after `THREAD_START_S`, or at once if each row is a tile.
+    `pcfix.running.Run.report` gets the progress in points; `points` are those of all rows.
     """
     if not rows:
         return
@@ -143,13 +144,13 @@ def in_tiles(run: Callable[..., Any], rows: int, *given: Any, points: int = 0) -
     tiles = min(rows, TILES_A_THREAD * count) if count > 1 or points else 1
     edges = [rows * i // tiles for i in range(tiles + 1)]
     if tiles > 1 and edges[1] > 1:
-        edges.insert(1, -(-edges[1] // TILES_A_THREAD))  # a small one shows how long others take
+        edges.insert(1, -(-edges[1] // TILES_A_THREAD))  # a small tile first, to measure the time
     spans = iter(pairwise(edges))
 
     def report(span: Span) -> None:
         how.report(points * (span[1] - span[0]) / rows)
 
-    busy_from = time.perf_counter() + ALONE_S
+    busy_from = time.perf_counter() + THREAD_START_S
     if tiles < rows or count == 1:
         for span in spans:
             run(span, *given)
@@ -158,7 +159,7 @@ def in_tiles(run: Callable[..., Any], rows: int, *given: Any, points: int = 0) -
                 break
     rest = [*spans]
     if rest:
-        with ThreadPoolExecutor(count) as pool:  # after an error no further tile begins
+        with ThreadPoolExecutor(count) as pool:  # after an error no further tile starts
             done = pool.map(lambda span: run(span, *given), rest)
             for span, _ in zip(rest, done, strict=True):
                 report(span)
@@ -166,7 +167,7 @@ def in_tiles(run: Callable[..., Any], rows: int, *given: Any, points: int = 0) -
 
 @device
 def most_between(span: Span, start: npt.NDArray[np.int64]) -> int:
-    """Return how many entries, ``start[i]`` to ``start[i + 1]``, a row of a tile has at most."""
+    """Return the most entries, ``start[i]`` to ``start[i + 1]``, of a row of a tile."""
     most = 0
     for i in range(*span):
         most = max(most, start[i + 1] - start[i])

@@ -1,4 +1,4 @@
-"""Import libraries that may be missing: those of extras, and open3d with its libusb."""
+"""Import libraries that may be missing: those of extras, and open3d, which needs libusb."""
 
 import ctypes
 import importlib
@@ -10,7 +10,7 @@ from pcfix.errors import InputError
 
 
 def optional_library(name: str, extra: str, who: str) -> Any:
-    """Import a library of an extra; an error has the command that installs it."""
+    """Import a library of an extra; the error names the command that installs it."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -37,8 +37,8 @@ def photo_library(name: str) -> Any:
 def load_open3d(part: str = "open3d") -> Any:
     """Import open3d, or a part of it, with libusb-1.0.
 
-    The camera drivers in open3d link to libusb-1.0 of the system, which servers often lack; the
-    one in the package libusb-package serves as well.
+    The camera drivers in open3d link to libusb-1.0 of the system, which servers often lack. The one
+    in the package libusb-package works as well.
     """
     try:
         try:

@@ -1,7 +1,7 @@
-"""The frozen dataclasses that pass between the rooms.
+"""Data types that all folders share, as frozen dataclasses.
 
-Frames, once for all: the *world* is the cloud's own projected CRS, metres, right-handed, Z up.
-The *camera frame* is OpenCV's: x right, y down, z forward; ``x_camera = R (x_world - C)``.
+Frames: the *world* is the cloud's own projected CRS, metres, right-handed, Z up. The *camera frame*
+is OpenCV's: x right, y down, z forward; ``x_camera = R (x_world - C)``.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ Projection = Literal[
 ViewKind = Literal["tracks", "depth-maps", "pairs", "pair-images"]
 
 NOMINAL_WIDTH_PX = 5472.0
-"""Of lenses in millimetres whose pixel size is not known: the longer side of a survey drone's
-camera of 20 megapixels, 13.2 mm of pixels of 2.4 um."""
+"""Width of the image of a lens in millimetres whose pixel size is unknown: that of a survey drone's
+camera of 20 megapixels, 13.2 mm with pixels of 2.4 um."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """An interior orientation: how a direction in the camera frame becomes a place in the image.
+    """An interior orientation: it maps a direction in the camera frame to image coordinates.
 
-    Three steps. First the direction (X, Y, Z), at the angle theta from the axis, is projected;
-    with (e, g) = (X, Y) / hypot(X, Y):
+    There are three steps. First the direction (X, Y, Z), at the angle theta from the axis, is
+    projected; with (e, g) = (X, Y) / hypot(X, Y):
 
     =============  =============================================  =========================
     `projection`   plane coordinates (x, y)                       `shape`
@@ -61,7 +61,7 @@ class Lens:
              + (p1 (r^2 + 2 x^2) + 2 p2 x y) (1 + p3 r^2 + p4 r^4) + s1 r^2 + s2 r^4
         y' = y (...) + (p2 (r^2 + 2 y^2) + 2 p1 x y) (...) + s3 r^2 + s4 r^4
 
-    and last the image, origin in the upper left corner of the upper left pixel:
+    and last the image coordinates, from the upper left corner of the upper left pixel:
 
         u = principal_x + (focal + b1) x' + b2 y'
         v = principal_y + focal y' + b3 x'
@@ -74,7 +74,7 @@ class Lens:
     shape : tuple of float
         The parameters of the projection, see the table.
     radial, denominator : tuple of float
-        k1, k2, ... and d1, d2, ...; as many as there are.
+        k1, k2, ... and d1, d2, ...; any number of them.
     tangential : tuple of float
         p1 ... p4 in Brown's order (Metashape's; OpenCV's p1 and p2 the other way round).
     thin_prism : tuple of float
@@ -82,12 +82,12 @@ class Lens:
     distortion_centre : tuple of 2 float
         In plane coordinates.
     inverse : bool
-        Brown's formula goes from (x', y') to (x, y) instead.
+        Brown's formula maps (x', y') to (x, y) instead.
     in_turn : bool
         The tangential and thin prism terms use x, y and r after the radial terms (COLMAP's
         RAD_TAN_THIN_PRISM_FISHEYE).
     sensor : str
-        Its name in the source.
+        Name of the sensor in the camera file.
     unit : {"px", "mm"}
     """
 
@@ -142,18 +142,18 @@ class Cameras:
     centres : array, shape (k, 3)
         Projection centres, metres, world frame.
     rotations : array, shape (k, 3, 3), or None
-        World to camera. None when the source has no angles; then every camera is a candidate
-        for every point.
+        World to camera. None if the file has no angles; then every camera is a candidate for
+        every point.
     lenses : tuple of Lens, length k, or None
-        Interior orientation of each image. None where the source has none; then a frame holds
-        every point in front of the camera.
+        Interior orientation of each image. None if the file has none; then every point in front
+        of the camera counts as in its frame.
     crs : str or None
         CRS of centres and rotations: what pyproj understands (geocentric ones are allowed), or
         ``ENU:latitude,longitude,height`` for axes east, north, up at that place, or ``local``
-        where the source says that its frame is not tied to the earth. None when it does not
-        say; then the cloud's CRS is assumed.
+        if the file states that its frame is not tied to the earth. None if it states nothing;
+        then the CRS of the cloud is assumed.
     project_crs : str or None
-        The CRS in which the software delivers its clouds, where that is not `crs`.
+        The CRS in which the software exports its clouds, if that is not `crs`.
     gnss : GnssPositions or None
     unposed : tuple of str
         Images without a pose, which are excluded.
@@ -175,7 +175,7 @@ class Cameras:
     source: str = ""
 
     def __post_init__(self) -> None:
-        """Check that the arrays belong together."""
+        """Check the shapes of the arrays."""
         k = len(self.labels)
         if self.centres.shape != (k, 3):
             shape = self.centres.shape
@@ -197,7 +197,7 @@ class Cameras:
 
 
 NO_CAMERAS = Cameras((), np.zeros((0, 3)))
-"""For a correction without cameras; see `MethodOptions.check_no_cameras`."""
+"""The cameras of a correction without any; see `MethodOptions.check_no_cameras`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +210,7 @@ class WaterPlane:
 
     def __str__(self) -> str:
         if self.b == self.c == 0.0:
-            return f"level {self.a:g} m"
+            return f"level {round(self.a, 3):.9g} m"
         return f"plane z = {self.a:g} + {self.b:g} x + {self.c:g} y"
 
 
@@ -218,7 +218,7 @@ class WaterPlane:
 class WaterDimension:
     """A dimension of the cloud that holds the height (m) of the water surface above each point.
 
-    The surface is taken as level above each point.
+    The surface is assumed to be level above each point.
     """
 
     name: str
@@ -253,8 +253,8 @@ class WaterMesh:
 class WaterRaster:
     """Heights on a regular grid, bilinear between the centres of the cells.
 
-    The height of a place is known if those of all four centres around it are. In the outer half of
-    the cells at the edge it is extrapolated, so that a raster without gaps covers all its cells.
+    The height at a position is known if the heights of all four centres around it are. In the outer
+    half of the cells at the edge it is extrapolated, so a raster without gaps covers all its cells.
 
     Attributes
     ----------
@@ -275,7 +275,7 @@ class WaterRaster:
     name: str = "raster"
 
     def __post_init__(self) -> None:
-        """Check that it is a raster with some heights."""
+        """Check size, position and heights."""
         shape = self.height_m.shape
         if len(shape) != 2 or min(shape) < 2:
             raise SettingError(
@@ -304,15 +304,18 @@ WaterSurface: TypeAlias = WaterPlane | WaterDimension | WaterMesh | WaterRaster
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Which cameras made each of n points: rows of a ragged table.
+    """The images that contributed to each of n points: a view list, as a ragged table.
 
-    The cameras of point i are ``camera[start[i]:start[i + 1]]``, row numbers of `Cameras`;
-    `weight`, where the source has one, is what each of them counted for, in the same order.
+    The images of point i are ``camera[start[i]:start[i + 1]]``, row numbers of `Cameras`. `weight`
+    has the weight of each of them in the same order, if the list states weights.
 
-    As `tracks` they are the images whose rays were intersected; as `depth-maps` those whose depth
-    maps, each matched with other images, were averaged; as `pairs` the entries 2i and 2i + 1 of a
-    point are the two images of its stereo pair i, of whose places the point is the median; as
-    `pair-images` they are the images of such pairs, any two that were matched.
+    The kind states what these images are:
+
+    - `tracks`: the images whose rays were intersected;
+    - `depth-maps`: the images whose depth maps were averaged, each matched with other images;
+    - `pairs`: entries 2i and 2i + 1 are the images of stereo pair i; the point is the median over
+      the pairs;
+    - `pair-images`: the images of such pairs; any two of them may have been matched.
     """
 
     start: IntArray
@@ -321,7 +324,7 @@ class Views:
     kind: ViewKind = "tracks"
 
     def take(self, rows: IntArray) -> Views:
-        """Return the views of the given points, in that order."""
+        """Return the view list of the given points, in that order."""
         counts = (self.start[1:] - self.start[:-1])[rows]
         start = np.concatenate([[0], np.cumsum(counts)])
         where = np.repeat(self.start[rows] - start[:-1], counts) + np.arange(start[-1])
@@ -331,16 +334,16 @@ class Views:
 
 @dataclass(frozen=True, eq=False)
 class TiePoints:
-    """The m points of a sparse model, and their o image points."""
+    """The m tie points of a model, and their o observations."""
 
     xyz: FloatArray  # (m, 3), in the frame of the cameras that were read with them; NaN if unknown
-    views: Views  # the cameras that observed each point
-    image_xy: FloatArray  # (o, 2), in the unit of the lens from the upper left corner, as `views`
+    views: Views  # the images that observed each point
+    image_xy: FloatArray  # (o, 2), in the unit of the lens, from the upper left corner
 
 
 @dataclass(frozen=True, eq=False)
 class GroundControl:
-    """The m surveyed points, and their o image points.
+    """The m control and check points, and their o observations.
 
     A point on a surface (``on``) may have no coordinates: NaN, and infinite standard deviations.
     """
@@ -360,7 +363,7 @@ class GroundControl:
 
     @property
     def surveyed(self) -> GroundControl:
-        """Those with coordinates."""
+        """The points with coordinates."""
         known = np.asarray(np.isfinite(self.xyz).all(axis=1))
         kept, rows = known[self.point], np.flatnonzero(known)
         return replace(
@@ -388,9 +391,9 @@ class Outcome(IntEnum):
     ONE_CAMERA = 3
     PARALLEL_RAYS = 4
     NOT_TRANSFERRED = 5
-    """It could not be transferred to the adjusted cameras."""
+    """It could not be transferred to the adjusted poses."""
     FLAT_RAYS = 6
-    """Two cameras or more see it, but fewer than two within the largest angle."""
+    """Two images or more show it, but fewer than two rays are within the maximum angle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -423,15 +426,15 @@ class Correction:
     camera_used : array of bool, shape (k,)
         Cameras with at least one ray.
     water_known : array of bool, shape (n,)
-        Whether the water surface has a height above the point.
+        Whether the height of the water surface above the point is known.
     lowest_water_m : float
-        The lowest height of the water surface above any point; infinite where none is known.
+        The lowest height of the water surface above any point; infinite if none is known.
     covariance_m2 : array, shape (n, 6), or None
         Covariances of the coordinates: xx, xy, xz, yy, yz, zz; see `pcfix.refract.uncertainty`.
         None if they were not requested.
     unsure : array of bool, shape (n,), or None
-        Corrected points that only oblique images see, without a view list; see
-        `pcfix.refract.batch.Batch.seen_flat`. None if the option `unsure` is ``keep``.
+        Corrected points that are visible in oblique images only, without a view list. None if the
+        option `unsure` is ``keep``.
     """
 
     apparent_xyz: FloatArray
@@ -450,7 +453,7 @@ class Correction:
 
     @cached_property
     def xyz(self) -> FloatArray:
-        """Corrected points, metres, world frame; land and uncorrected points are apparent ones."""
+        """Corrected points, metres, world frame; for land and uncorrected points apparent ones."""
         xyz = self.apparent_xyz.copy()
         xyz[self.moved] += self.shift_m[self.moved]
         return xyz
@@ -474,6 +477,6 @@ class Correction:
 
     @cached_property
     def moved(self) -> BoolArray:
-        """Points with a shift: corrected ones, and land after a transfer to adjusted cameras."""
-        x, y, z = self.shift_m.T  # axis by axis: numpy is slow along the short one
+        """Points with a shift: corrected ones, and land after a transfer to adjusted poses."""
+        x, y, z = self.shift_m.T  # by axis, because numpy is slow along the short one
         return np.asarray(self.corrected | (x != 0.0) | (y != 0.0) | (z != 0.0))

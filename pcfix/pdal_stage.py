@@ -1,7 +1,7 @@
 """The functions of PDAL's ``filters.python``: correct, label, clean and compare.
 
-A pipeline imports one of them, which belongs to the stage that imports it: PDAL passes options,
-metadata and the report through the globals of the stage's source::
+A pipeline imports one of them. PDAL passes options, metadata and the report through the globals of
+the source of the stage::
 
     {
       "type": "filters.python",
@@ -25,7 +25,6 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
@@ -34,7 +33,7 @@ import numpy as np
 from pcfix.errors import PcfixError, SettingError, show_warning
 from pcfix.io.pdal import NAME, OUTCOME, Dimensions, PdalCloud, Results, metadata_of
 from pcfix.model import LOW_NOISE, WaterDimension, WaterSurface
-from pcfix.options.declare import Option, OptionSet, named, options_of
+from pcfix.options.declare import OptionSet, named, options_of
 from pcfix.options.shared import PartOptions
 
 Set = TypeVar("Set", bound=OptionSet)
@@ -49,7 +48,7 @@ COLOURS = ("Red", "Green", "Blue")
 
 
 def __getattr__(name: str) -> Stage:
-    """Return the function of that name for the globals of the module that imports it."""
+    """Return the stage of this name, bound to the globals of the module that imports it."""
     work = {"correct": _correct, "label": _label, "clean": _clean, "compare": _compare}.get(name)
     if work is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -64,7 +63,7 @@ def __getattr__(name: str) -> Stage:
 def _run(work: Work, namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> bool:
     """Run with libraries separate from PDAL's, and leave the process usable after a failure."""
     before = sys.getdlopenflags()
-    # PDAL links to a PROJ and a GDAL of its own; two of a kind crash the program at its exit
+    # PDAL links to its own PROJ and GDAL; sharing symbols with ours crashes the program at its exit
     sys.setdlopenflags(os.RTLD_NOW | getattr(os, "RTLD_DEEPBIND", 0))
     in_program = "redirector" in sys.modules and "pdal" not in sys.modules
     try:
@@ -83,8 +82,8 @@ def _run(work: Work, namespace: dict[str, Any], ins: Dimensions, outs: Dimension
         sys.setdlopenflags(before)
     sentence = str(mistake)
     if in_program:
-        # the program prints an error as the repr of each line of a traceback, and always one: the
-        # sentence is printed before that, and the traceback cut down to its last line
+        # The program always prints a traceback, each line as a repr. So the sentence is printed
+        # before it, and the traceback is reduced to its last line.
         sys.stderr.write(f"pcfix: {mistake}\n")
         sys.tracebacklimit = 0
         sentence = "refused, see the line above"
@@ -172,7 +171,7 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
 
 
 def _compare(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
-    """Compare, and pass all points on unchanged."""
+    """Compare the cloud, and pass all points on unchanged."""
     from pcfix.flow.compare import compare_clouds
     from pcfix.options.steps import StageCompareOptions
 
@@ -183,7 +182,7 @@ def _compare(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
 
 
 def _options(namespace: dict[str, Any], kind: type[Set]) -> Set:
-    """Return the stage's options, of the right types."""
+    """Return the options of the stage, checked."""
     given = namespace.get("pdalargs") or {}
     if not isinstance(given, dict):
         sentence = f"pdalargs: must be an object of options, not {given!r}."
@@ -195,31 +194,16 @@ def _options(namespace: dict[str, Any], kind: type[Set]) -> Set:
     given = {name.replace("-", "_"): value for name, value in given.items()}
     elsewhere = {"port", *(one.name for one in options_of(PartOptions))}  # readers choose points
     known = {one.name: one for one in options_of(kind) if one.name not in elsewhere}
-    values = {
-        name: _converted(known[name], value)
-        for name, value in named(given, known.values(), "pdalargs").items()
-        if value is not None
-    }
-    options = kind(**values)
+    values = named(given, known.values(), "pdalargs")
+    for name, value in values.items():
+        if known[name].type is Any and isinstance(value, list | dict | bool):
+            sentence = f"pdalargs: {name} must be a text or a number, not {json.dumps(value)}."
+            raise SettingError("option.type", sentence, option=name, value=value)
+    options = kind(**{name: value for name, value in values.items() if value is not None})
     if missing := options.missing():
         sentence = f"pdalargs: the option '{missing.name}' is needed."
         raise SettingError("option.missing", sentence, option=missing.name)
     return options
-
-
-def _converted(one: Option, value: Any) -> Any:
-    """Return a value of JSON as the options take it; numbers may be text, and a list one value."""
-    if one.repeats and not isinstance(value, list):
-        return (value,)
-    if isinstance(value, str) and one.parse is None and {int, float} & {*one.kinds}:
-        with suppress(ValueError):
-            return float(value)
-    if isinstance(value, int | float) and isinstance(one.default, tuple):
-        return str(value)
-    if one.type is Any and isinstance(value, list | dict | bool):
-        sentence = f"pdalargs: {one.name} must be a text or a number, not {json.dumps(value)}."
-        raise SettingError("option.type", sentence, option=one.name, value=value)
-    return value
 
 
 def _chunks(
@@ -247,7 +231,7 @@ def _chunks(
 
 
 def _view(cloud: PdalCloud) -> CloudView:
-    """Return what is known of the cloud, and all its points."""
+    """Return the facts of the cloud, and its points."""
     from pcfix.flow.surfaces import CloudView, corners
 
     def chunks(water: WaterSurface | None = None, names: Iterable[str] = ()) -> Iterator[Points]:
@@ -262,8 +246,8 @@ def _view(cloud: PdalCloud) -> CloudView:
 def _repair_process(error: BaseException) -> None:
     """Undo what PDAL's plugin does to a Python process when a stage fails.
 
-    It releases one reference too many to the exception's class, which in the end frees the class;
-    and it leaves stdout redirected until a pipeline succeeds.
+    It releases one reference too many to the class of the exception, which finally frees the class.
+    And it leaves stdout redirected until a pipeline succeeds.
     """
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(type(error)))
     pdal = sys.modules.get("pdal")

@@ -1,7 +1,7 @@
-"""How a command runs: its threads, its progress, and where its large arrays are.
+"""Settings of a running command: threads, progress, and where large arrays are stored.
 
-These travel in one value, `Run`, that `running` sets for the current thread, so that no kernel or
-search has them as arguments. No result depends on them. Other threads begin with the defaults.
+`running` sets them, as one value `Run`, for the current thread. So no kernel or search needs them
+as arguments. No result depends on them. Other threads start with the defaults.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy.typing as npt
 from pcfix.errors import SettingError
 
 Empty: TypeAlias = Callable[[tuple[int, ...], npt.DTypeLike], npt.NDArray[Any]]
-"""Makes an array of a shape and type, values not set: `numpy.empty`, or one on disk."""
+"""Creates an array with undefined values: `numpy.empty`, or an array on disk."""
 
 
 def _nothing(*given: object) -> None:
@@ -36,20 +36,20 @@ def _available_cores() -> int:
 
 @dataclass(frozen=True)
 class Run:
-    """How the work of a command is done.
+    """Settings of a running command.
 
     Attributes
     ----------
     threads : int
-        Number of threads of kernels and searches.
+        Number of threads for kernels and searches.
     report : callable
-        Called with the number of points that a method of correction has just finished.
+        Called with the number of points that have just been corrected.
     empty : callable
-        Makes large arrays; `pcfix.io.files.scratch_arrays` makes them on disk.
+        Creates large arrays; `pcfix.io.files.scratch_arrays` creates them on disk.
     release : callable
-        Removes what was read of arrays on disk from memory.
+        Frees the memory of arrays on disk.
     clouds : dict, optional
-        The points of small clouds by path, of a command that reads them more than once.
+        Points of small clouds by path, for commands that read them more than once.
     """
 
     threads: int
@@ -63,7 +63,7 @@ _RUN = ContextVar("pcfix_run", default=Run(_available_cores()))  # noqa: B039 (f
 
 
 def current() -> Run:
-    """Return how the current thread runs."""
+    """Return the settings of the current thread."""
     return _RUN.get()
 
 

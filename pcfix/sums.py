@@ -1,4 +1,4 @@
-"""Statistics that are added up with ``+``, over chunks and files, and the results of commands."""
+"""Statistics that are accumulated with ``+`` over chunks and files, and the results of commands."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from pcfix.errors import plain
 LEAST = {"join": np.minimum}
 MOST = {"join": np.maximum}
 SAME = {"join": lambda one, other: one}
-"""Metadata of fields of which the smallest or largest value counts, or that are the same."""
+"""Metadata of fields that are joined by the minimum, by the maximum, or by taking either value."""
 
 
 class Sums:
-    """The base of dataclasses whose fields are added up one by one.
+    """The base of dataclasses that are added field by field.
 
-    Numbers, arrays and sums are added, tuples joined; None is what is not known yet. Fields with
-    the metadata `LEAST`, `MOST` or `SAME` are joined otherwise.
+    Numbers, arrays and sums are added, and tuples are joined. None stands for a value that is not
+    known yet. Fields with the metadata `LEAST`, `MOST` or `SAME` are joined in another way.
     """
 
     def __add__(self, other: Self) -> Self:
-        """Return the statistics of the points of both."""
+        """Return the statistics of all points of both."""
         joined = {}
         for one in fields(self):  # type: ignore[arg-type]
             mine, theirs = getattr(self, one.name), getattr(other, one.name)
@@ -36,7 +36,7 @@ class Sums:
 
 
 def nice_step(least: float) -> float:
-    """Return the smallest of 1, 2, 5 times a power of ten that is not below a number."""
+    """Return the smallest number of the form 1, 2 or 5 times 10^k that is at least `least`."""
     if not least > 0.0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(least))
@@ -44,7 +44,7 @@ def nice_step(least: float) -> float:
 
 
 class Figures(SimpleNamespace):
-    """The results of a command by name, as its text and the JSON file of its summary have them."""
+    """The results of a command by name, for its printed summary and for ``--summary``."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""

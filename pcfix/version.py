@@ -1,3 +1,3 @@
-"""The version of pcfix, apart from the front door, so that every room can say it."""
+"""The version of pcfix."""
 
 __version__ = "0.1.0"

@@ -15,6 +15,5 @@ pipeline = pdal.Pipeline(json.dumps(job))
 pipeline.execute()
 points = pipeline.arrays[0]
 moved = points["RayCount"] > 0
-print(
-    f"{moved.sum():,} of {len(points):,} points moved, deepest {points['WaterDepth'].max():.2f} m"
-)
+deepest_m = points["WaterDepth"].max()
+print(f"{moved.sum():,} of {len(points):,} points corrected, deepest {deepest_m:.2f} m")

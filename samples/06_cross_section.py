@@ -1,4 +1,4 @@
-"""Plot a cross-section: water, the cloud as it came, corrected, and LiDAR.
+"""Plot a cross-section: water surface, input cloud, corrected cloud and LiDAR.
 
 Run 01_correct.py first.
 """

@@ -6,9 +6,9 @@
 # FOLDER   of the environment, default .venv in this checkout
 # EXTRAS   such as "vector,photos" or "test", default "vector": maps and shorelines
 #
-# Needs Python 3.11 or newer (PYTHON=... names another than python3). What Debian and Ubuntu keep
-# apart (venv, and the libraries that open3d links to) is installed with apt where that is
-# possible; elsewhere the names are printed.
+# Needs Python 3.11 or newer; PYTHON=... names another program than python3. On Debian and Ubuntu,
+# venv and the libraries that open3d needs are installed with apt if possible, else their names are
+# printed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 folder=${1:-.venv}
@@ -19,7 +19,7 @@ as_root() {
     if [ "$(id -u)" = 0 ]; then "$@"; elif command -v sudo >/dev/null; then sudo "$@"; else return 1; fi
 }
 
-# One installation at a time talks to apt, as it does not wait for itself.
+# Only one installation at a time may use apt.
 system_packages() (
     if command -v flock >/dev/null; then flock 9; fi
     if command -v apt-get >/dev/null && as_root apt-get update -qq &&
@@ -44,7 +44,7 @@ fi
 if [ ${#missing[@]} -gt 0 ]; then system_packages "${missing[@]}"; fi
 
 if [ ! -x "$folder/bin/python" ]; then "$python" -m venv "$folder"; fi
-# uv installs what pip would, in a seventh of the time; where it does not reach an index, pip does.
+# uv is seven times as fast as pip; if it cannot reach an index, pip is used.
 pip=("$folder/bin/python" -m pip)
 "${pip[@]}" install --quiet --upgrade pip uv || "${pip[@]}" install --quiet --upgrade pip
 index=${PIP_INDEX_URL:-$("${pip[@]}" config get global.index-url 2>/dev/null || true)}
@@ -52,7 +52,7 @@ what=(--quiet --editable ".$extras")
 UV_NATIVE_TLS=true "$folder/bin/uv" pip install --python "$folder/bin/python" \
     ${index:+--default-index "$index"} "${what[@]}" || "${pip[@]}" install "${what[@]}"
 if [ -z "${2:-}" ]; then
-    echo "compiling the kernels, so that the first correction need not wait for it ..."
+    echo "compiling the kernels, which would otherwise delay the first correction ..."
     warm=$(mktemp -d)
     "$folder/bin/pcfix" correct samples/scene/cloud.laz "$warm/out.laz" \
         --cameras samples/scene/cameras.csv --water 0.37 --quiet

@@ -79,7 +79,7 @@ def test_old_caches_go(tmp_path, monkeypatch):
     finally:
         kernels.cache_folder.cache_clear()
     assert found is not None and found.is_dir()
-    assert len(list(tmp_path.iterdir())) == kernels.CACHES_KEPT
+    assert len(list(tmp_path.iterdir())) == kernels.MOST_CACHES
 
 
 def test_no_arrays_returned_without_references():

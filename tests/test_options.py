@@ -4,11 +4,10 @@ import pytest
 
 import pcfix
 from pcfix.cli.commands import COMMANDS
-from pcfix.options.correct import LEVEL_M, CorrectOptions, ScienceOptions
+from pcfix.options.correct import LEVEL_M, CorrectOptions, RunOptions, ScienceOptions
 from pcfix.options.declare import options_of
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX, Panel
 from pcfix.options.steps import SIGMA_REFERENCE_M
-from pcfix.options.survey import RunOptions
 from pcfix.water.index import with_index
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
@@ -42,7 +41,6 @@ def test_declared(kind):
         ({"index": 1.7}, "option.range", {"option": "index"}),
         ({"sigma_image": float("nan")}, "option.range", {"option": "sigma_image"}),
         ({"cameras_offset": "1,2"}, "option.count", {"option": "cameras_offset"}),
-        ({"respect_classes": 2}, "option.type", {"option": "respect_classes"}),
         ({"respect_classes": "2,ground"}, "option.type", {"option": "respect_classes"}),
         ({"depth_factor": 1.4}, "option.needs", {"needs": "method factor"}),
         ({"least_pool": 3.0}, "option.needs", {"needs": "connected"}),
@@ -58,6 +56,9 @@ def test_texts_and_values():
     given = {"respect_classes": "6,2", "cameras_offset": "1,2,3", "index": "1.33"}
     same = {"respect_classes": (2, 6), "cameras_offset": (1.0, 2.0, 3.0), "index": 1.33}
     assert CorrectOptions(**given) == CorrectOptions(**same)
+    assert CorrectOptions(respect_classes=2, sigma_image="1") == CorrectOptions(
+        respect_classes=(2,), sigma_image=1.0
+    )
 
 
 def test_usage():

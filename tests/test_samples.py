@@ -11,7 +11,7 @@ from tests.utils.real_pdal import IS_THERE, PROGRAM, ROOT
 
 SCRIPTS = sorted((ROOT / "samples").glob("0*.py"))
 PRINTED = {
-    "01": "14,736 of 20,000", "02": "as it came   bias +1.8", "03": "depth.png: 12.",
+    "01": "14,736 of 20,000", "02": "uncorrected  bias +1.8", "03": "depth.png: 12.",
     "04": "14,736 of 20,000 points corrected,", "05": "14,736 of 20,000", "06": "201 stations",
 }  # fmt: skip
 WRITTEN = {"03": ["depth.tif", "depth.qml", "depth.png"], "06": ["section.png"]}

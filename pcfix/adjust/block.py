@@ -446,7 +446,7 @@ def gnss_with_sigma(
     if np.abs(mean).max() > max(MOST_OFFSET_M, MOST_OFFSET_SIGMAS * typical):
         x, y, z = (-mean).tolist()
         words = (
-            f"{name}: the GNSS positions lie on average {x:.2f}, {y:.2f}, {z:.2f} m (x, y, z) from"
+            f"{name}: the GNSS positions are on average {x:.2f}, {y:.2f}, {z:.2f} m (x, y, z) from"
             " the projection centres, so they have another datum or CRS (ellipsoidal heights?)."
             " Name it with --gnss-crs, or transform the positions or the model."
         )

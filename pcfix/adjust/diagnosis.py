@@ -1,21 +1,21 @@
-r"""Diagnosis of refraction that an adjustment without water absorbed in its lens and poses.
+r"""Diagnosis of refraction that an ordinary adjustment absorbed in its lens and poses.
 
-Software that does not know of the water fits the images of a bed all the same: it bends lens and
-block until straight rays intersect. The land is then at a wrong height, and correcting the cloud
-alone makes it worse. The signs, in order of how much they tell:
+Software that ignores the water deforms lens and block until straight rays fit the images of the
+bed. The land is then at a wrong height, and correcting only the cloud makes it worse. The signs, in
+the order of their weight:
 
 tie points : intersected with refraction, points under water fit their images worse than with
-    straight rays. With true poses it is the other way round.
-GNSS : projection centres differ from it in the pattern in which this water would have bent this
-    block (`pcfix.adjust.from_cloud`).
+    straight rays. With true poses they fit better.
+GNSS : projection centres differ from their GNSS positions in the pattern in which this water would
+    have deformed this block (`pcfix.adjust.from_cloud`).
 bed : depths of the cloud are nearly true before any correction; refraction leaves 1/n of them or
     less.
-land : it is wrong, at control points or against a survey. It can be so for other reasons, and it is
-    right if ground control held it.
+land : its heights are wrong, at control points or against a survey. There can be other reasons, and
+    they are right if ground control fixed them.
 neighbours : neighbouring points of a dense cloud that come from different images fit each other
     with straight rays, and not with refracted ones.
 
-The first sign that says something decides.
+The first sign that is significant decides.
 """
 
 from __future__ import annotations
@@ -43,8 +43,11 @@ if TYPE_CHECKING:  # not quick to load
     from pcfix.adjust.from_cloud import Undone
     from pcfix.adjust.problem import Intersected
 
-ORDER = ("tie points", "GNSS", "bed", "land", "neighbours")
-"""The signs in the order in which they decide."""
+ORDER = {
+    "tie points": "tie points", "GNSS": "GNSS positions", "bed": "measured depths",
+    "land": "heights of land", "neighbours": "neighbouring points",
+}  # fmt: skip
+"""The signs in the order in which they decide, and what shows each."""
 
 LEAST_POINTS = 30
 """Tie points under water that are needed."""
@@ -88,6 +91,11 @@ class Sign:
     figures: dict[str, float] = field(default_factory=dict)
     error_m: float | None = None  # likely error of the heights, if it was absorbed
 
+    @property
+    def shown_by(self) -> str:
+        """The evidence, in the plural."""
+        return ORDER[self.name]
+
 
 @dataclass(frozen=True)
 class Diagnosis:
@@ -121,11 +129,11 @@ class Diagnosis:
         if not self.absorbed or self.decided_by is None:
             return ""
         likely = self.likely_error_m
-        error = "" if likely is None else f" The likely error of heights is {likely:.2g} m."
+        error = "" if likely is None else f" The heights are probably off by {likely:.2g} m."
         have = "seem to have" if self.decided_by.name == "neighbours" else "have"
         return (
             f"The poses {have} absorbed the refraction: {self.decided_by.words}.{error} Correcting"
-            f" the cloud alone makes it worse; adjust the poses first{because}: {command}"
+            f" only the cloud makes them worse. Adjust the poses first{because}: {command}"
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -143,6 +151,13 @@ class Diagnosis:
 def _exceeds(value: float, sigma: float, limit: float) -> bool | None:
     """Return whether a value exceeds its limit; None if that is not significant."""
     return value > limit if abs(value - limit) > SIGMAS * sigma else None
+
+
+def _absorbed_words(share: float, sigma: float) -> str:
+    return (
+        f"{100.0 * share:.0f} % of the refraction is absorbed (standard error"
+        f" {100.0 * sigma:.0f} %, limit {100.0 * SHARE:.0f} %)"
+    )
 
 
 # Tie points
@@ -192,8 +207,7 @@ def tie_point_sign(straight: Intersected, refracted: Intersected, depth_m: Float
     }  # fmt: skip
     words = (
         f"tie points under water have residuals of {s_px:.2f} px with straight rays and"
-        f" {r_px:.2f} px with refraction; share of refraction absorbed {share:.2f}, standard error"
-        f" {sigma:.2f} (limit {SHARE:g})"
+        f" {r_px:.2f} px with refraction, so {_absorbed_words(share, sigma)}"
     )
     speaks = None if sigma > MOST_SIGMA else _exceeds(share, sigma, SHARE)
     return Sign("tie points", speaks, words, figures)
@@ -237,8 +251,8 @@ def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, undon
     sigma = noise / max(float(np.linalg.norm(clear)), 1e-150)
     rms = float(np.sqrt(np.mean(y * y)))
     words = (
-        f"projection centres differ from the GNSS by {rms:.3f} m RMS; share of refraction absorbed"
-        f" by their pattern {share:.2f}, standard error {sigma:.2f} (limit {SHARE:g})"
+        f"projection centres differ from the GNSS by {rms:.3f} m RMS, and by their pattern"
+        f" {_absorbed_words(share, sigma)}"
     )
     is_useful = share <= MOST_SHARE and sigma <= MOST_SIGMA
     speaks = _exceeds(share, sigma, SHARE) if is_useful else None
@@ -309,8 +323,9 @@ def neighbours_sign(share: float, sigma: float, *, is_fused: bool) -> Sign:
         Whether the cloud is of fused depth maps; others can have discontinuities all the same.
     """
     words = (
-        f"discontinuities between image footprints: a share of {share:.2f} is left in the corrected"
-        f" bed, standard error {sigma:.2f} (limit 0.50; filtering and meshing also leave some)"
+        f"{100.0 * share:.0f} % of the discontinuities between image footprints are left in the"
+        f" corrected bed (standard error {100.0 * sigma:.0f} %, limit 50 %; filtering and meshing"
+        " also leave some)"
     )
     speaks = _exceeds(share, sigma, 0.5) if is_fused or share < 0.5 else None
     return Sign("neighbours", speaks, words, {"share": share, "sigma_share": sigma})
@@ -359,7 +374,7 @@ def diagnosed(
         signs += _signs_of_rays(cameras, water, n, ties, gnss, view, in_passing=in_passing)
     if view is not None:
         signs += _signs_of_surveys(cameras, water, n, view, control, reference)
-    return Diagnosis(tuple(sorted(signs, key=lambda sign: ORDER.index(sign.name))))
+    return Diagnosis(tuple(sorted(signs, key=lambda sign: [*ORDER].index(sign.name))))
 
 
 def _signs_of_rays(
@@ -441,7 +456,7 @@ def _signs_of_surveys(
         signs.append(land_sign(cloud_z(dry) - dry[:, 2], gsd, "the control points"))
         deep = used_as_dry(control, water)
         if deep:
-            words = f"control points {', '.join(deep)} lie below the water: mark them under_water"
+            words = f"control points {', '.join(deep)} are below the water: mark them under_water"
             signs.append(Sign("land", None, words))
     if reference is None:
         return signs

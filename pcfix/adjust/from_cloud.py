@@ -144,7 +144,7 @@ def _check(block: Block, unknowns: Unknowns) -> None:
         code, words = "needs_water", "level, tilt and refractive index must be fixed"
     elif len(block.conditions.on):
         code = "has_conditions"
-        words = "no point of --gcps can lie on the water or on a plane (waterline, on:NAME)"
+        words = "no point of --gcps can be on the water or on a plane (waterline, on:NAME)"
     else:
         return
     words = f"Without tie points {words}. Change that, or give a model with tie points."
@@ -282,7 +282,7 @@ def undo_absorption(
     ties = ties_of_cloud(xyz, views_in_frame(xyz, cameras), cameras, least)
     wet = is_submerged(ties.xyz[:, 2], surface_above(water, ties.xyz))
     if not wet.any():
-        raise _unsolved("no point under water lies in three images")
+        raise _unsolved("no point under water is in three images")
     true = true_start(ties.xyz, water, refractive_index, wet)
     block = replace(
         plain_block(cameras, replace(ties, xyz=true), water, refractive_index, wet),

@@ -32,7 +32,7 @@ from pcfix.adjust.result import Adjusted
 from pcfix.adjust.solve import Progress, reduced_at, solver
 from pcfix.errors import GeometryError, PcfixWarning, SettingError
 from pcfix.model import Cameras, FloatArray, GroundControl, TiePoints, WaterSurface
-from pcfix.options.survey import AdjustRules
+from pcfix.options.correct import AdjustRules
 from pcfix.refract.choice import views_in_frame
 from pcfix.water.surface import surface_above
 
@@ -96,7 +96,7 @@ def adjust_block(
     wet = len(xyz) if water is None else int((surface_above(water, xyz).height_m > xyz[:, 2]).sum())
     if wet < SMALL_WATER:
         words = (
-            f"Only {wet} of {len(xyz):,} points lie below the water, so there is no refraction to"
+            f"Only {wet} of {len(xyz):,} points are below the water, so there is no refraction to"
             " adjust. Check the water level, or use an ordinary bundle adjustment."
         )
         raise GeometryError("water.below_points", words, wet=wet, points=len(xyz))
@@ -200,7 +200,7 @@ def check_marks(
     if is_placed and np.abs(middle).max() > ELSEWHERE * height > 0.0:
         x, y, z = (-middle).tolist()
         words = (
-            f"{name}: the control points lie {x:.1f}, {y:.1f}, {z:.1f} m (x, y, z; median) from the"
+            f"{name}: the control points are {x:.1f}, {y:.1f}, {z:.1f} m (x, y, z; median) from the"
             " intersections of their marks, while the GNSS positions fit. One of the two has"
             " another CRS or height datum; name it with --gcps-crs or --gnss-crs."
         )
@@ -227,7 +227,7 @@ def _land_notes(water: WaterSurface | None, found: Adjusted) -> list[PcfixWarnin
     above, count = int((found.is_observed & ~found.is_wet).sum()), int(found.is_observed.sum())
     if above >= SMALL_WATER:
         return []
-    few = f"Only {above} of {count:,} points lie above the water"
+    few = f"Only {above} of {count:,} points are above the water"
     if any(found.unknowns.water_sigma):
         words = (
             f"{few}, so level, tilt and index cannot be separated from the height of the block."
@@ -350,7 +350,7 @@ def bed_notes(found: Adjusted) -> list[PcfixWarning]:
         return []
     words = (
         f"The heights of the bed have a standard error of {sigma_m:.2f} m ({gsd:.1f} ground"
-        " pixels). Give control points, GNSS positions of more images that do not lie on one line,"
+        " pixels). Give control points, GNSS positions of more images that are not on one line,"
         " or a calibrated lens."
     )
     return [PcfixWarning("adjust.imprecise_bed", words, sigma_m=sigma_m, gsd=gsd)]

@@ -242,7 +242,7 @@ def _planes(
             if count < least:
                 raise GeometryError(
                     "gcps.few_on_plane",
-                    f"Plane {', '.join(bundle)}: {count} points lie on it, at least {least} are"
+                    f"Plane {', '.join(bundle)}: {count} points are on it, at least {least} are"
                     " needed. Mark more points.",
                     plane=", ".join(bundle),
                     points=count,

@@ -239,7 +239,7 @@ def singular(problem: Problem, solution: Solution) -> GeometryError:
         words.append(f"the poses {some}")
     remedy = "fix some of them"
     if set(names) & BED and not problem.block.wet.any():
-        remedy = "fix them, as no point lies under water"
+        remedy = "fix them, as no point is under water"
     elif labels:
         remedy = "give GNSS positions, three control points or a free network, or fix images"
     return GeometryError(

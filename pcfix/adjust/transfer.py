@@ -254,7 +254,7 @@ class CloudTransfer:
                 f" flying height {height:,.0f} m). Check both files, --cameras-crs and"
                 " --cameras-offset, which count for the file that has no CRS."
             )
-            raise GeometryError("adjusted_from.apart", words, apart_m=apart, height_m=height)
+            raise GeometryError("adjusted_from.too_far", words, distance_m=apart, height_m=height)
 
     def check(self, name: str, counts: TransferCounts) -> None:
         """Refuse a cloud that the original cameras do not see."""

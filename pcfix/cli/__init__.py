@@ -1,4 +1,4 @@
-"""Door 1, the command line: flags from the tables of options, one function a command."""
+"""The command line: flags from the declared options, and one function for each command."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pcfix.version import __version__
 
 
 def app_for(arguments: Sequence[str], *, everything: bool = False) -> App:
-    """Return the program, of which only the command of the arguments gets its flags."""
+    """Return the program; only the command in the arguments gets its flags."""
     app = App(
         name="pcfix",
         help="Refraction correction of through-water photogrammetric point clouds.",
@@ -42,13 +42,13 @@ def app_for(arguments: Sequence[str], *, everything: bool = False) -> App:
 
 
 def main(tokens: Sequence[str] | None = None) -> None:
-    """Run the command line; a user's mistake is one line on stderr and exit code 1."""
+    """Run the command line; a mistake of the user gives one line on stderr and exit code 1."""
     arguments = list(sys.argv[1:] if tokens is None else tokens)
     ended = list[int]()
     try:
         _end_by_signals(ended)
-        # Modules and kernels are hundreds of thousands of objects that stay: searching them for
-        # garbage, often and at the end, took a fifth of a start.
+        # Modules and kernels are hundreds of thousands of permanent objects. Collecting garbage
+        # among them, often and at the end, took a fifth of the start.
         gc.set_threshold(50_000, 20, 50)
         atexit.register(gc.freeze)
         _run(arguments)
@@ -56,7 +56,7 @@ def main(tokens: Sequence[str] | None = None) -> None:
         words = ["pcfix", *(one for one in arguments[:1] if one in COMMANDS), "--help"]
         _stop(f"{printable(str(error))}\nTry '{' '.join(words)}'.", 2)
     except PcfixError as error:
-        if ended:  # a library that writes took the interrupt for an error of the file
+        if ended:  # a library may report an interrupt as an error of the file it writes
             _stop("stopped.", 128 + ended[0])
         _stop(str(error), 1)
     except UnicodeEncodeError as error:
@@ -87,20 +87,20 @@ def _run(arguments: list[str]) -> None:
 
 
 class _EndedError(KeyboardInterrupt):
-    """Another process ends this one, which cleans up as after Ctrl-C."""
+    """A signal ends the process, which cleans up as after Ctrl-C."""
 
 
 def _end_by_signals(ended: list[int]) -> None:
-    """Let SIGTERM and SIGHUP end the process as Ctrl-C does, unless they are ignored.
+    """Make SIGTERM and SIGHUP end the process as Ctrl-C does, unless they are ignored.
 
-    The number of a signal that comes is added to `ended`.
+    The number of the signal is appended to `ended`.
     """
 
     def end(number: int, frame: Any) -> None:
         caller = frame
         while caller is not None:
             if "llvmlite" in caller.f_code.co_filename:
-                # an exception in a callback of LLVM would crash the process: once more, later
+                # an exception in a callback of LLVM would crash the process: send it again later
                 Timer(0.05, signal.raise_signal, (number,)).start()
                 return
             caller = caller.f_back

@@ -1,4 +1,4 @@
-"""The commands: each turns its flags into one call of the Python interface."""
+"""The commands: each calls one function of the Python interface."""
 
 from __future__ import annotations
 
@@ -12,12 +12,25 @@ from typing import Any
 
 import pcfix
 from pcfix.cli.flags import COMMANDS, UsageError, command, progress_bar, say, status_line
-from pcfix.options.correct import CorrectOptions, LabelOptions
-from pcfix.options.photos import CalmOptions, OrthoOptions, PhotosOptions
+from pcfix.options.correct import (
+    AdjustOptions,
+    CamerasCheckOptions,
+    CorrectOptions,
+    LabelOptions,
+    RunOptions,
+    WaterCheckOptions,
+)
 from pcfix.options.scenes import DemoOptions, PlanOptions, SimulateOptions
 from pcfix.options.shared import OverwriteOption, TileOptions
-from pcfix.options.steps import CleanOptions, CompareOptions, DsmOptions, ViewerOptions
-from pcfix.options.survey import AdjustOptions, CamerasCheckOptions, RunOptions, WaterCheckOptions
+from pcfix.options.steps import (
+    CalmOptions,
+    CleanOptions,
+    CompareOptions,
+    DsmOptions,
+    OrthoOptions,
+    PhotosOptions,
+    ViewerOptions,
+)
 
 TILED = "LAS or LAZ cloud; a folder, glob, list (.txt) or index (.vpc) of tiles."
 CLOUD = "LAS or LAZ to write; a folder for tiles."
@@ -26,7 +39,7 @@ CLOUD = "LAS or LAZ to write; a folder for tiles."
 def _summarized(
     title: str, name: str, quiet: bool, work: Callable[..., Any], *given: Any, unit: str = "points"
 ) -> None:
-    """Call a function of two files and options with a bar, and print the summary of a command."""
+    """Call a function of two files and options with a progress bar, and print its summary."""
     from pcfix.report.text import text_of
 
     with progress_bar(title, quiet, unit=unit) as progress:
@@ -78,22 +91,18 @@ def correct(input: str, output: Path, /, *, options: CorrectOptions, quiet: bool
     "pcfix adjust sparse adjusted --water 0.37 --cloud cloud.laz --gnss gnss.csv",
     model="Camera poses with tie points, or without them if --cloud is given.",
     out="Folder for the adjusted model.",
-    jobs="Number of threads.",
 )
-def adjust(
-    model: Path, out: Path, /, *, options: AdjustOptions, quiet: bool, jobs: int | None = None
-) -> None:
+def adjust(model: Path, out: Path, /, *, options: AdjustOptions, quiet: bool) -> None:
     """Refine camera poses and lens by a refractive bundle adjustment."""
     from pcfix.adjust.result import adjustment_dict, before_of
     from pcfix.flow.adjust import correct_words
     from pcfix.report.adjustment import adjustment_text
-    from pcfix.running import threads
 
-    with threads(jobs), status_line("Adjusting", quiet) as progress:
+    with status_line("Adjusting", quiet) as progress:
         found = pcfix.adjust_cameras(model, out, options=options, progress=progress)
     say(adjustment_text(adjustment_dict(found, before_of(found))), quiet)
-    cloud = "" if options.cloud else " (CLOUD.laz is the cloud of the original cameras)"
-    say(f"Next{cloud}: {correct_words(found, model, out, options)}", quiet)
+    cloud = "" if options.cloud else ", with the cloud of the original cameras as CLOUD.laz"
+    say(f"Next step{cloud}:\n  {correct_words(found, model, out, options)}", quiet)
 
 
 @command("pcfix label cloud.laz labelled.laz --water shore.csv", input=TILED, output=CLOUD)

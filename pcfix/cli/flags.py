@@ -1,4 +1,4 @@
-"""Options as flags of the command line, progress, and what is printed at the end."""
+"""Options as flags of the command line; progress; the printed summary."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pcfix.options.declare import Option, OptionSet, options_of
 from pcfix.options.shared import Panel
 
 MANY = 20
-"""With more options than these, `--help` shows the basic ones, and `--help-all` all."""
+"""If a command has more options, `--help` shows the basic ones, and `--help-all` all."""
 _GROUPS = {name: Group(name.value, sort_key=order) for order, name in enumerate(Panel)}
 _QUIET = Parameter(
     name=["--quiet", "-q"],
@@ -30,7 +30,7 @@ _QUIET = Parameter(
 
 
 class UsageError(Exception):
-    """Flags that do not go together; exit code 2."""
+    """Wrong usage of flags; exit code 2."""
 
 
 class Command(NamedTuple):
@@ -40,15 +40,15 @@ class Command(NamedTuple):
     kind: type[OptionSet]
     example: str
     helps: dict[str, str]
-    """What its arguments and own flags mean."""
+    """The help of its arguments and of flags that are not options."""
 
     @property
     def has_many(self) -> bool:
-        """Whether it has more options than `--help` shows."""
+        """Whether `--help` shows only some of its options."""
         return len(options_of(self.kind)) > MANY
 
     def flat(self, *, everything: bool = False) -> Callable[..., None]:
-        """Return the command as cyclopts takes it: a function with a keyword for each option."""
+        """Return a function with a keyword for each option, as cyclopts reads it."""
         every, options = everything or not self.has_many, options_of(self.kind)
         hints, shown = get_type_hints(self.call), []
         for name, one in inspect.signature(self.call).parameters.items():
@@ -57,16 +57,16 @@ class Command(NamedTuple):
             elif name == "quiet":
                 shown.append(one.replace(annotation=Annotated[bool, _QUIET], default=False))
             else:
-                asked = Parameter(help=self.helps[name], negative=())
-                if name in ("jobs", "stage"):
-                    asked = Parameter.combine(asked, Parameter(group=_GROUPS[Panel.OUTPUT]))
-                shown.append(one.replace(annotation=Annotated[hints[name], asked]))
+                place = Parameter(help=self.helps[name], negative=(), show_default=False)
+                if one.kind is one.KEYWORD_ONLY:
+                    place = Parameter.combine(place, Parameter(group=_GROUPS[Panel.OUTPUT]))
+                shown.append(one.replace(annotation=Annotated[hints[name], place]))
 
         def call(*places: Any, **given: Any) -> None:
             names = [one.name for one in options if one.name in given]
             asked = self.kind(**{name: given.pop(name) for name in names})
             missing = asked.missing()
-            if missing and given.get("config") is None:  # an earlier run says the rest
+            if missing and given.get("config") is None:  # run.json has the rest
                 other = f", or --{missing.instead}" if hasattr(asked, missing.instead) else ""
                 raise UsageError(f"{missing.flag} is needed{other}")
             quiet = {"quiet": given.pop("quiet", False)} if "quiet" in hints else {}
@@ -81,7 +81,7 @@ COMMANDS: dict[str, Command] = {}
 
 
 def command(example: str, **helps: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a function a command, with an example and what its arguments mean."""
+    """Register a function as a command, with an example and the help of its arguments."""
 
     def add(call: Callable[..., None]) -> Callable[..., None]:
         kind = get_type_hints(call)["options"]
@@ -92,7 +92,7 @@ def command(example: str, **helps: str) -> Callable[[Callable[..., None]], Calla
 
 
 def _keyword(one: Option, is_shown: bool) -> inspect.Parameter:
-    """Return an option as a keyword; text that a parser reads is passed on unchanged."""
+    """Return an option as a keyword; text for a parser is passed on unchanged."""
     kind: Any = one.type
     if one.is_path:
         kind = Path | None
@@ -112,7 +112,7 @@ def _keyword(one: Option, is_shown: bool) -> inspect.Parameter:
         negative_none="no-" if has_opposite else (),
         negative_iterable=(),
         allow_repeating=True,  # the last one counts
-        allow_leading_hyphen="," in one.metavar,  # a first number below zero
+        allow_leading_hyphen="," in one.metavar,  # the first number may be negative
         show_default=(lambda value: default) if default else False,
     )
     return inspect.Parameter(
@@ -122,7 +122,7 @@ def _keyword(one: Option, is_shown: bool) -> inspect.Parameter:
 
 
 def _announce_compiling() -> None:
-    """Print on a terminal that the first command compiles the kernels."""
+    """Announce on a terminal that the first command compiles the kernels."""
     from pcfix.kernels import cache_folder
 
     folder = cache_folder()
@@ -134,9 +134,9 @@ def _announce_compiling() -> None:
 def progress_bar(
     title: str, quiet: bool, unit: str = "points"
 ) -> Iterator[Callable[[int, int], None] | None]:
-    """Show a bar with units/s and the remaining time on a terminal; nothing if piped.
+    """Show a progress bar with speed and remaining time on a terminal.
 
-    With ``PCFIX_PROGRESS=lines`` it is a line for each percent, for programs that call this one.
+    With ``PCFIX_PROGRESS=lines`` print a line for each percent, for programs that call this one.
     """
     if os.environ.get("PCFIX_PROGRESS") == "lines":
         shown = -1
@@ -179,7 +179,7 @@ def progress_bar(
 
 @contextmanager
 def status_line(title: str, quiet: bool) -> Iterator[Callable[[Any], None] | None]:
-    """Show on a terminal one line that changes; nothing if piped."""
+    """Show a status line on a terminal."""
     if quiet or not sys.stderr.isatty():
         yield None
         return

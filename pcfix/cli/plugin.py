@@ -1,4 +1,4 @@
-"""The QGIS plugin as a ZIP: its files, and a table of the commands that it offers."""
+"""Write the QGIS plugin: its files and a table of the commands that it offers, as a ZIP."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _PLACES = {
 
 
 def plugin_zip(commands: Mapping[str, Command]) -> bytes:
-    """Return the plugin, with the commands among those given that it offers."""
+    """Return the plugin with the `OFFERED` commands."""
     table = {"version": __version__, "commands": [_command(n, commands[n]) for n in OFFERED]}
     return packed(json.dumps(table, indent=1) + "\n", __version__)
 
@@ -49,7 +49,7 @@ def _command(name: str, command: Command) -> dict[str, Any]:
 
 
 def _option(one: Option, *, replaced: bool) -> dict[str, Any]:
-    """Return an option for a form; with `replaced`, another one can replace it."""
+    """Return an option as a field of a form; `replaced` if another option can replace it."""
     kind, default = _kind(one), one.default
     if kind not in ("bool", "int", "float", "choice"):
         default = None  # an empty text is pcfix's own default

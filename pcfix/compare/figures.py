@@ -387,7 +387,7 @@ def lines_downslope(xyz: FloatArray, count: int) -> tuple[SectionLine, ...]:
     eigenvalues = np.linalg.eigvalsh(covariance)
     if len(xyz) < 3 or eigenvalues[0] <= 1e-6 * eigenvalues[1]:
         raise GeometryError(
-            "cloud.on_line", "The bed lies on a line in plan. Give --section x1,y1,x2,y2 instead."
+            "cloud.on_line", "The bed is on a line in plan. Give --section x1,y1,x2,y2 instead."
         )
     gradient = np.linalg.solve(covariance, products[:, 2])
     steepness = float(np.hypot(*gradient))

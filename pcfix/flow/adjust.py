@@ -51,10 +51,11 @@ from pcfix.model import (
     WaterRaster,
     WaterSurface,
 )
+from pcfix.options.correct import WATER_UNKNOWNS, AdjustOptions
 from pcfix.options.declare import File, taken
-from pcfix.options.survey import WATER_UNKNOWNS, AdjustOptions
 from pcfix.port.shapes import FlatPort, Port
 from pcfix.report.adjustment import adjustment_page
+from pcfix.running import threads
 from pcfix.water.index import index_of
 
 if TYPE_CHECKING:
@@ -113,7 +114,8 @@ def adjust_cameras(
     given = taken(AdjustOptions, options, keywords, "adjust_cameras")
     inputs = replace(given.part(Inputs), cameras=model)
     target = None if out_dir is None else Path(out_dir)
-    return adjust_into(target, inputs, given, given.cloud, progress)
+    with threads(given.jobs):
+        return adjust_into(target, inputs, given, given.cloud, progress)
 
 
 def adjust_into(

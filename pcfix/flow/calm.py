@@ -24,7 +24,7 @@ from pcfix.io.photographs import Frames, check_calm, read_frames, write_calm, wr
 from pcfix.io.rasters import new_raster, write_part
 from pcfix.model import FloatArray, Lens, WaterRaster
 from pcfix.options.declare import File, taken
-from pcfix.options.photos import CalmOptions
+from pcfix.options.steps import CalmOptions
 from pcfix.photos.calm import LEAST_CORNERS, corners_in, covered, laid, median_of, register
 from pcfix.photos.mapping import Photo
 from pcfix.photos.waves import Nodes, View, displacements, fit_waves, nodes_of, slopes_of

@@ -22,8 +22,8 @@ from pcfix.io.gnss_positions import read_gnss
 from pcfix.lens.frames import cameras_in_sight, footprint
 from pcfix.lens.imaging import unproject
 from pcfix.model import Cameras, FloatArray, Lens, TiePoints, WaterDimension
+from pcfix.options.correct import CamerasCheckOptions
 from pcfix.options.declare import File, taken
-from pcfix.options.survey import CamerasCheckOptions
 from pcfix.report.page import (
     AFTER,
     WATER,
@@ -236,7 +236,8 @@ def _fit(
         "points_sampled": len(xyz),
         "seen_by": dict(zip(("0", "1", "2", "3 or more"), shares, strict=True)),
         "verdict": verdict,
-        "tested": str(found),
+        "tested": found.fits,
+        "not_tested": found.unchecked,
         "fits": not verdict,
     }
 
@@ -270,29 +271,38 @@ def cameras_text(report: CamerasReport) -> str:
     if gnss is not None and gnss["images"]:
         mean, sd = (
             ", ".join("-" if one is None else f"{one:{form}}" for one in gnss[name])
-            for name, form in (("mean_m", "+.3f"), ("sd_m", ".3f"))
+            for name, form in (("mean_m", "+z.3f"), ("sd_m", "z.3f"))
         )
-        rows.append(("GNSS", f"{gnss['images']:,} images; adjusted minus GNSS east, north, up:"
-                     f" mean {mean} m, sd {sd} m; largest {gnss['largest_m']:.3f} m"
-                     f" ({gnss['largest_image']})"))  # fmt: skip
+        rows.append(("GNSS", f"{gnss['images']:,} images. Poses minus GNSS (east, north, up):"
+                     f" mean {mean} m, standard deviation {sd} m; largest distance"
+                     f" {gnss['largest_m']:.3f} m ({gnss['largest_image']})"))  # fmt: skip
     if gnss is not None and gnss["reason"]:
         rows.append(("GNSS", gnss["reason"]))
     if fit is not None:
-        seen = (f"{name}: {100.0 * part:.1f} %" for name, part in fit["seen_by"].items())
+        shares = ", ".join(f"{100.0 * part:.1f}" for part in fit["seen_by"].values())
+        match = "cameras and cloud match" if fit["tested"] else "nothing could be tested"
         rows += [
             ("Cloud", f"{fit['cloud']} ({fit['points_sampled']:,} points sampled)"),
-            ("Visible", f"share of points by number of cameras: {', '.join(seen)}"),
-            ("Check", fit["verdict"] or fit["tested"]),
+            ("Visible", f"{shares} % of the points in {', '.join(fit['seen_by'])} images"),
+            ("Check", fit["verdict"] or match),
         ]
+        for label, tests in (("Tested", fit["tested"]), ("Not tested", fit["not_tested"])):
+            rows += [("" if i else label, one) for i, one in enumerate(tests)]
     if (found := report.diagnosis) is not None:
-        says = {True: "absorbed", False: "not absorbed", None: "open"}
+        says = {True: "absorbed: ", False: "not absorbed: ", None: "no evidence: "}
         verdict = f"not known; give control points (--gcps), or {EXPORT}"
-        if found.absorbed:
-            verdict = found.sentence(*report.remedy)
-        elif found.absorbed is False and found.decided_by is not None:
-            verdict = f"the poses have not absorbed the refraction, by {found.decided_by.name}"
+        if found.absorbed is not None and found.decided_by is not None:
+            have = "have" if found.absorbed else "have not"
+            verdict = (
+                f"the poses {have} absorbed the refraction, as {found.decided_by.shown_by} show"
+            )
+        if found.likely_error_m is not None:
+            verdict += f"; the likely error of heights is {found.likely_error_m:.2g} m"
         rows.append(("Refraction", verdict))
-        rows += [("", f"{s.name}: {says[s.speaks]}. {s.words}") for s in found.signs]
+        rows += [(s.name[:1].upper() + s.name[1:], says[s.speaks] + s.words) for s in found.signs]
+        if found.absorbed:
+            command, because = report.remedy
+            rows += [("Next step", f"adjust the poses{because}:"), ("", command)]
     return aligned(f"{r['path']}: {cameras.source or 'cameras'}", rows, cameras.notes)
 
 

@@ -76,7 +76,7 @@ def learn_regression(
             f"{checks.where(first)}: {int((~covered).sum())} of {len(checks)} check depths have no"
             f" bed around them: {FEWEST} submerged points are needed within {radius:.2f} m, the"
             f" nearest is {nearest_m[first]:,.2f} m away. Check that they have the cloud's CRS and"
-            " lie in the water."
+            " are in the water."
         )
         if covered.sum() < LEAST_COUNT:
             raise GeometryError("check_depths.no_bed", notes[0], covered=int(covered.sum()))

@@ -142,7 +142,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     if tally.views is not None and plan.match is not None:
         report = replace(tally.views, notes=plan.match.notes)
     water_notes = _check_counts(plan, tally, report)
-    counts, uncertainty = figures.as_dict(), figures.uncertainty(plan.made)
+    counts, uncertainty = figures.as_dict(), figures.uncertainty(plan.reconstruction)
     tested, poses, absorbed, shoreline = None, None, None, None
     if plan.inputs.port is None:
         ties = quick_ties(plan.inputs, plan.view.crs) if len(plan.cameras) else None
@@ -170,7 +170,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         counts["unsure"] = None
     unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
     not_moved = sum(counts["uncorrected"].values()) + int(figures.outcomes[Outcome.NOT_TRANSFERRED])
-    made, detected = plan.made, [*plan.notes]
+    reconstruction, detected = plan.reconstruction, [*plan.notes]
     if tally.beyond is not None and line is not None:
         least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
         detected += coded("regression.range", tally.beyond.notes(line, least))
@@ -202,9 +202,13 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         water_fit=plan.found.as_dict(),
         uncertainty=uncertainty,
         transfer=transfer.as_dict(tally.transfer) if transfer and tally.transfer else None,
-        made=made,  # the reconstruction type, and why
+        reconstruction=reconstruction,  # its type, and why
         # other notes on the cloud, also in `warnings`
-        told=[one for one in map(str, detected) if made is None or one not in made["because"]],
+        notes=[
+            one
+            for one in map(str, detected)
+            if reconstruction is None or one not in reconstruction["because"]
+        ],
         poses=poses,  # whether they have absorbed the refraction
         shoreline=shoreline,
         fit=None if tested is None else tested.as_dict(),

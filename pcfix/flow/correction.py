@@ -94,7 +94,7 @@ class Plan:
         return more
 
     @property
-    def made(self) -> dict[str, Any] | None:
+    def reconstruction(self) -> dict[str, Any] | None:
         """The reconstruction type, and why, if the options leave it open."""
         settings = self.survey.settings
         own = [] if self.survey.own_water is None else [OWN_WATER]
@@ -131,7 +131,7 @@ class Plan:
             "settings": self.options.part(ScienceOptions).as_dict(),
             **(surface if self.inputs.port is None else {}),
             **self.settings,
-            **({} if self.made is None else {"made": self.made}),
+            **({} if self.reconstruction is None else {"reconstruction": self.reconstruction}),
             **({} if self.transfer is None else self.transfer.provenance()),
             "cameras": len(self.cameras),
             "cameras_source": self.cameras.source,

@@ -1,4 +1,4 @@
-"""Find out whether poses have absorbed the refraction, and say how to correct them."""
+"""Find out whether poses have absorbed the refraction, and how to correct them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 LEAST_POSITIONS = 3
 """GNSS positions that determine position, orientation and scale of a block."""
 
-NO_DATUM = " (GNSS.csv has the positions of the images; control points, --gcps, serve as well)"
+NO_DATUM = " (with GNSS.csv, the positions of the images, or with control points, --gcps)"
 
 QUICK_BYTES = 25_000_000
 """Size of a model that is read within a second or two, even if nobody asked."""
@@ -99,8 +99,9 @@ def diagnose_in_passing(
         f" quickly; {EXPORT}"
     )
     if decided is not None:
-        did = "absorbed" if diagnosis.absorbed else "did not absorb"
-        words = f"{did} the refraction, by {decided.name}{'; see the warning' * bool(sentence)}"
+        have = "have" if diagnosis.absorbed else "have not"
+        words = f"{have} absorbed the refraction, as {decided.shown_by} show"
+        words += "; see the warning" if sentence else ""
     signs = diagnosis.as_dict()["signs"]
     return {"absorbed": diagnosis.absorbed, "words": words, "signs": signs}, warning
 

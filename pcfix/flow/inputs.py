@@ -1,7 +1,7 @@
 """Read the inputs of a correction: cameras, view list, water, tide and mask.
 
-A cloud may be corrected with other cameras than those that made it: `adjusted_from` are the
-original ones, `cameras` the same images adjusted since.
+A cloud may be corrected with adjusted poses: `adjusted_from` is the original camera file, and
+`cameras` has the same images with adjusted poses.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ LOCAL = "local"
 class Inputs(MaskOption, InputOptions):
     """Cameras, view list and water as the user gives them.
 
-    `cameras` and `adjusted_from` may be `pcfix.Cameras`, then in the cloud's CRS; `water` may be a
-    `pcfix.WaterSurface`, `port` a `Port`. `both_models` decides whether views, offset and CRS
-    belong to `cameras` or `adjusted_from`.
+    `cameras` and `adjusted_from` may be `pcfix.Cameras` in the CRS of the cloud, `water` a
+    `pcfix.WaterSurface`, and `port` a `Port`. `both_models` decides whether views, offset and CRS
+    belong to `cameras` or to `adjusted_from`.
     """
 
     def check(self) -> None:
@@ -71,7 +71,7 @@ class Inputs(MaskOption, InputOptions):
         return find_surface(self.water, self, view)
 
     def level_offset_m(self, cameras: Cameras) -> FloatArray | None:
-        """Return how much higher than on average the water stood at each image, shape (k,)."""
+        """Return the water level at each image minus the mean level, shape (k,)."""
         if self.tide is None:
             return None
         own = self.cameras if self.adjusted_from is None else self.adjusted_from
@@ -101,9 +101,9 @@ class Inputs(MaskOption, InputOptions):
             cameras, to_cloud = self.cameras, None
         else:
             read = self.read() if read is None else read
-            way = self._georeferenced(read, cloud_crs)
-            cameras, to_cloud = way.cameras(read), way.points
-            _warn(way.notes)
+            placement = self._georeferenced(read, cloud_crs)
+            cameras, to_cloud = placement.cameras(read), placement.points
+            _warn(placement.notes)
         if self.views is None:
             return cameras, None
         if read is not None and Path(self.views) == Path(str(self.cameras)):
@@ -142,23 +142,23 @@ class Inputs(MaskOption, InputOptions):
         known = np.isfinite(ties.xyz).all(axis=1)
         if placed and not known.any():
             return None
-        way = self._georeferenced(read, cloud_crs)
+        placement = self._georeferenced(read, cloud_crs)
         xyz = np.full((len(ties.xyz), 3), np.nan)
-        xyz[known] = way.points(ties.xyz[known])
+        xyz[known] = placement.points(ties.xyz[known])
         return replace(ties, xyz=xyz)
 
 
 class CameraInputs(NamedTuple):
     """The cameras of a correction, in the cloud's CRS."""
 
-    cameras: Cameras  # to correct with, `NO_CAMERAS` without any
+    cameras: Cameras  # for the correction; `NO_CAMERAS` if there are none
     views: ViewList | None  # of the cloud
-    listed: Cameras  # the cameras that the view list counts, which made the cloud
+    listed: Cameras  # the original cameras, to which the row numbers of the view list refer
     transfer: CloudTransfer | None  # from the original to the adjusted cameras
 
 
 def read_blocks(inputs: Inputs, cloud_crs: str | CRS | None) -> CameraInputs:
-    """Return cameras in the cloud's CRS, and the view list, checked with the original cameras."""
+    """Return cameras in the cloud's CRS and the view list, matched with the original cameras."""
     if not inputs.cameras:
         return CameraInputs(NO_CAMERAS, None, NO_CAMERAS, None)
     if inputs.adjusted_from is None:
@@ -171,10 +171,10 @@ def read_blocks(inputs: Inputs, cloud_crs: str | CRS | None) -> CameraInputs:
 
 
 def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:
-    """Return the inputs with the original cameras and those with the adjusted ones.
+    """Return the inputs with the original cameras, and those with the adjusted ones.
 
-    CRS and offset of the cameras are for the file that does not have its own place, or for both if
-    both have one. If neither has, the offset is for that with which the two agree best.
+    The options for CRS and offset apply to the file that states no CRS, or to both if both do. If
+    neither does, the offset is applied so that the two files agree best.
     """
     given = (inputs.views, inputs.cameras, inputs.adjusted_from)
     listed, path, old = (None if isinstance(one, Cameras) else one for one in given)
@@ -190,7 +190,7 @@ def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:
         replace(inputs, views=None, adjusted_from=None),
     ]
     tables = [not isinstance(one.cameras, Cameras) and takes_sensor(one.cameras) for one in both]
-    if inputs.sensor is not None and any(tables):  # a model has its own lens
+    if inputs.sensor is not None and any(tables):  # a model contains its lens
         both = _without(both, tables, sensor=None)
     if inputs.cameras_crs is None and inputs.cameras_offset is None:
         return both[0], both[1]
@@ -202,24 +202,30 @@ def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:
     if any(tied) and not all(tied):
         both = _without(both, [not one for one in tied], cameras_crs=None, cameras_offset=None)
     elif inputs.cameras_offset is not None and not any(tied):
-        # Nobody says which of the two files is shifted: try the offset on both, and on either.
-        apart = adjusted.centres - original.centres[_rows(original.labels, adjusted.labels)]
+        # It is unknown which of the two files is shifted: try the offset on both, and on either.
+        difference = adjusted.centres - original.centres[_rows(original.labels, adjusted.labels)]
         offset = np.array(inputs.cameras_offset)
-        moves = {(True, True): apart, (True, False): apart - offset, (False, True): apart + offset}
-        best = min(moves, key=lambda way: np.median(np.linalg.norm(moves[way], axis=1)))
+        moves = {
+            (True, True): difference,
+            (True, False): difference - offset,
+            (False, True): difference + offset,
+        }
+        best = min(moves, key=lambda one: np.median(np.linalg.norm(moves[one], axis=1)))
         both = _without(both, best, cameras_offset=None)
     return both[0], both[1]
 
 
-def _without(both: list[Inputs], kept: Sequence[bool], **changes: Any) -> list[Inputs]:
-    """Return the inputs, changed where they are not kept."""
-    return [one if keep else replace(one, **changes) for one, keep in zip(both, kept, strict=True)]
+def _without(both: list[Inputs], unchanged: Sequence[bool], **changes: Any) -> list[Inputs]:
+    """Return the inputs, with changes where `unchanged` is false."""
+    return [
+        one if keep else replace(one, **changes) for one, keep in zip(both, unchanged, strict=True)
+    ]
 
 
 def original_ties(
     inputs: Inputs, transfer: CloudTransfer | None, cloud_crs: str | CRS | None
 ) -> TiePoints | None:
-    """Return the tie points of the model that made the cloud, with the cameras of a transfer."""
+    """Return the tie points of the original model, numbered as the cameras of a transfer."""
     if transfer is None:
         return ties_of(inputs, cloud_crs)
     ties = both_models(inputs)[0].tie_points(cloud_crs)
@@ -244,7 +250,7 @@ def transfer_between(original: Cameras, adjusted: Cameras) -> CloudTransfer:
 
 def _rows(original: tuple[str, ...], adjusted: tuple[str, ...]) -> IntArray:
     """Return the row in the original labels of each adjusted one."""
-    if original == adjusted:  # then even repeated names are unambiguous
+    if original == adjusted:  # in the same order, even repeated names are unambiguous
         return np.arange(len(adjusted))
     row, unclear = match_labels(adjusted, original)
     repeated = [label for label, count in Counter(adjusted).items() if count > 1]
@@ -267,7 +273,7 @@ def _rows(original: tuple[str, ...], adjusted: tuple[str, ...]) -> IntArray:
 
 def ties_of(inputs: Inputs, crs: Any) -> TiePoints | None:
     """Return the tie points of the camera file in the cloud's CRS, if it has any."""
-    with warnings.catch_warnings():  # they were shown when the cameras were read
+    with warnings.catch_warnings():  # the warnings were shown when the cameras were read
         warnings.simplefilter("ignore", PcfixWarning)
         return inputs.tie_points(crs)
 

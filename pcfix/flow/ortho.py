@@ -20,7 +20,7 @@ from pcfix.io.clouds import is_cloud
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.model import WaterPlane
 from pcfix.options.declare import File, taken
-from pcfix.options.photos import OrthoOptions, PhotosOptions
+from pcfix.options.steps import OrthoOptions, PhotosOptions
 from pcfix.photos.ortho import Picture, mosaic, picture_of
 from pcfix.running import threads
 from pcfix.sums import Figures

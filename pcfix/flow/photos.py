@@ -34,7 +34,7 @@ from pcfix.io.rasters import filled_heights, open_raster
 from pcfix.io.water import rasters_of_images, read_water_raster
 from pcfix.model import Cameras, FloatArray, Lens, WaterDimension
 from pcfix.options.declare import File, taken
-from pcfix.options.photos import PhotosOptions
+from pcfix.options.steps import PhotosOptions
 from pcfix.photos.mapping import Ground, Photo, Scene, exact, ground_seen, nodes_of, paper, resample
 from pcfix.running import current, threads
 from pcfix.sums import Figures
@@ -108,7 +108,7 @@ def map_photos(
     if poor:
         worst, name = max(poor)
         words = (
-            f"{given.dsm}: does not cover all that {len(poor)} photographs see; more than"
+            f"{given.dsm}: does not cover the frames of {len(poor)} photographs; more than"
             f" {100 * MOST_BLACK:.0f} % of them is black ({name}: {100 * worst:.0f} %)."
         )
         notes.append(PcfixWarning("dsm.too_small", words, photographs=len(poor)))
@@ -257,7 +257,7 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
     if not any(ground_seen(photo, scene, nodes)[2].any() for photo, nodes in coarse):
         raise GeometryError(
             "cameras.no_overlap",
-            f"{given.dsm}: none of the {len(photos)} photographs sees it. Check its CRS and that of"
+            f"{given.dsm}: is in none of the {len(photos)} photographs. Check its CRS and that of"
             f" {given.cameras} (--cameras-crs, --cameras-offset).",
             path=given.dsm,
         )

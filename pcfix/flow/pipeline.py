@@ -1,4 +1,4 @@
-"""Write the PDAL pipeline that equals a call of `correct_file`."""
+"""Return the PDAL pipeline that is equivalent to a call of `correct_file`."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 def pipeline_for(input: Path, output: Path | None, options: CorrectOptions) -> dict[str, Any]:
-    """Return the pipeline, ready for JSON; without an output only the stage that corrects.
+    """Return the pipeline, ready for JSON; without an output only the stage of pcfix.
 
-    Options that differ from their defaults become those of the stage. PDAL replaces an output that
-    exists. What `pcfix.correct_file` refuses at its start is refused here too.
+    The stage gets the options that differ from their defaults. PDAL replaces existing outputs. What
+    `pcfix.correct_file` refuses before it reads points is refused here, too.
     """
     for name in ("bounds", "read_resolution", "port"):
         if getattr(options, name) is not None:
@@ -82,7 +82,7 @@ def pipeline_for(input: Path, output: Path | None, options: CorrectOptions) -> d
 
 
 def _extra_dims(point_format: laspy.PointFormat, columns: tuple[Column, ...]) -> str:
-    """Return the extra dimensions of the input, as PDAL names them, and those of pcfix."""
+    """Return the extra dimensions of the input, with PDAL's names and types, and of pcfix."""
     names = []
     for dimension in point_format.extra_dimensions:
         kind = "double" if dimension.is_scaled else str(dimension.dtype.base)

@@ -168,8 +168,8 @@ def _bed(given: PlanOptions, depth_m: float) -> tuple[Block, FloatArray]:
         share = len(seen) / POINTS
         raise SettingError(
             "plan.overlap",
-            f"Overlap {given.overlap:g} and sidelap {given.sidelap:g}: three images see only"
-            f" {share:.0%} of a bed {depth_m:g} m deep. Give more overlap.",
+            f"Overlap {given.overlap:g} and sidelap {given.sidelap:g}: only"
+            f" {share:.0%} of a bed {depth_m:g} m deep are in three images. Give more overlap.",
             overlap=given.overlap, sidelap=given.sidelap, share=share,
         )  # fmt: skip
     views = Views(sight.start, sight.camera).take(seen)

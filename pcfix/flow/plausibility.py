@@ -58,15 +58,15 @@ class Plausible(NamedTuple):
 
     def __str__(self) -> str:
         """Return a line that claims no more than was tested."""
-        found = "cameras and cloud fit" if self.fits else "nothing was tested"
-        found = "cameras and cloud may not fit, see the warnings" if self.doubts else found
+        found = "cameras and cloud match" if self.fits else "nothing was tested"
+        found = "cameras and cloud may not match, see the warnings" if self.doubts else found
         found += f"; tested: {', '.join(self.fits)}" if self.fits else ""
         return found + (f"; not checked: {', '.join(self.unchecked)}" if self.unchecked else "")
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        lists = {name: list(map(str, some)) for name, some in self._asdict().items()}
-        return {"words": str(self), **lists}
+        lists = {"fits": self.fits, "problems": self.doubts, "unchecked": self.unchecked}
+        return {"words": str(self), **{name: list(map(str, one)) for name, one in lists.items()}}
 
 
 @dataclass(frozen=True)
@@ -246,7 +246,7 @@ def _directions(cameras: Cameras, xyz: FloatArray) -> Iterator[Finding]:
             turn_deg=turn,
         )
     elif abs(turn) < 180.0 - MOST_TURN_DEG:  # as cameras are mounted in aircraft
-        yield "unchecked", "yaw (the images lie across the flight lines)"
+        yield "unchecked", "yaw (the images are across the flight lines)"
     else:
         yield _doubt(
             "cameras.yaw",

@@ -32,7 +32,7 @@ from pcfix.io.las.writing import write_points
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.io.rasters import open_raster, place_of, read_masked, write_dod
 from pcfix.options.declare import File, taken
-from pcfix.options.photos import PhotosOptions, RebuildOptions
+from pcfix.options.steps import PhotosOptions, RebuildOptions
 from pcfix.photos.ortho import Picture, blank_in
 from pcfix.photos.stereo import stereo_cloud
 from pcfix.running import threads

@@ -1,4 +1,4 @@
-"""What a run is asked for, the files that it reads and writes, and which of its steps are done."""
+"""The request of a run, the files that it reads and writes, and the record of its steps."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from pcfix.io.files import belonging, file_state, files_in, read_json, refusing,
 from pcfix.io.rasters import open_raster
 from pcfix.io.tiles import Tiles, cloud_of, inputs_of, open_cloud, tiles_from, tiles_of
 from pcfix.model import Cameras, WaterSurface
+from pcfix.options.correct import RunOptions
 from pcfix.options.declare import named, options_of
 from pcfix.options.steps import DistanceOptions
-from pcfix.options.survey import RunOptions
 from pcfix.version import __version__
 from pcfix.water.index import with_index
 
 SURFACE = "surface.tif"
 STEPS = ("adjust", "correct", "clean", "dsm", "compare", "map", "report")
-"""In their order; each depends on those before it."""
+"""The steps in order; each depends on those before it."""
 
 
 class Request(RunOptions):
-    """Everything that the results of a run depend on; ``run.json`` keeps it."""
+    """Everything that the results of a run depend on; ``run.json`` records it."""
 
     input: str | tuple[str, ...] = ""
-    """The cloud; many files as `tiles_of` takes them."""
+    """The cloud; for many files see `tiles_of`."""
 
     @cached_property
     def source(self) -> Path | Tiles:
@@ -51,12 +51,12 @@ class Request(RunOptions):
 
     @property
     def has_surface(self) -> bool:
-        """Whether the reference has heights everywhere: not check points."""
+        """Whether the reference is a surface, not check points."""
         suffix = Path(str(self.reference)).suffix.lower()
         return is_cloud(self.surveyed) or suffix in (".tif", ".tiff")
 
     def check(self) -> None:
-        """Refuse options that exclude each other."""
+        """Raise SettingError for options that exclude each other."""
         wrong = ""
         if self.adjust == "no" and self.only_to_adjust:
             wrong = f"{self.only_to_adjust[0]} is for an adjustment only. Remove it, or use auto."
@@ -71,7 +71,7 @@ class Request(RunOptions):
 
     @property
     def only_to_adjust(self) -> list[str]:
-        """Options that were given and are for an adjustment only."""
+        """The given options that only an adjustment uses."""
         return [name for name in ("gcps", "gnss", "lens") if getattr(self, name) is not None]
 
     @property
@@ -86,7 +86,7 @@ class Request(RunOptions):
         return ""
 
     def with_adjusted(self, folder: Path, step: dict[str, Any]) -> Request:
-        """Return the request of the next steps: with the adjusted cameras, if there are any."""
+        """Return the request for the next steps, with the adjusted cameras if there are any."""
         if step["model"] is None:
             return self
         return replace(
@@ -97,12 +97,12 @@ class Request(RunOptions):
         )  # fmt: skip
 
     def record(self) -> dict[str, Any]:
-        """Return plain values, without what the results do not depend on."""
+        """Return plain values of the options that the results depend on."""
         values = {name: value for name, value in self.as_dict().items() if name not in HOW}
         return {**values, "pcfix": __version__}
 
     def files(self) -> dict[str, list[Path]]:
-        """Return the input files, each of which exists, by the first step that reads them."""
+        """Return the input files by the first step that reads them; each exists."""
         found = [*_files_of(self.source), *(one for path in self._named for one in files_in(path))]
         found += [Path(self.water)] if Path(self.water).is_file() else []
         compared = [] if self.reference is None else _files_of(self.surveyed)
@@ -110,7 +110,7 @@ class Request(RunOptions):
         return {"adjust": found, "compare": compared}
 
     def watched(self, results: Path) -> dict[str, list[Path]]:
-        """Return the input files with those that belong to them, but none in the results."""
+        """Return the input files and the files that belong to them, except those in the results."""
         read, own = self.files(), results.resolve()
         more = {one for path in self._named for one in belonging(path)}
         outside = sorted(one for one in more if own not in one.resolve().parents)
@@ -118,7 +118,7 @@ class Request(RunOptions):
 
     @property
     def _named(self) -> list[Path]:
-        """The files of the first step, but for the cloud and the water."""
+        """The files of the first step, except cloud and water."""
         return paths_in(self, but=("water", "reference"))
 
 
@@ -130,18 +130,18 @@ LATER = {
     **{one.name: "compare" for one in options_of(DistanceOptions)},
     "reference": "compare", "resolution": "dsm", "project": "report", "date": "report",
 }  # fmt: skip
-"""The first step that an option of a request matters to, if it does not matter to all."""
+"""The first step that depends on an option, for options that do not affect all steps."""
 
 
 class Record:
-    """The file run.json: what was asked for, from which files, and which steps are done.
+    """The file run.json: the request, its input files, and the steps that are done.
 
     Each step has a key: a hash of its options, its input files and the key of the step before it.
-    A step is done if the record has it with the same key, its outputs are as it left them, and no
-    step before it had to be done. The file is written after each step.
+    A step is skipped if the record has it with the same key, its outputs have not changed, and no
+    earlier step was done again. The file is written after each step.
 
-    `request` is everything that the results depend on, and `inputs` are the input files by the
-    first step that reads them.
+    `request` has all options that the results depend on, and `inputs` the input files by the first
+    step that reads them.
     """
 
     def __init__(
@@ -160,24 +160,24 @@ class Record:
         earlier = read_record(path) if path.exists() else {"request": request, "steps": {}}
         self._earlier: dict[str, Any] = earlier["steps"]
         self.resumes = self._has(STEPS[0])
-        """Whether there is an earlier run whose corrected cloud is not replaced."""
+        """Whether there is an earlier run whose corrected cloud remains valid."""
         plain = json.loads(json.dumps(request))
         self.changed = [one for one in plain if plain[one] != earlier["request"].get(one)]
-        """The options that the earlier run had otherwise."""
+        """The options that had other values in the earlier run."""
 
     def _has(self, step: str) -> bool:
         return bool(self._earlier.get(step, {}).get("key") == self._keys[step])
 
     def step(self, name: str, outputs: Sequence[Path], work: Callable[[], Any]) -> tuple[Any, bool]:
-        """Do a step unless it is done; return its result and whether it was done.
+        """Do a step, or skip it; return its result and whether it was skipped.
 
-        `outputs` are all files that `work` leaves; it returns what later steps need, as JSON can
-        hold it.
+        `outputs` are all files that `work` writes. `work` returns what later steps need, in the
+        types of JSON.
         """
         done = self._earlier.get(name, {})
         was_done = self._has(name) and done["outputs"] == [file_state(one) for one in outputs]
         if not was_done:
-            self._earlier = {}  # the later steps read other files now
+            self._earlier = {}  # later steps must be done again
             result = json.loads(json.dumps(work()))
             states = [file_state(one) for one in outputs]
             done = {"key": self._keys[name], "outputs": states, "result": result}
@@ -198,7 +198,7 @@ _NO_RECORD = "is not the record of a run ({}). Give the run.json of an earlier r
 
 
 def request_of(record: Path) -> Request:
-    """Return what an earlier run was asked for, from its ``run.json``."""
+    """Return the request of an earlier run from its ``run.json``."""
     asked = {**read_record(record)["request"]}
     input = asked.pop("input", "")
     for name in ("index_from", "pcfix"):
@@ -211,7 +211,7 @@ def request_of(record: Path) -> Request:
 
 
 class RunFolder:
-    """The folder of a run: what was asked for, and the files that it writes."""
+    """The folder of a run: its request and the files that it writes."""
 
     def __init__(self, folder: Path, request: Request) -> None:
         self.folder, self.request = folder, request
@@ -223,17 +223,17 @@ class RunFolder:
         self.regression, self.dod = folder / "regression.json", self.compare / "dod.tif"
 
     def files_of(self, cloud: Path) -> list[Path]:
-        """Return the files of a cloud in the folder: itself, or as many as the input has."""
+        """Return the files of a cloud in the folder: one, or as many as the input has."""
         return [cloud] if self._tiles is None else [cloud / name for name in self._tiles]
 
     @cached_property
     def corrected_cloud(self) -> Path | Tiles:
-        """The corrected cloud, once it is there."""
+        """The corrected cloud; it must exist."""
         return self._cloud(self.corrected)
 
     @cached_property
     def cleaned_cloud(self) -> Path | Tiles:
-        """The cleaned cloud, once it is there."""
+        """The cleaned cloud; it must exist."""
         return self._cloud(self.cleaned)
 
     def _cloud(self, path: Path) -> Path | Tiles:
@@ -242,7 +242,7 @@ class RunFolder:
 
     @property
     def resolution_m(self) -> float:
-        """Side of the cells of the rasters, once they are there."""
+        """Cell size of the rasters; they must exist."""
         with open_raster(self.folder / SURFACE) as dsm:
             return float(dsm.res[0])
 
@@ -259,7 +259,7 @@ class RunFolder:
 
     @cached_property
     def water(self) -> WaterSurface:
-        """The surface as the corrected cloud states it, else as it was asked for."""
+        """The water surface: as recorded in the corrected cloud, else as requested."""
         with _shown_before():
             with open_cloud(self.corrected_cloud) as source:
                 stated = own_water(source)

@@ -1,4 +1,4 @@
-"""Undo a correction from the dimensions that it left in the file."""
+"""Undo a correction with the extra dimensions that it wrote."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def restore_file(
     progress: Callable[[int, int], None] | None = None,
     **keywords: Any,
 ) -> int:
-    """Give back the apparent cloud that a corrected one came from, bit for bit.
+    """Undo a correction exactly: write the apparent cloud, bit for bit.
 
     Parameters
     ----------
@@ -33,19 +33,19 @@ def restore_file(
         A cloud that pcfix corrected with ``dimensions="all"``, or many and a folder for the
         output; see `pcfix.correct_file`.
     output : path
-        The cloud as it was: coordinates, classes, flags, point format, version.
+        The apparent cloud with its coordinates, classes, flags, point format and version.
     options, progress
         See `pcfix.correct_file`.
 
     Returns
     -------
     int
-        Points written. Rows dropped by ``uncorrected="drop"`` are gone.
+        Number of points written. Points dropped by ``uncorrected="drop"`` are lost.
 
     Raises
     ------
     InputError
-        If pcfix did not correct the file, or without the dimensions that undo it.
+        If pcfix did not correct the file, or the dimensions for undoing it are missing.
     """
     given = taken(TileOptions, options, keywords, "restore_file")
     return run_command(
@@ -55,7 +55,7 @@ def restore_file(
 
 
 def _restoring(plan: None, source: LasSource) -> FileWork:
-    """Return the restoring of one file: its header of before, and each chunk."""
+    """Return how to restore one file: its original header, and a function for each chunk."""
     content = read_settings(source.vlrs, source.path)
     with record_errors(source.path):
         names, before = _ours(source, content["settings"]), content["before"]
@@ -64,10 +64,11 @@ def _restoring(plan: None, source: LasSource) -> FileWork:
         header = restored_header(source, before, names)
 
     def apply(points: Chunk, result: None) -> Chunk:
-        """Give points their original coordinates, classes and flags."""
+        """Restore coordinates, classes and flags of points."""
         moved = np.asarray(points.array["RayCount"] > 0)
         points.array["classification"][moved] = points.array["SourceClass"][moved]
-        ours = np.asarray(~moved & (points.array["WaterDepth"] > 0))  # and could not be corrected
+        # points that pcfix withheld: submerged, but not corrected
+        ours = np.asarray(~moved & (points.array["WaterDepth"] > 0))
         if UNSURE.name in names:
             ours |= points.array[UNSURE.name] > 0
         withheld = np.asarray(points["withheld"]).astype(bool)
@@ -82,7 +83,7 @@ def _restoring(plan: None, source: LasSource) -> FileWork:
 
 
 def _ours(source: LasSource, settings: dict[str, Any]) -> set[str]:
-    """Return the dimensions that pcfix added, if all that undo its work are there, unchanged."""
+    """Return the dimensions that pcfix added; InputError if any is missing or has changed."""
     dimensions = settings["dimensions"]
     columns = columns_for(dimensions, settings.get("unsure", "keep"))
     names = {column.name for column in columns}

@@ -37,10 +37,9 @@ from pcfix.io.saved import ENSEMBLE
 from pcfix.io.tiles import Tiles, check_one_file
 from pcfix.libraries import analysis_library
 from pcfix.model import WaterDimension
-from pcfix.options.correct import CorrectOptions
+from pcfix.options.correct import AdjustOptions, CorrectOptions, RunOptions
 from pcfix.options.declare import File, options_of, taken
 from pcfix.options.steps import CleanOptions, DistanceOptions
-from pcfix.options.survey import AdjustOptions, RunOptions
 from pcfix.report.adjustment import adjustment_sentence, all_notes
 from pcfix.report.comparison import signed_statistics
 from pcfix.report.summary import Summary
@@ -173,7 +172,7 @@ def run_all(
     poses = corrected["poses"]
     if first["absorbed"] is False and poses is not None and poses["absorbed"] is None:
         # the first step has surveys that the correction has not
-        words = "did not absorb the refraction, as the first step found"
+        words = "have not absorbed the refraction, as the step adjust found"
         corrected = {**corrected, "poses": {**poses, "absorbed": False, "words": words}}
 
     # the corrected cloud marks which points are below the water
@@ -261,7 +260,7 @@ def _decide(request: Request) -> tuple[str, bool | None]:
     which the result is compared: the cloud must not depend on it.
     """
     if request.adjust != "auto" or request.cameras is None:
-        return ("that was asked for" if request.adjust == "yes" else ""), None
+        return ("set by the user" if request.adjust == "yes" else ""), None
     if request.why_not_adjust:
         return request.why_not_adjust, None
     inputs, view = request.part(Inputs), view_of(request.source)
@@ -272,8 +271,8 @@ def _decide(request: Request) -> tuple[str, bool | None]:
             cameras = read_gnss(request.gnss, cameras)
         elif request.gcps is None and not has_datum(cameras, str(request.cameras)):
             return (
-                "there is no datum: no --gcps, no --gnss, and no GNSS positions better than"
-                f" {MOST_STATED_M:g} m in the camera file"
+                "the camera file has no GNSS positions better than"
+                f" {MOST_STATED_M:g} m, and neither --gnss nor --gcps is given"
             ), None
         water = inputs.surface(view).surface
         if isinstance(water, WaterDimension):
@@ -283,10 +282,10 @@ def _decide(request: Request) -> tuple[str, bool | None]:
             in_passing=not request.only_to_adjust,
         ).decided_by  # fmt: skip
     if sign is None:
-        why = "nothing shows whether the poses absorbed the refraction; --adjust yes adjusts anyway"
+        why = "nothing shows whether the poses have absorbed the refraction (--adjust yes adjusts)"
         return why, None
-    did = "absorbed" if sign.speaks else "did not absorb"
-    return f"the poses {did} the refraction: {sign.words}", sign.speaks
+    have = "have" if sign.speaks else "have not"
+    return f"the poses {have} absorbed the refraction: {sign.words}", sign.speaks
 
 
 def _adjust(request: Request, target: Path, files: list[Path]) -> str:

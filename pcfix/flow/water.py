@@ -12,8 +12,8 @@ from pcfix.flow.surfaces import check_shoreline, find_surface, sample_of, view_o
 from pcfix.grid.shoreline import NearWater
 from pcfix.io.files import check_input
 from pcfix.model import FloatArray, WaterDimension
+from pcfix.options.correct import WaterCheckOptions
 from pcfix.options.declare import taken
-from pcfix.options.survey import WaterCheckOptions
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, draw_cloud, label_plan, new_figure
 from pcfix.report.text import Plain, RowTable, aligned, filled, shoreline_rows
 from pcfix.water.auto import WaterProposal
@@ -116,15 +116,16 @@ def water_text(report: WaterReport) -> str:
     elif isinstance(found, WaterProposal):
         rows = [
             ("Level", f"{found.level_m:.3f} m, standard error {found.sigma_level_m:.3f} m,"
-             f" confidence {found.confidence:.2f}"),
+             f" confidence {100.0 * found.confidence:.0f} %"),
             *(("Evidence", reason) for reason in found.reasons),
         ]  # fmt: skip
     if r["share_below"] is not None:
         below, unknown = 100.0 * r["share_below"], 100.0 * r["share_unknown"]
-        words = f"{below:.1f} % of {r['cloud']} are below the surface, {unknown:.1f} % have none"
-        rows.append(("Cloud", f"{words} above them"))
+        words = f"{below:.1f} % of the points of {r['cloud']} are below the surface"
+        words += f"; {unknown:.1f} % have no surface above them" if unknown else ""
+        rows.append(("Cloud", words))
     rows += shoreline_rows(r["shoreline"])
-    return aligned(f"{r['water']}: {r['surface']}", rows, found.notes)
+    return aligned(f"Water surface ({r['water']}): {r['surface']}", rows, found.notes)
 
 
 def water_figure(found: FoundSurface, cloud_xyz: FloatArray) -> Figure:
@@ -133,7 +134,7 @@ def water_figure(found: FoundSurface, cloud_xyz: FloatArray) -> Figure:
     title, shown = str(found.surface), cloud_xyz
     if isinstance(found, WaterProposal):
         title = f"Water {found.level_m:.3f} ± {found.sigma_level_m:.3f} m"
-        title, shown = f"{title}, confidence {found.confidence:.2f}", found.ground
+        title, shown = f"{title}, confidence {100.0 * found.confidence:.0f} %", found.ground
     draw_cloud(figure, plan, shown, getattr(found, "level_m", None))
     if found.points is not None:
         _draw_shoreline(plan, side, found, found.points)

@@ -26,7 +26,7 @@ STAGE_SOURCE = "from pcfix.pdal_stage import {}"
 """The source of a stage in a pipeline."""
 CLASS_FLAGS = "ClassFlags=uint8"
 """To be added for PDAL 2.2, where point formats 0 to 5 have no such dimension."""
-UNPACKED = "flags_taken_apart"
+UNPACKED = "flags_unpacked"
 """In the metadata of a stage that separated the flags from packed classes."""
 _WITHHELD_FLAG = 4
 """Bit of ClassFlags, which older PDAL has in place of the dimension Withheld."""

@@ -389,8 +389,8 @@ class ViewMatch:
         report.share_seen = views.share_seen
         report.unposed = order.unposed
         report.entries, report.unposed_entries = int(posed.sum()), int((~posed).sum())
-        report.beside_entries = int(outside.sum())
-        report.beside_points = int(np.count_nonzero(outside))
+        report.outside_entries = int(outside.sum())
+        report.outside_points = int(np.count_nonzero(outside))
         return listed, report
 
     def _rows(
@@ -432,8 +432,8 @@ class ViewReport(Sums):
     unmatched: int = 0
     entries: int = 0  # cameras of all lists that were matched
     unposed_entries: int = 0  # images without a pose, which are ignored
-    beside_entries: int = 0  # cameras that cannot have imaged their point, which are ignored
-    beside_points: int = 0  # points that these are listed for
+    outside_entries: int = 0  # cameras that cannot have imaged their point, which are ignored
+    outside_points: int = 0  # points that these are listed for
     unposed: tuple[str, ...] = field(default=(), metadata=SAME)  # that a list may name
     notes: list[PcfixWarning] = field(default_factory=list, metadata=SAME)
 
@@ -463,8 +463,8 @@ class ViewReport(Sums):
             named = f", such as {', '.join(self.unposed[:3])}" if self.unposed else ""
             sentence = f"{self.unposed_entries:,} entries without a pose{named} are ignored."
             found["views.unposed"] = sentence
-        if self.beside_entries:
-            found["views.not_in_frame"] = beside(self.beside_entries, self.beside_points)
+        if self.outside_entries:
+            found["views.not_in_frame"] = beside(self.outside_entries, self.outside_points)
         notes = (PcfixWarning(code, f"{self.source}: {one}") for code, one in found.items())
         return [*self.notes, *notes]
 

@@ -128,7 +128,7 @@ def _mesh(path: Path) -> WaterMesh:
     double, area_m2 = in_two_sheets(tin)
     share = float(area_m2[double].sum() / area_m2.sum())
     if share > MOST_OVERLAP:
-        sentence = f"{100.0 * share:.0f} % of the mesh lies above another part. Export one surface."
+        sentence = f"{100.0 * share:.0f} % of the mesh is above another part. Export one surface."
         raise bad_file(path, "water.mesh_overlap", sentence, share=share)
     return mesh
 
@@ -236,7 +236,7 @@ def read_water_raster(
             first, last = np.clip([cell.min(axis=0) - 2, cell.max(axis=0) + 3], 0, size).astype(int)
         if (last - first).min() < 2:
             sentence = "has fewer than two rows and columns near the cloud. Check its CRS."
-            raise bad_file(name, "water.raster_apart", sentence)
+            raise bad_file(name, "water.raster_far", sentence)
         _check_size(float((last - first).prod()), name)
         window = Window(*first.tolist(), *(last - first).tolist())
         heights, more = _heights(source, window, crs, name)

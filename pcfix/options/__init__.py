@@ -1,5 +1,6 @@
-"""Every option of every command, said once; the doors and their documentation are made from it.
+"""All options of all commands, each declared once: flags, keywords and documents follow from it.
 
-`pcfix.options.declare` says how. The other files are the tables: groups that several commands
-share, a correction, what follows it, what goes before it, photographs, and what needs no data.
+`declare` has the mechanism, `shared` the options of several commands, `correct` those of a
+correction and of the steps before it, `steps` those after it and of photographs, and `scenes` those
+of commands without data.
 """

@@ -1,24 +1,32 @@
-"""The options of a correction and of a labelling."""
+"""The options of a correction, of what comes before it, and of a whole run."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal, get_args
 
 from pcfix.errors import SettingError
-from pcfix.options.declare import File, OptionSet, number_or, option, options_of
+from pcfix.options.declare import File, OptionSet, number_or, option, options_of, words
 from pcfix.options.shared import (
+    CameraFileOptions,
     IndexOptions,
     InputOptions,
+    JobOptions,
     LandRules,
     MaskOption,
     NeededOptions,
+    OverwriteOption,
     Panel,
     PartOptions,
+    PortOptions,
     ShorelineOption,
     SummaryOption,
+    SurveyOptions,
     TileOptions,
+    ViewOptions,
+    WaterOptions,
     WaterPerImageOption,
 )
+from pcfix.options.steps import DistanceOptions, ReferenceOption
 
 Unsure = Literal["keep", "withhold"]
 Dimensions = Literal["all", "minimal", "none"]
@@ -38,7 +46,7 @@ LEVEL_M = 0.02
 
 
 class MethodOptions(IndexOptions, panel=Panel.METHOD):
-    """The rays that are used, and how the true point follows from the apparent one."""
+    """The choice of rays and the method of correction."""
 
     method: Method = option("auto", basic=True)
     """Correction method. auto: consistent if the cameras have angles and lenses, else snell."""
@@ -70,8 +78,6 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     """Maximum number of rays per point; those closest to nadir are used. [default: no limit]"""
     occlusion: Literal["auto", "on", "off"] = option("auto", with_cameras=True)
     """Skip cameras from which the cloud occludes the point; auto: if there are oblique images."""
-    exact: bool = option(False)
-    """No effect: every point is solved exactly. The option remains for older scripts."""
     depth_factor: float | str | None = option(
         None, least=1, most=3, needs="method factor", parse=number_or("auto"), metavar="N"
     )
@@ -80,10 +86,10 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     least_r2: float = option(0.5, least=0, most=1)
     """Minimum r2 of the fit of --method regression."""
     index_from: str = ""
-    """Which water the index is of, if it was not given as a number; not an option."""
+    """The water of the index, if it was not given as a number; not an option."""
 
     def check(self) -> None:
-        """Check that one ray is enough for the method."""
+        """Check the method for a single ray."""
         if self.max_cameras == 1 and self.method not in ("butler", "dietrich"):
             raise SettingError(
                 "option.range",
@@ -99,7 +105,7 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
         return self.method not in WITHOUT_CAMERAS or self.depth_factor == "auto"
 
     def check_no_cameras(self) -> None:
-        """Refuse what cannot be done, or has no effect, without cameras."""
+        """Raise SettingError for methods and options that need cameras."""
         if self.needs_cameras:
             factor = self.method in WITHOUT_CAMERAS
             wanted = "depth-factor auto" if factor else f"method {self.method}"
@@ -119,7 +125,7 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
 
     @property
     def limit_deg(self) -> float | None:
-        """The maximum incidence angle; None for no limit, or if it is not known yet."""
+        """The maximum incidence angle; None for no limit, or if it is not estimated yet."""
         return None if self.max_angle in (None, "auto") else float(self.max_angle)
 
     @property
@@ -130,7 +136,7 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
 
     @property
     def chooses_maps(self) -> bool:
-        """Whether the images that made a point are chosen among several by the bed around it."""
+        """Whether the base image of a point is the one with which the neighbouring bed agrees."""
         return self.method == "consistent" and self.matcher in ("depth-maps", "single-map")
 
 
@@ -154,11 +160,11 @@ class BudgetOptions(OptionSet, panel=Panel.BUDGET):
 
 
 class RefractionOptions(BudgetOptions, MethodOptions, panel=Panel.OUTPUT):
-    """Everything that the correction of points depends on."""
+    """All options that affect the correction of points."""
 
     unsure: Unsure = option("keep", with_cameras=True)
     """Corrected points whose rays all have incidence angles above 35 deg, without a view list: keep
-    them as they are, or flag them as withheld."""
+    them, or flag them as withheld."""
     deep: bool = option(False, panel=Panel.WATER)
     """Accept depths of more than 60 m, which usually mean a wrong water level."""
 
@@ -168,7 +174,7 @@ class PointsOptions(RefractionOptions, WaterPerImageOption):
 
 
 class ScienceOptions(RefractionOptions, panel=Panel.OUTPUT):
-    """Everything that a corrected file depends on, besides its inputs; the file records it."""
+    """All options that affect a corrected file; the file records them."""
 
     uncorrected: Literal["withhold", "keep", "drop"] = option("withhold", basic=True)
     """Submerged points with fewer than two usable rays: flag, keep or drop them."""
@@ -187,7 +193,7 @@ class CorrectOptions(
 
 
 class LabelRules(LandRules, panel=Panel.WATER):
-    """Which points count as submerged, besides those below the surface; see `pcfix.label`."""
+    """The rules of a labelling; see `pcfix.label`."""
 
     band: float = option(0.0, least=0)
     """Points up to this distance from the surface, above or below, become class 41. [m] [default:
@@ -199,7 +205,7 @@ class LabelRules(LandRules, panel=Panel.WATER):
     """Set points of class 40 or 41 to class 1 if they are no longer in either class."""
 
     def check(self) -> None:
-        """Check that the dead band is wider."""
+        """Check that the dead band is wider than the band."""
         if 0.0 < self.dead_band <= self.band:
             raise SettingError(
                 "option.range",
@@ -212,12 +218,132 @@ class LabelRules(LandRules, panel=Panel.WATER):
 
 
 class StageLabelOptions(LabelRules, MaskOption, NeededOptions):
-    """The options of the stage ``label`` of PDAL, which writes no files."""
+    """The options of the PDAL stage ``label``, which writes no files."""
 
 
 class LabelOptions(PartOptions, TileOptions, SummaryOption, StageLabelOptions):
     """The options of ``pcfix label``."""
 
 
+WaterUnknown = Literal["level", "tilt", "index", "shape", "distance", "centre"]
+LensUnknown = Literal[
+    "f", "cx", "cy", "b1", "b2", "p1", "p2", "k1", "k2", "k3", "k4", "k5", "k6", "k7", "k8"
+]
+WATER_UNKNOWNS: tuple[str, ...] = get_args(WaterUnknown)
+
+
+class SurveyedOptions(OptionSet, panel=Panel.CAMERAS):
+    """Survey data of the images."""
+
+    gcps: Any = option(None, basic=True, metavar="PATH")
+    """Control and check points with their image points: CSV
+    name,x,y,z,image,u,v[,role,under_water], ODM's gcp_list.txt, or Metashape's markers."""
+    gnss: File | None = option(None, basic=True)
+    """GNSS positions of the images: CSV image,x,y,z[,sx,sy,sz], a geotag list, or a camera file.
+    [default: those of the camera file]"""
+    lens: File | None = option(None, basic=True)
+    """Calibrated lens, which is held fixed: a file as for --sensor, or a Metashape calibration."""
+
+
+class CamerasCheckOptions(
+    OverwriteOption, SummaryOption, SurveyedOptions, CameraFileOptions, IndexOptions,
+    panel=Panel.CAMERAS,
+):  # fmt: skip
+    """The options of ``pcfix cameras``."""
+
+    cloud: File | None = option(None, basic=True)
+    """LAS or LAZ cloud to check against the cameras."""
+    water: Any = option(None, basic=True, metavar="SPEC")
+    """Water surface, as for 'pcfix correct': for heights and GSD and, with --cloud, for a check of
+    absorbed refraction."""
+    reference: File | None = option(None, basic=True)
+    """Survey of land or bed: LiDAR (.las, .laz), grid (.tif) or CSV x,y,z."""
+    plot: File | None = option(None, writes=True, basic=True)
+    """PNG of the block in plan and from the side."""
+
+
+class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions, panel=Panel.OUTPUT):
+    """The options of ``pcfix water``."""
+
+    cloud: File | None = option(None, basic=True)
+    """LAS or LAZ cloud under the water surface."""
+    plot: File | None = option(None, writes=True, basic=True)
+    """PNG of points and residuals, or of the evidence for auto."""
+    shoreline: File | None = option(None, writes=True, basic=True, needs="cloud")
+    """GeoPackage (.gpkg) for the shoreline of the cloud, with its standard error."""
+
+
+class RunOptions(
+    ReferenceOption, ShorelineOption, TileOptions, DistanceOptions, SurveyedOptions,
+    RefractionOptions, MaskOption, LandRules, SurveyOptions, panel=Panel.OUTPUT,
+):  # fmt: skip
+    """The options of ``pcfix run``; ``run.json`` records all that affect its results."""
+
+    resolution: float | None = option(None, basic=True, above=0)
+    """Cell size of the rasters. [m] [default: 2 to 4 points a cell]"""
+    project: str | None = option(None, basic=True)
+    """Name of the project, the title of the report. [default: the name of the cloud]"""
+    date: str | None = option(None)
+    """Date of the images, for the report."""
+    adjust: Literal["auto", "yes", "no"] = option("auto", basic=True)
+    """First refine the cameras, as 'pcfix adjust'; auto: if they have absorbed refraction, and
+    there are GNSS positions or --gcps."""
+
+
+def _lens_names(text: str) -> tuple[str, ...]:
+    names = words(text)
+    return () if names == ("none",) else names
+
+
+class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
+    """The unknowns and weights of an adjustment."""
+
+    free: tuple[WaterUnknown, ...] = option((), basic=True, parse=words, metavar="NAMES")
+    """Unknowns of the water: any of level,tilt,index,shape (second-order curvature); of a port:
+    distance (flat), centre (dome), index. [default: none]"""
+    parallel: tuple[str, ...] = option((), parse=words, metavar="NAMES")
+    """Parallel planes of --gcps, such as floor,deck; water may be one of them."""
+    sigma_level: float | None = option(None, above=0)
+    """Estimate the water level too, with this standard deviation of the given one. [m]"""
+    sigma_tilt: float | None = option(None, above=0)
+    """Estimate the tilt too, with this standard deviation of the given one. [deg]"""
+    sigma_index: float | None = option(None, above=0)
+    """Estimate the refractive index too, with this standard deviation of the given one."""
+    lens_unknowns: tuple[LensUnknown, ...] | None = option(None, parse=_lens_names, metavar="NAMES")
+    """Unknowns of the lens: none, or any of f,cx,cy,k1...,p1,p2,b1,b2. [default: those that the
+    block determines]"""
+    poses: Literal["free", "fixed", "similarity"] = option("free")
+    """Adjust each pose, none, or all together by one similarity transformation."""
+    fixed_images: tuple[str, ...] = option((), parse=words, metavar="A,B")
+    """Images whose poses are held fixed."""
+    datum: Literal["observed", "free"] = option("observed")
+    """Datum of the block: from observations, or free: mean position, direction and scale of the
+    original poses."""
+    ties: Literal["auto", "measured", "cloud"] = option("auto")
+    """Use measured tie points, or points of the cloud; auto: measured if there are any."""
+    gnss_sigma: float | None = option(None, above=0)
+    """Standard deviation of GNSS positions that state none. [m] [default: from their residuals]"""
+    sigma_image: float | None = option(None, above=0)
+    """Standard deviation of tie points in the images. [px] [default: from their residuals]"""
+    outliers: bool = option(True)
+    """Search for outliers and exclude them."""
+
+
+class AdjustOptions(
+    JobOptions, AdjustRules, SurveyedOptions, ViewOptions, CameraFileOptions, PortOptions,
+    NeededOptions, panel=Panel.CAMERAS,
+):  # fmt: skip
+    """The options of ``pcfix adjust``."""
+
+    cloud: File | None = option(None, basic=True)
+    """Cloud reconstructed with these poses; used if there are no tie points."""
+    gnss_crs: str | None = option(None, metavar="CRS")
+    """CRS of the GNSS positions."""
+    gcps_crs: str | None = option(None, metavar="CRS")
+    """CRS of the control points."""
+    water_mask: File | None = option(None, basic=True)
+    """Polygons inside which points may be submerged. [default: everywhere]"""
+
+
 Options = CorrectOptions
-"""The name of the front door."""
+"""The public name of the options of a correction."""

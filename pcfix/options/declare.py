@@ -1,13 +1,13 @@
-"""How an option is declared: one entry, from which every door and its documentation is made.
+"""Declare options: from one entry follow its flag, its keyword, its check and its documentation.
 
 An option is a field of an `OptionSet` with its help below it::
 
     read_resolution: float | None = option(None, above=0)
     \"\"\"Size of a square with one point. [m] [default: all levels]\"\"\"
 
-The text is the help, with the unit, and with the default in words if the value says too little.
-A class holds the options of one subject, and the class of a command lists those it consists of; no
-class is reached twice. Names are the same everywhere: ``max_angle`` in Python and JSON is
+The text is the help, with the unit, and with the default in words if its value is not clear enough.
+A class holds the options of one subject. The class of a command inherits from those that it needs,
+and reaches none twice. Names are the same everywhere: ``max_angle`` in Python and JSON is
 ``--max-angle`` on the command line.
 """
 
@@ -21,6 +21,7 @@ import os
 import sys
 import types
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from functools import cache
 from itertools import pairwise
@@ -45,34 +46,31 @@ Set = TypeVar("Set", bound="OptionSet")
 
 
 class Option(NamedTuple):
-    """An option of a class; name, type and default are those of its field."""
+    """An option of a class, with the name, type and default of its field."""
 
     name: str
     type: Any
     default: Any
     home: type  # the class that declares it
-    # whether most people need it; --help of a command with many options shows no others
-    basic: bool = False
-    least: float | None = None  # limit of a number, or of each of several
+    basic: bool = False  # most people need it; a short --help shows no others
+    least: float | None = None  # smallest number allowed, also in each of several
     above: float | None = None  # the same, but this value itself is not allowed
-    most: float | None = None
-    needed: str = ""  # "needed" if it must be given, with when not
+    most: float | None = None  # largest number allowed
+    needed: str = ""  # "needed" if it must be given, and when it need not be
     instead: str = ""  # another option that can replace it
-    with_cameras: bool = False  # whether it has no effect without cameras
-    needs: str = ""  # option without which it has no effect, or with which value: "method factor"
-    # options that must be given with it; of "cameras or gsd" exactly one
-    requires: tuple[str, ...] = ()
-    # the value of a text; ValueError says what is wrong with it
-    parse: Callable[[str], Any] | None = None
-    then: Callable[[Any], Any] | None = None  # what the program uses, by a value of the right type
+    with_cameras: bool = False  # it has no effect without cameras
+    needs: str = ""  # it has no effect without this option, or its value: "method factor"
+    requires: tuple[str, ...] = ()  # options to give with it; of "cameras or gsd" exactly one
+    parse: Callable[[str], Any] | None = None  # reads a text; its ValueError is the message
+    then: Callable[[Any], Any] | None = None  # turns a value of the right type into the one used
     metavar: str = ""  # placeholder of the value
-    panel: str = ""  # of the help, if it is not that of the class
-    off: bool = False  # whether --no-NAME is a flag too; a switch that is on always has one
-    writes: bool = False  # whether it names an output
+    panel: str = ""  # panel of the help, if not that of the class
+    off: bool = False  # --no-NAME is a flag too; a switch that is on always has it
+    writes: bool = False  # it names an output
 
     @property
     def _text(self) -> str:
-        """The text below its declaration, or below that of a base that it replaces."""
+        """The text below its declaration, or below the declaration that it replaces."""
         found = (
             _texts(base.__module__).get((base.__name__, self.name)) for base in self.home.__mro__
         )
@@ -80,7 +78,7 @@ class Option(NamedTuple):
 
     @property
     def help(self) -> str:
-        """What it means, with the unit."""
+        """Its meaning, with the unit."""
         return self._text.partition(" [default: ")[0]
 
     @property
@@ -89,6 +87,8 @@ class Option(NamedTuple):
         words = self._text.partition(" [default: ")[2].removesuffix("]")
         if words or self.default in (None, ()) or self.default is False:
             return words
+        if self.default is True:
+            return "on"
         if isinstance(self.default, tuple):
             return ("," if self.parse else " ").join(f"{value:g}" for value in self.default)
         return f"{self.default:g}" if isinstance(self.default, float) else str(self.default)
@@ -100,14 +100,14 @@ class Option(NamedTuple):
 
     @property
     def kinds(self) -> tuple[Any, ...]:
-        """The types that it may have, without None."""
+        """The types that its value may have, without None."""
         union = get_origin(self.type) in (Union, types.UnionType)
         kinds = get_args(self.type) if union else (self.type,)
         return tuple(kind for kind in kinds if kind is not type(None))
 
     @property
     def choices(self) -> tuple[str, ...]:
-        """The words that it may be; empty if it is free."""
+        """The words that are allowed; empty if any value is."""
         return next((get_args(kind) for kind in self.kinds if get_origin(kind) is Literal), ())
 
     @property
@@ -121,7 +121,14 @@ class Option(NamedTuple):
         return self.default == () and self.parse is None
 
     def checked(self, value: Any) -> Any:
-        """Return a value as its type, or refuse it."""
+        """Return a value as its type, or refuse it.
+
+        A single value may replace a list, and a number may be text, as both occur in JSON.
+        """
+        if self.repeats and isinstance(value, str):
+            value = (value,)
+        elif isinstance(self.default, tuple) and _is_number(value):
+            value = str(value) if self.parse is not None else (value,)
         if isinstance(value, str) and self.parse is not None:
             try:
                 value = self.parse(value)
@@ -155,7 +162,10 @@ class Option(NamedTuple):
             raise self._wrong("type", value, "must be a file or folder")
         if not {int, float} & {*kinds} or (str in kinds and isinstance(value, str)):
             return value
-        if isinstance(value, str | bool) or not hasattr(value, "__float__"):
+        if isinstance(value, str):
+            with suppress(ValueError):
+                value = float(value)
+        if not _is_number(value):
             raise self._wrong("type", value, "must be a number")
         number, least = float(value), self.least if self.above is None else self.above
         low = -math.inf if least is None else least
@@ -180,18 +190,22 @@ class Option(NamedTuple):
         )  # fmt: skip
 
 
+def _is_number(value: Any) -> bool:
+    return hasattr(value, "__float__") and not isinstance(value, bool)
+
+
 def option(default: Any, **declared: Any) -> Any:
-    """Declare an option; for the names of `declared` see `Option`."""
+    """Declare an option; `Option` has the names of `declared`."""
     return field(default=default, metadata={"option": declared})
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)
 @dataclass(frozen=True, kw_only=True)
 class OptionSet:
-    """The base of all classes of options: every value is checked against its declaration.
+    """The base of all classes of options, which are frozen dataclasses.
 
-    Its subclasses are frozen dataclasses. A class says in which `panel` of the help its own options
-    are.
+    Every value is checked against its declaration. `panel` is the panel of the help that shows the
+    options of a class.
     """
 
     panel: ClassVar[str] = ""
@@ -202,7 +216,7 @@ class OptionSet:
         dataclass(frozen=True, kw_only=True)(cls)
 
     def __post_init__(self) -> None:
-        """Check every option, then what they say together."""
+        """Check every option, then the rules between options."""
         options = {one.name: one for one in options_of(type(self))}
         for name, one in options.items():
             object.__setattr__(self, name, one.checked(getattr(self, name)))
@@ -234,10 +248,10 @@ class OptionSet:
                 vars(group)["check"](self)
 
     def check(self) -> None:
-        """Check what the options of a class say together; called for each class of a command."""
+        """Check the rules between options; called for each class of a command."""
 
     def missing(self) -> Option | None:
-        """Return the first option that is needed and was not given, nor another instead."""
+        """Return the first needed option that was not given or replaced by another one."""
         for one in options_of(type(self)):
             is_optional = one.name == "cameras" and not getattr(self, "needs_cameras", True)
             given = [getattr(self, name, None) for name in (one.name, one.instead)]
@@ -246,12 +260,12 @@ class OptionSet:
         return None
 
     def part(self, kind: type[Set]) -> Set:
-        """Return those options that another class has too."""
+        """Return the options that another class shares with this one, as that class."""
         names = [one.name for one in fields(kind) if hasattr(self, one.name)]
         return kind(**{name: getattr(self, name) for name in names})
 
     def plain(self) -> dict[str, Any]:
-        """Return what was given, other than the defaults, as a stage of PDAL takes it."""
+        """Return the options that differ from their defaults, as ``pdalargs`` takes them."""
         return {
             one.name: _as_text(one, getattr(self, one.name))
             for one in options_of(type(self))
@@ -259,14 +273,14 @@ class OptionSet:
         }
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all values, as JSON holds them."""
+        """Return all values in the types of JSON."""
         return dict(plain(self))
 
 
 def _as_text(one: Option, value: Any) -> Any:
-    """Return numbers and words as text with commas between, where text is parsed, and no limit."""
+    """Return a value for JSON: several numbers or words as one text with commas."""
     if value is None:
-        return "none"  # null would be the default
+        return "none"  # null stands for the default
     if isinstance(value, tuple) and one.parse is not None:
         return ",".join(f"{v:.15g}" if isinstance(v, float) else str(v) for v in value)
     return plain(value)
@@ -326,9 +340,9 @@ def taken(kind: type[Set], given: OptionSet | None, keywords: Mapping[str, Any],
 
 
 def named(given: Mapping[str, Any], known: Iterable[Option], where: str) -> dict[str, Any]:
-    """Return values, all of whose names must be known.
+    """Return the values as a dict if all their names are known.
 
-    Raises SettingError ``option.unknown``, with the nearest known name.
+    Raises SettingError ``option.unknown``, with the most similar known name.
     """
     names = [one.name for one in known]
     for name in given:
@@ -345,20 +359,20 @@ def named(given: Mapping[str, Any], known: Iterable[Option], where: str) -> dict
 
 
 def words(text: str) -> tuple[str, ...]:
-    """Parse words with commas between."""
+    """Parse words separated by commas."""
     return tuple(word.strip() for word in text.split(",") if word.strip())
 
 
 def numbers(text: str) -> tuple[float, ...]:
-    """Parse numbers with commas between."""
+    """Parse numbers separated by commas."""
     try:
         return tuple(map(float, words(text)))
     except ValueError:
-        raise ValueError("must be numbers with commas between") from None
+        raise ValueError("must be numbers separated by commas") from None
 
 
 def number_or(*names: str) -> Callable[[str], float | str | None]:
-    """Return the parser of a number or one of some words, any if none are named; none is None."""
+    """Return a parser of numbers and of these words, or of any word; "none" becomes None."""
 
     def parse(text: str) -> float | str | None:
         try:

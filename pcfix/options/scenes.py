@@ -1,4 +1,4 @@
-"""The options of what needs no data: simulate, demo and plan."""
+"""The options of commands without data: simulate, demo and plan."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MOST_DEPTHS = 100
 
 
 class FlightOptions(OptionSet, panel=Panel.FLIGHT):
-    """How the block is flown."""
+    """The flight."""
 
     block: BlockKind = option("nadir", basic=True)
     """Only nadir images, or oblique ones too."""
@@ -45,7 +45,7 @@ class FlightOptions(OptionSet, panel=Panel.FLIGHT):
 
 
 class CameraOptions(OptionSet, panel=Panel.CAMERA):
-    """The camera, and how well it measures."""
+    """The camera and its noise."""
 
     focal_mm: float = option(8.8, least=0.5, most=2000)
     """Focal length."""
@@ -79,7 +79,7 @@ class SceneWaterOptions(IndexOptions, panel=Panel.WATER):
 
 
 class SceneCloudOptions(OptionSet, panel=Panel.CLOUDS):
-    """The cloud that is reconstructed from the images, and the LiDAR."""
+    """The reconstructed cloud and the LiDAR."""
 
     points: int = option(100_000, basic=True, least=1)
     """Number of points in the cloud."""
@@ -110,7 +110,7 @@ class DemoOptions(OverwriteOption, panel=Panel.OUTPUT):
 
 
 def _depths(text: str) -> tuple[float, ...]:
-    """Return the depths of a list, or of FROM:TO:STEP; a single one is the greatest of five."""
+    """Return the depths of a list or of FROM:TO:STEP; one depth stands for five up to it."""
     if ":" in text:
         first = last = step = math.nan
         with suppress(ValueError):

@@ -13,7 +13,7 @@ DEFAULT_REFRACTIVE_INDEX = 1.34
 
 
 class Panel(StrEnum):
-    """The panels of the help, in its order."""
+    """The panels of the help, in order."""
 
     NEED = "What you need"
     INPUT = "Part of the cloud"
@@ -25,7 +25,7 @@ class Panel(StrEnum):
     BUDGET = "Error budget"
     TESTS = "Tests"
     RASTER = "Raster"
-    FIGURES = "Figures"
+    FIGURES = "Comparison"
     UNKNOWNS = "Unknowns and weights"
     CLOUDS = "Clouds"
     ROUNDS = "Rounds"
@@ -45,12 +45,12 @@ class IndexOptions(OptionSet, panel=Panel.WATER):
 
     @property
     def refractive_index(self) -> float:
-        """The number; a water's name becomes one by `pcfix.water.index.with_index`."""
+        """The index as a number; `pcfix.water.index.with_index` replaces fresh and sea."""
         return DEFAULT_REFRACTIVE_INDEX if self.index is None else float(self.index)
 
 
 class WaterOptions(OptionSet, panel=Panel.WATER):
-    """How a water surface is fitted to shoreline points."""
+    """The fit of a water surface to shoreline points."""
 
     water_model: Literal["auto", "level", "plane", "along", "river"] = option("auto", needs="water")
     """Surface fitted to shoreline points: level, plane, plane tilted along the points only, or
@@ -68,7 +68,7 @@ class NeededOptions(WaterOptions, panel=Panel.NEED):
 
 
 class WaterPerImageOption(OptionSet, panel=Panel.WATER):
-    """A water surface of its own for each image."""
+    """A separate water surface for each image."""
 
     water_per_image: File | None = option(None, needs="water")
     """Folder of rasters of the water, named as the images; see 'pcfix calm --surface'. --water is
@@ -76,7 +76,7 @@ class WaterPerImageOption(OptionSet, panel=Panel.WATER):
 
 
 class LandRules(OptionSet, panel=Panel.WATER):
-    """Which points below the surface are land all the same."""
+    """Rules by which points below the surface count as land."""
 
     connected: bool = option(False, basic=True, off=True, needs="water")
     """Correct only the main water body and its connected parts; ignore separate pools."""
@@ -95,7 +95,7 @@ class LandRules(OptionSet, panel=Panel.WATER):
 
 
 class MaskOption(OptionSet, panel=Panel.WATER):
-    """Where points may be submerged."""
+    """The area in which points may be submerged."""
 
     water_mask: File | None = option(None, basic=True)
     """Polygons (.gpkg, .shp, .geojson, .wkt) inside which points may be submerged. [default:
@@ -103,7 +103,7 @@ class MaskOption(OptionSet, panel=Panel.WATER):
 
 
 class PortOptions(OptionSet, panel=Panel.WATER):
-    """A housing under water."""
+    """The port of an underwater housing."""
 
     port: Any = option(None, basic=True, metavar="SPEC")
     """Housing port, for images taken under water; replaces --water:
@@ -112,7 +112,7 @@ class PortOptions(OptionSet, panel=Panel.WATER):
 
 
 class CameraFileOptions(OptionSet, panel=Panel.CAMERAS):
-    """How a camera file is read."""
+    """How to read a camera file."""
 
     sensor: File | None = option(None, with_cameras=True)
     """Interior orientation, if the cameras have none: CSV focal,sensor_x,sensor_y in mm, or a
@@ -140,7 +140,7 @@ class CamerasOptions(CameraFileOptions, panel=Panel.NEED):
 
 
 class ViewOptions(OptionSet, panel=Panel.CAMERAS):
-    """Which images contributed to each point."""
+    """The view list: which images contributed to each point."""
 
     views: File | None = option(None, with_cameras=True, basic=True)
     """View list: the images that contributed to each point. COLMAP's fused.ply.vis, the dense PLY
@@ -151,7 +151,7 @@ class ViewOptions(OptionSet, panel=Panel.CAMERAS):
 
 
 class SurveyOptions(ViewOptions, CamerasOptions, NeededOptions, panel=Panel.CAMERAS):
-    """Inputs of a correction through a water surface, as the user names them."""
+    """Inputs of a correction through a water surface."""
 
     cameras: Any = option(
         None, basic=True, metavar="PATH", panel=Panel.NEED,
@@ -160,9 +160,9 @@ class SurveyOptions(ViewOptions, CamerasOptions, NeededOptions, panel=Panel.CAME
     adjusted_from: Any = option(None, with_cameras=True, basic=True, metavar="PATH", needs="water")
     """Original camera file, if --cameras is the output of 'pcfix adjust'. The cloud is first
     transferred to the adjusted poses."""
-    check_depths: File | None = option(None, needs="method regression")
+    check_depths: File | None = option(None, needs="method regression", panel=Panel.METHOD)
     """Measured depths for --method regression: CSV x,y,depth. [m]"""
-    regression: File | None = option(None, needs="method regression")
+    regression: File | None = option(None, needs="method regression", panel=Panel.METHOD)
     """Line fitted to another cloud, from --save-regression; replaces --check-depths."""
     tide: File | None = option(None, with_cameras=True, panel=Panel.WATER, needs="water")
     """Tide table, CSV time,level_m: each image gets the water level at its time."""
@@ -182,7 +182,7 @@ class InputOptions(SurveyOptions, PortOptions):
 
 
 class PartOptions(OptionSet, panel=Panel.INPUT):
-    """Which points of a cloud are read; see `pcfix.io.las.source`."""
+    """The part of a cloud to read; see `pcfix.io.las.source`."""
 
     bounds: tuple[float, float, float, float] | None = option(
         None, parse=numbers, metavar="X,Y,X,Y"
@@ -194,14 +194,14 @@ class PartOptions(OptionSet, panel=Panel.INPUT):
 
 
 class OverwriteOption(OptionSet, panel=Panel.OUTPUT):
-    """What becomes of files that exist."""
+    """Whether to replace existing files."""
 
     overwrite: bool = option(False, basic=True)
     """Replace an output that exists."""
 
 
 class JobOptions(OverwriteOption, panel=Panel.OUTPUT):
-    """How the work is done."""
+    """The number of threads or processes."""
 
     jobs: int | None = option(None, basic=True, least=1)
     """Number of threads or, for many files, of files processed at the same time. [default: all
@@ -209,7 +209,7 @@ class JobOptions(OverwriteOption, panel=Panel.OUTPUT):
 
 
 class TileOptions(JobOptions, panel=Panel.OUTPUT):
-    """How the work is done where the input may be many files."""
+    """The cluster, if the input may be many files."""
 
     scheduler: str | None = option(None, metavar="ADDRESS")
     """With many files: process them on the cluster of this Dask scheduler, tcp://host:8786."""
@@ -223,7 +223,7 @@ class SummaryOption(OptionSet, panel=Panel.OUTPUT):
 
 
 class ShorelineOption(OptionSet, panel=Panel.OUTPUT):
-    """The line at which the water meets the cloud."""
+    """The shoreline of the cloud as a file."""
 
     shoreline: File | None = option(None, writes=True, basic=True, needs="water")
     """GeoPackage (.gpkg) for the shoreline of the cloud, with its standard error."""

@@ -1,4 +1,4 @@
-"""The options of the steps after a correction: clean, dsm, compare and view."""
+"""The options of the steps after a correction, and of photographs."""
 
 from __future__ import annotations
 
@@ -13,12 +13,17 @@ from pcfix.errors import SettingError
 from pcfix.options.declare import File, OptionSet, numbers, option
 from pcfix.options.shared import (
     CameraFileOptions,
+    CamerasOptions,
+    IndexOptions,
+    JobOptions,
+    NeededOptions,
     OverwriteOption,
     Panel,
     PartOptions,
     SummaryOption,
     TileOptions,
     WaterOptions,
+    WaterPerImageOption,
 )
 
 LEAST_NEIGHBOURS, MOST_NEIGHBOURS = 6, 500
@@ -34,11 +39,11 @@ SurfaceChoice = Literal["all", "bed"]
 class CleanRules(OptionSet, panel=Panel.TESTS):
     """Thresholds of the tests; None switches a test off.
 
-    The fences are those of Tukey (Exploratory Data Analysis, 1977): three ranges are 4.7 standard
-    deviations of a normal distribution. Up to a quarter of the neighbours may be noise on one
-    side. On a slope, at a wall or on a rock that holds a quarter of the neighbours the range is
-    as large as the terrain is high, so that nothing is taken for noise there. The mean distance
-    to the neighbours finds, in a cloud of even spacing, also its edges and corners.
+    The fences are those of Tukey (Exploratory Data Analysis, 1977): three interquartile ranges are
+    4.7 standard deviations of a normal distribution. Up to a quarter of the neighbours may be noise
+    on one side. On a slope, at a wall, or on a rock with a quarter of the neighbours the range is
+    as large as the height of the terrain, so no point is flagged there. In a cloud of even spacing,
+    the mean distance to the neighbours also flags points at edges and corners.
     """
 
     statistical: bool = option(True)
@@ -72,7 +77,7 @@ class CleanRules(OptionSet, panel=Panel.TESTS):
     """Minimum distance of noise above the bed. [m]"""
 
     def check(self) -> None:
-        """Switch off what is not asked for; something must be left."""
+        """Switch off the limits of tests that are off; at least one test must be on."""
         weak = ("min_rays", "max_ray_miss", "max_incidence")
         for switch, limits in {"statistical": ("deviations",), "weak": weak}.items():
             for name in () if getattr(self, switch) else limits:
@@ -89,7 +94,7 @@ class CleanRules(OptionSet, panel=Panel.TESTS):
 
     @property
     def nearest(self) -> int:
-        """How many neighbours in space are needed, including the point itself; 0 for none."""
+        """The number of neighbours in space that are needed, with the point itself; 0 for none."""
         statistical = self.neighbours if self.statistical else 0
         return max(statistical, 0 if self.radius is None else self.radius_neighbours + 1)
 
@@ -105,7 +110,7 @@ class CleanOptions(TileOptions, SummaryOption, CleanRules, panel=Panel.OUTPUT):
 
 
 class DsmRules(OptionSet, panel=Panel.RASTER):
-    """How a cloud becomes a raster."""
+    """How to grid a cloud."""
 
     resolution: float | None = option(None, basic=True, least=MIN_RESOLUTION_M)
     """Cell size. [m] [default: 2 to 4 points a cell]"""
@@ -125,7 +130,7 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
 
     @property
     def cell_m(self) -> float:
-        """The resolution, once there is one."""
+        """The resolution; it must be known."""
         if self.resolution is None:
             raise SettingError(
                 "option.missing", "resolution is missing. Give the cell size in metres."
@@ -133,7 +138,7 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
         return self.resolution
 
     def check(self) -> None:
-        """Check that the other options fit to the value, and the width of holes to the cells."""
+        """Check the rules between the value, the surface and the width of holes."""
         if self.what == "uncertainty" and (self.method != "mean" or self.fill is not None):
             raise SettingError(
                 "option.excludes",
@@ -169,19 +174,18 @@ class DsmOptions(PartOptions, OverwriteOption, SummaryOption, DsmRules, panel=Pa
 
 
 LAYERS = ("water", "apparent", "corrected", "reference")
-"""Lines of a cross-section; a further cloud must have another name."""
+"""Names of the lines of a cross-section; other clouds must have other names."""
 _NAME = re.compile(r"[\w .+-]*\w[\w .+-]*")
 
 
 SIGMA_REFERENCE_M = {"cloud": 0.03, "raster": 0.03, "table of check points": 0.02}
-"""Assumed noise of a height by kind of reference: LiDAR over hard ground, RTK or levelling."""
+"""Assumed standard deviation of a height by kind of reference: LiDAR on hard ground, RTK."""
 
 
 def _bands(given: Any) -> tuple[tuple[float, ...], ...]:
-    """Return the bounds of shares, each of which may be a text."""
+    """Return the bounds of each share; they may be given as text."""
     bands = list[tuple[float, ...]]()
-    # a stage of PDAL may give one text in the place of several
-    for one in (given,) if isinstance(given, str) else given:
+    for one in given:
         band: tuple[float, ...] = ()
         with suppress(ValueError):
             band = numbers(one) if isinstance(one, str) else tuple(map(float, one))
@@ -198,9 +202,8 @@ def _bands(given: Any) -> tuple[tuple[float, ...], ...]:
 
 def _named_clouds(given: Any) -> tuple[tuple[str, str], ...]:
     """Return name and path of each further cloud."""
-    pairs = given.items() if isinstance(given, Mapping) else given
     found: dict[str, str] = {}
-    for one in (pairs,) if isinstance(pairs, str) else pairs:
+    for one in given.items() if isinstance(given, Mapping) else given:
         text = one if isinstance(one, str) else f"{one[0]}={os.fspath(one[1])}"
         name, _, path = text.partition("=")
         if not (_NAME.fullmatch(name) and path):
@@ -217,10 +220,10 @@ def _named_clouds(given: Any) -> tuple[tuple[str, str], ...]:
 
 
 class DistanceOptions(OptionSet, panel=Panel.FIGURES):
-    """What a comparison, or that of a run, measures besides the vertical error.
+    """What a comparison measures in addition to the vertical error.
 
-    `share` and `also` hold pairs: of bounds in metres, and of a name and a path. They may be given
-    as texts; `also` may be a dict too.
+    `share` has pairs of bounds in metres, and `also` pairs of a name and a path. Both may be given
+    as text; `also` may be a dict, too.
     """
 
     m3c2: bool = option(False, needs="reference")
@@ -244,12 +247,12 @@ class DistanceOptions(OptionSet, panel=Panel.FIGURES):
 
     @property
     def from_reference(self) -> bool:
-        """Whether C2C is wanted from each point of the reference."""
+        """Whether C2C is computed from each point of the reference."""
         return self.direction in ("from-reference", "both")
 
 
 class CompareRules(DistanceOptions, panel=Panel.FIGURES):
-    """What is measured of two clouds."""
+    """What a comparison of two clouds measures."""
 
     submerged: bool = option(False, basic=True)
     """Compare only points of class 40, or below --water."""
@@ -271,7 +274,7 @@ class CompareRules(DistanceOptions, panel=Panel.FIGURES):
 
     @property
     def vertical(self) -> bool:
-        """Whether signed differences are wanted, and all that is computed from them."""
+        """Whether signed differences, and all that follows from them, are computed."""
         return not self.c2c_only
 
 
@@ -296,7 +299,7 @@ class CompareOptions(OverwriteOption, SummaryOption, CompareRules, panel=Panel.O
 
 
 class StageCompareOptions(ReferenceOption, CompareOptions):
-    """The options of the stage ``compare`` of PDAL, whose cloud is in no file."""
+    """The options of the PDAL stage ``compare``, whose cloud is not a file."""
 
     reference: File | None = option(None, basic=True, needed="needed")
 
@@ -316,3 +319,96 @@ class ViewerOptions(OverwriteOption, CameraFileOptions, WaterOptions, panel=Pane
     """PNG to draw instead of opening a window."""
     points: int = option(2_000_000, basic=True, least=1)
     """Maximum number of points of each cloud, evenly spread."""
+
+
+class OrthoOptions(
+    JobOptions, SummaryOption, IndexOptions, WaterOptions, CamerasOptions, panel=Panel.NEED
+):
+    """The options of ``pcfix ortho``."""
+
+    dsm: Any = option(None, basic=True, metavar="PATH", needed="needed")
+    """True heights of land and bed: a GeoTIFF, or a corrected cloud (.las, .laz), which is gridded
+    to cells twice as wide as those of the orthophoto."""
+    resolution: float | None = option(None, basic=True, above=0)
+    """Cell size. [m] [default: one ground pixel]"""
+    water: Any = option(None, basic=True, metavar="SPEC")
+    """Water surface, as for 'pcfix photos'. Omit it if refraction was already removed from the
+    photographs."""
+
+
+def _command(given: str) -> str:
+    """Check that a command has the places for images and cloud."""
+    missing = [one for one in ("{images}", "{cloud}") if one not in given]
+    if given not in ("stereo", "") and missing:
+        raise SettingError(
+            "option.command",
+            f"rebuild '{given}' has no {' and '.join(missing)}. Use them for the folder that the"
+            " command reads and the cloud that it writes, or give stereo.",
+            option="rebuild",
+            missing=missing,
+        )
+    return given
+
+
+class RebuildOptions(OptionSet, panel=Panel.ROUNDS):
+    """Rounds that remove refraction from photographs and reconstruct a cloud from them."""
+
+    rebuild: str | None = option(None, basic=True, then=_command, metavar="COMMAND")
+    """Reconstruct the cloud from the photographs, in rounds: stereo (built in), or the command of
+    another program. In the command, {images}, {cameras} and {cloud} become the folder of the
+    photographs, --cameras and the LAZ file to write."""
+    until_gsd: float = option(1.0, above=0)
+    """Stop if the mean change of the bed is less than this many ground pixels."""
+    most_rounds: int = option(4, least=1)
+    """Maximum number of rounds."""
+    reference: File | None = option(None, basic=True, needs="rebuild")
+    """Reference to compare the clouds of all rounds with, in OUT/compare; see 'pcfix compare'."""
+
+
+class PhotosOptions(
+    WaterPerImageOption, JobOptions, SummaryOption, RebuildOptions, IndexOptions, NeededOptions,
+    CamerasOptions, panel=Panel.NEED,
+):  # fmt: skip
+    """The options of ``pcfix photos``."""
+
+    dsm: Any = option(None, basic=True, metavar="PATH", needed="needed")
+    """Heights of land and bed: a GeoTIFF, or a cloud (.las, .laz), which is gridded; corrected for
+    --mapping exact, apparent for paper."""
+    resolution: float | None = option(None, basic=True, above=0)
+    """Cell size to which a cloud is gridded. [m] [default: 2 to 4 points a cell]"""
+    mapping: Literal["exact", "paper"] = option("exact", basic=True, panel=Panel.METHOD)
+    """exact: trace the light back from the true bed; paper: eq 12 of Skarlatos & Agrafiotis 2018 on
+    the apparent bed, one round of their iteration."""
+    spacing: int | None = option(None, least=1, most=512, panel=Panel.METHOD)
+    """Spacing of the grid nodes over the photograph. [px] [default: a cell of the DSM, at least 8
+    px]"""
+    holes: Literal["fill", "black"] = option("fill", panel=Panel.METHOD)
+    """Interpolate holes of the DSM, or make them black."""
+
+
+class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions, panel=Panel.WATER):
+    """The options of ``pcfix calm``."""
+
+    surface: bool = option(False, basic=True, requires=("depth", "cameras or gsd"))
+    """Also estimate the water surface of each frame from the displacement of the bed: rasters in
+    OUT_water, for --water-per-image of 'pcfix correct' and 'photos'."""
+    depth: Any = option(None, basic=True, metavar="SPEC", needs="surface")
+    """With --surface: true depth in metres, or heights of the bed: a GeoTIFF or cloud, which is
+    taken as apparent unless pcfix corrected it."""
+    level: float = option(0.0)
+    """With --surface: height of the calm water. [m]"""
+    cameras: Any = option(None, basic=True, metavar="PATH", needs="surface")
+    """With --surface: pose of the hovering camera, by the name of the first frame, or the only one
+    in the file."""
+    gsd: float | None = option(None, basic=True, above=0, needs="surface")
+    """With --surface, instead of --cameras, for a nadir view: pixel size at the bed. [m]"""
+    interval: float | None = option(None, above=0, needs="surface")
+    """With --surface: time between frames, before --every; without it frames are independent. [s]
+    [default: as stated in the video]"""
+    resolution: float | None = option(None, basic=True, above=0)
+    """Cell size of the rasters of the water. [m] [default: so that there are 2,000 cells]"""
+    every: int = option(1, least=1, most=100_000, panel=Panel.METHOD)
+    """Use every Nth frame."""
+    still: bool = option(False, panel=Panel.METHOD)
+    """The camera did not move, as on a mast: do not align the frames. Otherwise they are aligned
+    to the first one by the parts of the image that move least."""

@@ -79,8 +79,8 @@ _SINGLE, _NEAREST = "single depth maps", "single depth maps of the nearest image
 _MVS = {"method": "consistent", "camera_set": "mvs"}
 MODEL_ERRORS = {
     frozenset((_TRACKS, _NEAREST)): 0.005,
-    frozenset((_TRACKS, _PAIRS)): 0.025,
-    frozenset((_MAPS, _PAIRS)): 0.025,
+    frozenset((_TRACKS, _PAIRS)): 0.02,
+    frozenset((_MAPS, _PAIRS)): 0.02,
 }
 """`MODEL_ERROR` where it differs. Tracks and nearest maps name one place for each point: the right
 one was better in each of 18 clouds. The noise of stereo pairs is not modelled, so that tracks and
@@ -188,7 +188,7 @@ class Verdict(NamedTuple):
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
         return {
-            "made_of": self.chosen.words,
+            "type": self.chosen.words,
             "sure": self.is_sure,
             "confidence": round(self.confidence, 4),
             "share": round(self.share, 3),
@@ -197,7 +197,7 @@ class Verdict(NamedTuple):
             "runner_up_deeper_m": round(self.deeper_m, 4),
             "patches": self.patches,
             "scatter_m": round(self.model_uncertainty.scatter_m, 4),
-            "doubt_per_depth": round(self.model_uncertainty.per_depth, 4),
+            "per_depth": round(self.model_uncertainty.per_depth, 4),
         }
 
     def __str__(self) -> str:
@@ -413,7 +413,7 @@ def _remarks(part: Batch, place: IntArray) -> tuple[str, ...]:
     step = patches.grid_m(part.xyz)
     if step is not None:
         return (
-            f"The points lie on a grid of {step:.3g} m, like the heights of a raster, which smooths"
+            f"The points are on a grid of {step:.3g} m, like the heights of a raster, which smooths"
             " the evidence of the reconstruction type. Give the cloud as the matcher wrote it.",
         )
     has_lenses, z = part.survey.cameras.lenses is not None, part.xyz[:, 2]

@@ -193,14 +193,13 @@ class Tally(Sums):
             "incidence_deg": round(self.incidence_deg, 2),
         }
 
-    def uncertainty(self, made: dict[str, Any] | None = None) -> dict[str, Any] | None:
+    def uncertainty(self, detected: dict[str, Any] | None = None) -> dict[str, Any] | None:
         """Return standard error of Z, TVU and orders; see `UncertaintyTally.as_dict`.
 
-        `of_cloud` is what the cloud itself adds, if the detection (`made`) has estimated it.
+        `of_cloud` is the contribution of the cloud, if `detected`, the detected reconstruction
+        type, has an estimate of it.
         """
         found = self.errors.as_dict()
-        if found is not None and made is not None and "scatter_m" in made:
-            found["of_cloud"] = {
-                "scatter_m": made["scatter_m"], "per_depth": made["doubt_per_depth"]
-            }  # fmt: skip
+        if found is not None and detected is not None and "scatter_m" in detected:
+            found["of_cloud"] = {name: detected[name] for name in ("scatter_m", "per_depth")}
         return found

@@ -12,7 +12,7 @@ import numpy as np
 from pcfix.adjust.block import words_of
 from pcfix.adjust.result import Plain
 from pcfix.report.page import Report, Table, render
-from pcfix.report.text import Rows, RowTable, filled, share
+from pcfix.report.text import Rows, RowTable, filled, share, wrapped
 
 TITLE = "Refractive bundle adjustment"
 WHERE = (("land", "on land"), ("water", "under water"))
@@ -67,7 +67,7 @@ def adjustment_text(d: Plain) -> str:
     lines += [f"  {label:<17} {words}" for label, words in _facts(d)]
     if (surveyed := _survey_table(d)).rows:
         lines += surveyed.lines()[: 1 + MOST_LISTED]
-    return "\n".join([*lines, *(f"Note: {note}" for note in all_notes(d))])
+    return "\n".join([*lines, *(wrapped("", f"Note: {note}") for note in all_notes(d))])
 
 
 def adjustment_page(d: Plain) -> str:

@@ -25,7 +25,7 @@ from pcfix.report.page import (
     name_of,
     new_figure,
 )
-from pcfix.report.text import Plain, aligned, share
+from pcfix.report.text import Plain, aligned, share, wrapped
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -123,7 +123,7 @@ def comparison_text(c: Comparison) -> str:
     if (own := plain["own"]) is not None:
         noise = noise_sentence(own, raw_of(plain)["after"])
         if own["rmse_m"] is not None:
-            noise = f"RMSE {own['rmse_m']:.3f} m, 95 % {own['within_95_m']:.3f} m; {noise}"
+            noise = f"RMSE {own['rmse_m']:.3f} m, 95 % within {own['within_95_m']:.3f} m; {noise}"
         rows.append(("Bed" if own["of"] == "bed" else "Cloud", noise))
     if c.m3c2 is not None:
         m = c.m3c2.after
@@ -132,8 +132,9 @@ def comparison_text(c: Comparison) -> str:
                      f" of detection {m.mean_level_of_detection_m:.3f} m,"
                      f" {100 * m.significant_share:.0f} % of the distances beyond it"))  # fmt: skip
     head = f"Compared {c.cloud} with {c.reference} in {c.seconds:.1f} s"
-    tables = [line for table in _tables(plain) for line in table.lines()]
-    return "\n".join([aligned(head, rows), *tables, *(f"Note: {note}" for note in c.notes)])
+    tables = [line for table in _tables(plain) for line in ("", *table.lines())]
+    notes = [wrapped("", f"Note: {note}") for note in c.notes]
+    return "\n".join([aligned(head, rows), *tables, *notes])
 
 
 def noise_sentence(own: Plain, raw: Plain) -> str:
@@ -142,7 +143,7 @@ def noise_sentence(own: Plain, raw: Plain) -> str:
     noise = f"the noise of the reference ({own['sigma_reference_m']:.3f} m, {source})"
     if own["rmse_m"] is None:
         return f"the differences scatter no more than {noise}, so the cloud's error is not known."
-    with_it = f"RMSE {raw['rmse_m']:.3f} m, 95 % {raw['within_95_m']:.3f} m"
+    with_it = f"RMSE {raw['rmse_m']:.3f} m, 95 % within {raw['within_95_m']:.3f} m"
     return f"{noise} is subtracted; with it {with_it}."
 
 
@@ -162,7 +163,7 @@ def _tables(compared: Plain) -> list[Table]:
         marks = s["percentiles_m"]
         values = [*(s[key] for key in MOMENTS.values()), marks["p5"], marks["p95"], s["max_m"]]
         title = f"{one.title}, {one.cloud}"
-        rows.append([title, f"{s['count']:,}", *(f"{value:.3f}" for value in values)])
+        rows.append([title, f"{s['count']:,}", *(f"{value:z.3f}" for value in values)])
     title = f"Against {name_of(compared['reference'])} (m)"
     tables = [Table(title, ["", "points", *MOMENTS, "5 %", "95 %", "max"], rows)]
 
@@ -175,10 +176,10 @@ def _tables(compared: Plain) -> list[Table]:
         figures = [f"{s['mean_m']:.6f}", f"{s['sd_m']:.6f}", classes]
         rows.append([f"{one.title}, {one.cloud}", *figures, *shares])
     header = ["", "mean (m)", "std.dev. (m)", "classes", *header]
-    tables.append(Table("C2C: Gauss as CloudCompare fits it", header, rows))
+    tables.append(Table("C2C, normal distribution", header, rows))
 
     rows = [
-        [name, f"{fit['slope']:.4f}", f"{fit['intercept_m']:+.3f}", f"{fit['r2']:.4f}"]
+        [name, f"{fit['slope']:.4f}", f"{fit['intercept_m']:+z.3f}", f"{fit['r2']:.4f}"]
         for when, name, _ in TIMES
         if (fit := (compared["depth"] or {}).get(when)) is not None
     ]
@@ -187,14 +188,16 @@ def _tables(compared: Plain) -> list[Table]:
 
     # of each class of depth or of distance from the shore
     figures_of = {"bias": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m"}
-    header = ["", "points", *(f"{one}, {name}" for _, name, _ in TIMES for one in figures_of)]
+    first, *others = figures_of
+    header = ["", "points"]
+    header += [one for _, name, _ in TIMES for one in (f"{name}: {first}", *others)]
     for key, (title, _, _) in BINS.items():
         rows = []
         for one in compared[key]:
             row = [f"{one['from_m']:g} to {one['to_m']:g}", f"{one['after']['count']:,}"]
             for when, _, _ in TIMES:
                 s = one[when]
-                row += ["" if s is None else f"{s[key]:.3f}" for key in figures_of.values()]
+                row += ["" if s is None else f"{s[key]:z.3f}" for key in figures_of.values()]
             rows.append(row)
         tables.append(Table(title, header, rows))
     return [table for table in tables if table.rows]

@@ -105,7 +105,7 @@ def run_report(
     ]
     # the rows of the terminal, and why the method was chosen
     facts = [("Input cloud", name_of(s.input)), ("Points", f"{s.points:,}"), *rows]
-    facts += [("Reconstruction", s.made["because"])] if s.made else []
+    facts += [("Reconstruction", s.reconstruction["because"])] if s.reconstruction else []
     settings = [
         [name.replace("_", " "), _worded(value)]
         for name, value in s.settings.items()
@@ -261,7 +261,8 @@ def accuracy_tile(s: Summary, compared: Plain) -> Tile:
             return Tile(title, "predicted", [("RMSE", unknown)], [why])
         sigma, tvu = s.uncertainty["sigma_z_m"]["mean"], s.uncertainty["tvu_95_m"]["mean"]
         figures = [
-            ("standard error", f"{sigma:.3f} m"), ("95 %", f"{tvu:.3f} m"), ("bias", unknown),
+            ("standard error", f"{sigma:.3f} m"), ("95 % within", f"{tvu:.3f} m"),
+            ("bias", unknown),
         ]  # fmt: skip
         why = (
             "No reference was given. The prediction follows from assumed errors without a common"
@@ -284,7 +285,7 @@ def accuracy_tile(s: Summary, compared: Plain) -> Tile:
         )
     figures = [
         ("bias", signed(own["mean_m"])), ("RMSE", f"{known['rmse_m']:.3f} m"),
-        ("95 %", f"{known['within_95_m']:.3f} m"),
+        ("95 % within", f"{known['within_95_m']:.3f} m"),
     ]  # fmt: skip
     of = "bed" if own["of"] == "bed" else "cloud (bed and land are not separated)"
     return Tile(f"Accuracy of the {of}", "measured", figures, notes)

@@ -18,13 +18,14 @@ class Summary(Figures):
     @property
     def why_no_order(self) -> str:
         """Why no order of S-44 is claimed, as the whole bed may be off; empty if one is."""
-        made = self.made or {}
+        found = self.reconstruction or {}
         if self.settings["method"] == "regression":  # measured depths hold the bed
             return "the regression is of another cloud" if "regression" in self.settings else ""
-        if made.get("method") != "consistent" or not made.get("sure", bool(made.get("views_are"))):
+        is_sure = found.get("sure", bool(found.get("views_are")))
+        if found.get("method") != "consistent" or not is_sure:
             return "the reconstruction type is uncertain, or the method assumes another one"
         return {
-            True: "the poses absorbed the refraction",
+            True: "the poses have absorbed the refraction",
             None: "the poses were not checked for absorbed refraction",
             False: "",
         }[self.absorbed]
@@ -34,7 +35,7 @@ class Summary(Figures):
         optional = ("labelling", "transfer", "unsure", "poses", "shoreline", "fit", "part")
         values = {
             name: value for name, value in vars(self).items()
-            if name != "told" and not (name in optional and value is None)
+            if name != "notes" and not (name in optional and value is None)
         }  # fmt: skip
         if self.uncertainty is not None and self.why_no_order:
             no_order = {"s44": None, "why_no_order": self.why_no_order}

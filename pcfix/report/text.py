@@ -12,8 +12,10 @@ report page use the same rows.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from string import Formatter
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,6 +34,10 @@ RowTable = tuple[tuple[str, str, str], ...]
 FEWEST = 59
 """Differences of which all keep an order before 95 % of all are likely to: 0.95^59 is 0.05."""
 SHOWN_NAMES = 5
+WIDTH = 100
+"""Columns of a printed line."""
+UNIT = re.compile(r"(?<=\d) (?=(?:m|cm|px|deg|%)(?:\W|$))")
+"""The space between a number and its unit."""
 
 _PART: RowTable = (
     ("Read", "a part of {part[of]:,} points", "part"),
@@ -46,13 +52,13 @@ _SHORELINE: RowTable = (
      "!shoreline[lines]"),
 )  # fmt: skip
 _LABELLING: RowTable = (
-    ("Mask", "{labelling[outside_mask]:,} points below the surface are outside: land",
-     "labelling[water_mask]"),
-    ("Respected", "{labelling[respected]:,} points below the surface have classes of land",
-     "labelling[respected]"),
+    ("Mask", "{labelling[outside_mask]:,} points below the surface are outside of it and count as"
+     " land", "labelling[water_mask]"),
+    ("Classes", "{labelling[respected]:,} points below the surface count as land"
+     " (--respect-classes)", "labelling[respected]"),
     ("Pools", "{labelling[separate][points]:,} points in {labelling[separate][pools]:,} separate"
-     " pools: land", "labelling[separate][pools]"),
-    ("Pools", "none separate from the water", "!labelling[separate][pools]"),
+     " pools count as land", "labelling[separate][pools]"),
+    ("Pools", "no pool is separate from the water", "!labelling[separate][pools]"),
 )  # fmt: skip
 _CORRECTED: RowTable = (
     *_PART,
@@ -64,8 +70,8 @@ _CORRECTED: RowTable = (
     ("Submerged", "{submerged:,} points ({submerged:of points}), {corrected_words}", ""),
     ("", "{count:,} not corrected: {name} ({fate})", "*uncorrected"),
     _NO_SURFACE,
-    ("Withheld", "{unsure:,} corrected points ({unsure:of corrected}) are seen at large incidence"
-     " angles only", "unsure"),
+    ("Withheld", "{unsure:,} corrected points ({unsure:of corrected}) are visible at large"
+     " incidence angles only", "unsure"),
     ("Depth", "{depth_m[min]:.2f} to {depth_m[max]:.2f} m, mean {depth_m[mean]:.2f} m", "depth_m"),
     ("Z shift", "mean {shift_z_m[mean]:.3f} m (5th to 95th percentile {shift_z_m[p5]:.3f} to"
      " {shift_z_m[p95]:.3f} m)", "shift_z_m"),
@@ -73,9 +79,9 @@ _CORRECTED: RowTable = (
     ("Cameras", "{cameras_used} of {cameras} used, {rays_per_point:.1f} rays per point, incidence"
      " angles up to {incidence_deg:.0f} deg", "cameras"),
     ("Cameras", "none; ray counts of 1 and incidence angles of 0 are placeholders", "!cameras"),
-    ("Unused", "{unused_count} see no corrected point: {unused}", "unused"),
+    ("Unused", "{unused_count} cameras without corrected points: {unused}", "unused"),
     ("Water", "{water}, refractive index {settings[index]:.6g}", ""),
-    ("", "fitted: {water_fit[model]}, standard error {water_fit[sigma_level_m]:.3f} m",
+    ("", "fitted {water_fit[model]}, standard error {water_fit[sigma_level_m]:.3f} m",
      "water_fit"),
     ("", "accepted {water_fit[accepted]} of {water_fit[points]} points", "water_fit[points]"),
     *_SHORELINE,
@@ -96,8 +102,8 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
         ("Class 40", "{submerged:,} points ({submerged:of points})", ""),
         ("Class 41", "{water_surface:,} points within {settings[band]:g} m of the surface",
          "settings[band]"),
-        ("Reclassified", "{stale:,} former points of class 40 or 41:"
-         " {settings[reset]:?class 1|unchanged; --reset sets them to class 1}", "stale"),
+        ("Formerly", "{stale:,} points of class 40 or 41 are in neither class now:"
+         " {settings[reset]:?class 1 now|unchanged; --reset sets class 1}", "stale"),
         _NO_SURFACE,
         *_LABELLING,
         ("Water", "{water}", ""),
@@ -106,7 +112,7 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
         ("Noise", "{noise:,} points ({noise:of points}), {dropped:?dropped|class 7, withheld}", ""),
         ("", "{count:,} {name}", "*reasons"),
         ("Ignored", "{set_aside:,} points were withheld or noise before", "set_aside"),
-        ("Bed", "{submerged:,} submerged points tested against it", "submerged"),
+        ("Bed", "{submerged:,} submerged points were tested against it", "submerged"),
         ("Neighbours", "mean distance {neighbour_distance_m[mean]:.3f} m, standard deviation"
          " {neighbour_distance_m[sd]:.3f} m, limit {neighbour_distance_m[limit]:.3f} m",
          "neighbour_distance_m"),
@@ -131,9 +137,9 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
     )),
     "calm": ("Combined {input} -> {output}      {frames} frames of {columns:,} x {rows:,} pixels in"
              " {seconds:.1f} s", (
-        ("Registered", "by {corners:,} corners with a median scatter of {scatter_px:.2f} px; the"
+        ("Aligned", "by {corners:,} corners with a median scatter of {scatter_px:.2f} px; the"
          " camera moved by up to {moved_px:.1f} px", "corners"),
-        ("Registered", "no: the camera stood still", "!corners"),
+        ("Aligned", "no: the camera did not move (--still)", "!corners"),
         ("Spread", "median {spread:.1f} grey values: {spread_file}", ""),
         ("Water", "{water[waves]} waves; slopes {water[slope_deg]:.2f} deg rms,"
          " {water[explained]:.0f %} of them explained", "water"),
@@ -221,9 +227,27 @@ def _repeats(needs: str, needed: Any) -> Iterator[Plain]:
 
 
 def aligned(head: str, rows: Iterable[tuple[str, str]], notes: Iterable[object] = ()) -> str:
-    """Return a summary: a line that says what was done, labelled rows, and notes."""
-    lines = [head, *(f"  {label:<13} {text}" for label, text in rows)]
-    return "\n".join([*lines, *(f"Note: {note}" for note in notes)])
+    """Return a summary: a line that says what was done, labelled rows, and notes.
+
+    Long texts are wrapped, except for commands, so that these can be copied.
+    """
+    rows = list(rows)
+    width = max([13, *(len(label) for label, _ in rows)])
+    lines = [(f"  {label:<{width}} ", text) for label, text in rows]
+    lines += [("", f"Note: {note}") for note in notes]
+    return "\n".join([head, *(wrapped(start, text) for start, text in lines)])
+
+
+def wrapped(start: str, text: str) -> str:
+    """Return a text in lines of `WIDTH` with a hanging indent, unless it has a command."""
+    if "pcfix " in text:
+        return start + text
+    text = UNIT.sub("\xa0", text)  # a number and its unit stay together
+    lines = fill(
+        text, WIDTH, initial_indent=start, subsequent_indent=" " * len(start),
+        break_long_words=False, break_on_hyphens=False,
+    )  # fmt: skip
+    return lines.replace("\xa0", " ")
 
 
 def share(part: int, whole: int) -> str:
@@ -259,7 +283,7 @@ def text_of(command: str, found: Figures) -> str:
 def summary_text(summary: Summary) -> str:
     """Return the summary of a correction."""
     head = _Words(vars(summary)).written(_TABLES["correct"][0], {})
-    return aligned(head, summary_rows(summary), summary.told)
+    return aligned(head, summary_rows(summary), summary.notes)
 
 
 def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
@@ -267,16 +291,16 @@ def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
 
     `measured` is the vertical uncertainty against a reference, `Comparison.tvu` in plain values.
     """
-    made, unused, check = s.made, s.cameras_unused, ""
+    detected, unused, check = s.reconstruction, s.cameras_unused, ""
     method = str(s.settings["method"])
-    if made is not None and made.get("made_of", "") not in ("", method):
-        sure = f"detected, confidence {100.0 * made['confidence']:.0f} %"
-        method = f"{made['method']}, {made['made_of']} ({sure})"
-    elif made is not None and "made_of" not in made:
-        method = f"{made['method']}. {made['because']}"
+    if detected is not None and detected.get("type", "") not in ("", method):
+        sure = f"detected, confidence {100.0 * detected['confidence']:.0f} %"
+        method = f"{detected['method']}, {detected['type']} ({sure})"
+    elif detected is not None and "type" not in detected:
+        method = f"{detected['method']}. {detected['because']}"
     if s.fit is not None and s.cameras:
         check = "cameras match the cloud"
-        if s.fit["doubts"]:
+        if s.fit["problems"]:
             check = "cameras may not match the cloud; see the warnings"
         elif not s.fit["fits"]:
             check = "cameras and cloud could not be tested"
@@ -346,7 +370,7 @@ def order_sentence(s: Summary, measured: Plain | None = None) -> str:
     if measured is not None and measured["count"] < FEWEST:
         return f"fewer than {FEWEST} points were measured, too few for an order"
     if measured is None and s.uncertainty is not None and s.why_no_order:
-        return f"no order is claimed: {s.why_no_order}"
+        return f"no order claimed: {s.why_no_order}"
     known = measured or s.uncertainty
     return "" if known is None else tvu_sentence(known)
 
@@ -356,7 +380,7 @@ def tvu_sentence(uncertainty: Plain) -> str:
     shares = uncertainty["s44"]
     order = next((one.name for one in ORDERS if shares[one.name] >= 0.95), None)
     if order is None:
-        within = shares[ORDERS[-1].name]
-        return f"fewer than 95 % of the points meet any order of IHO S-44 ({within:.0%} order 2)"
-    name = f"order {order}" if order[0].isdigit() else f"{order} Order"
-    return f"{100.0 * shares[order]:.4g} % of the points are within the TVU of IHO S-44 {name}"
+        within = 100.0 * shares[ORDERS[-1].name]
+        return f"no order: {within:.0f} % of the points are within the TVU of order 2"
+    name = f"Order {order}" if order[0].isdigit() else f"{order} Order"
+    return f"{name} ({100.0 * shares[order]:.4g} % of the points are within its TVU)"

@@ -277,10 +277,10 @@ def _judged(coarse: Scan) -> WaterProposal:
         if gain >= LEAST_EACH:
             strong.append(cue.name)
             evidence[f"{cue.name} amplitude"], evidence[f"{cue.name} sigma"] = size, sigma
-            text = f"the logarithm of the ratio falls by {-size:.2f} ± {sigma:.2f} per metre"
+            text = f"the logarithm of their ratio falls by {-size:.3f} per metre"
             if cue == SLOPE:
-                text = f"true slopes are {1.0 + size:.2f} ± {sigma:.2f} times the apparent ones"
-            sentences.append(f"{cue.meaning}: {text}")
+                text = f"true slopes are {1.0 + size:.2f} times the apparent ones"
+            sentences.append(f"{cue.meaning}: {text} (standard error {sigma:.3f})")
     # the rival: the best height elsewhere
     elsewhere = np.abs(coarse.heights_m - peak.level_m) > SAME_PLACE_M
     rivals = np.where(elsewhere, _gains(coarse, peak.tilt), 0.0)
@@ -357,9 +357,11 @@ class Cue(NamedTuple):
     amplitude: float | None = None  # given by physics, or negative and free
 
 
-SLOPE = Cue("slope", "the ground looks flatter below", None, 12.0, 0.6, amplitude=LIFT)
-RED = Cue("red/green", "red fades against green below", 0, 24.0, 0.8, scale_m=0.7)
-BLUE = RED._replace(name="blue/green", meaning="blue fades against green below", colour=2)
+SLOPE = Cue("slope", "the ground is flatter below the surface", None, 12.0, 0.6, amplitude=LIFT)
+RED = Cue("red/green", "red fades faster than green below the surface", 0, 24.0, 0.8, scale_m=0.7)
+BLUE = RED._replace(
+    name="blue/green", meaning="blue fades faster than green below the surface", colour=2
+)
 
 
 class Moments(NamedTuple):

@@ -106,9 +106,9 @@ def refuse_under_water(cameras: Cameras, level: FloatArray | float, water: str) 
         first = below[0]
         raise GeometryError(
             "cameras.under_water",
-            f"{below.size} of {len(cameras)} cameras are under the water ({water}), the first"
-            f" {cameras.labels[first]} at z = {cameras.centres[first, 2]:.2f} m. Check the vertical"
-            " datum, the order of the columns and the water surface.",
+            f"{below.size} of {len(cameras)} cameras are below the water ({water}); the first,"
+            f" {cameras.labels[first]}, is at {cameras.centres[first, 2]:.2f} m. Check the vertical"
+            " datum, the order of the columns and the water level.",
             cameras=int(below.size), first=cameras.labels[first],
         )  # fmt: skip
 
@@ -121,8 +121,8 @@ def check_submerged(count: int, name: str, water: WaterSurface, heights: str = "
     if count == 0:
         raise GeometryError(
             "water.below_cloud",
-            f"{name}: no point lies below the water ({water}){heights}. Check the height of the"
-            " water and its vertical datum.",
+            f"{name}: no point is below the water ({water}){heights}. Check the water level and"
+            " its vertical datum.",
             path=name,
         )
 
@@ -199,7 +199,7 @@ class WaterMeeting(Sums):
         if points > few:
             land = "" if self.submerged < self.points else "; no point is left as land"
             words = (
-                f"{name}: {points:,} of {self.submerged:,} submerged points lie deeper than"
+                f"{name}: {points:,} of {self.submerged:,} submerged points are deeper than"
                 f" {limit_m:g} m, the deepest {self.most_depth_m:.0f} m below the water"
                 f" ({water}){land}{self.heights()}. Check the height of the water and its vertical"
                 " datum"
@@ -230,7 +230,7 @@ class WaterMeeting(Sums):
         """Return the range of the cloud's heights as text; empty without points."""
         if not self.points:
             return ""
-        return f"; the cloud's heights are {self.low_m:.2f} to {self.high_m:.2f} m"
+        return f"; the heights of the cloud are {self.low_m:.2f} to {self.high_m:.2f} m"
 
 
 def _heights_of(water: WaterSurface) -> FloatArray:

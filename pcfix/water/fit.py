@@ -146,7 +146,7 @@ def fit_water(
     if found.sigma_m > WIDE_SCATTER_M:
         notes.append(
             f"The points scatter by {found.sigma_m:.2f} m. They may not belong to one surface, or"
-            " not lie on the edge of the water."
+            " not be on the edge of the water."
         )
     residual, weight = np.full(len(xyz), np.nan), np.zeros(len(xyz))
     residual[known], weight[known] = found.residual_m, found.weight

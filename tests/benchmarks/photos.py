@@ -18,7 +18,7 @@ import pcfix
 from pcfix.errors import PcfixWarning
 from pcfix.flow.photos import block_of
 from pcfix.io.photographs import photographs_in
-from pcfix.options.photos import PhotosOptions
+from pcfix.options.steps import PhotosOptions
 from pcfix.photos.mapping import exact, resample
 from tests.utils.renderer import Relief, Texture, rendered
 from tests.utils.shared import SHARED

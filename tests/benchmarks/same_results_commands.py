@@ -152,7 +152,6 @@ OF_OBLIQUES = {
     "default": "",
     "views": "--views {inputs}/c.vis",
     "snell": "--method snell",
-    "exact": "--method consistent --exact",
     "withhold": "--unsure withhold --occlusion on",
 }
 OF_PHOTOS = {"exact": "--dsm {dsm.block/out.tif}", "paper": "--mapping paper --dsm {inputs}/a.las"}

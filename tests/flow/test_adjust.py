@@ -9,7 +9,7 @@ import pytest
 import pcfix
 from pcfix.flow.adjust import adjust_cameras, correct_words
 from pcfix.lens.imaging import straight_images
-from pcfix.options.survey import AdjustOptions
+from pcfix.options.correct import AdjustOptions
 from pcfix.running import threads
 from tests.utils.adjust_files import IMAGE_PX, write_block
 from tests.utils.codes import refused
@@ -235,8 +235,8 @@ def test_doors_agree(files, written, tmp_path):
     assert done.returncode == 0, done.stderr
     for name in ("colmap/images.bin", "colmap/points3D.bin", "cameras.csv", "adjustment.json"):
         assert (tmp_path / "cli" / name).read_bytes() == (out / name).read_bytes(), name
-    assert "Next: pcfix correct" in done.stdout
-    assert "sigma0" in done.stdout
+    assert "Next step:\n  pcfix correct" in done.stdout
+    assert "Sigma0" in done.stdout
 
 
 @pytest.mark.usefixtures("undrawn")

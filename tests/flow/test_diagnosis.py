@@ -1,11 +1,13 @@
-"""Bent poses through the doors: one warning in a correction, all signs in `pcfix cameras`."""
+"""Absorbed refraction: one warning in a correction, all signs in `pcfix cameras`."""
 
 import json
 import warnings
 
+import numpy as np
 import pytest
 
 import pcfix
+from pcfix.adjust.diagnosis import Diagnosis, land_sign, neighbours_sign
 from pcfix.errors import PcfixWarning
 from pcfix.flow.cameras import cameras_text, check_cameras
 from pcfix.flow.diagnosis import adjust_words
@@ -19,8 +21,8 @@ OFFSET_M = (319900.0, 3842700.0, 0.0)
 LEVEL_M = 0.37
 
 
-def said(source, output, **given):
-    """Return what a correction warns of."""
+def warnings_of(source, output, **given):
+    """Return the warnings of absorbed refraction, and the summary, of a correction."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         summary = pcfix.correct_file(source, output, **given)
@@ -31,7 +33,7 @@ def said(source, output, **given):
 @bent
 def test_bent_poses(tmp_path):
     model, cloud = BENT / "sparse", middle_of(BENT, tmp_path) / "cloud.las"
-    found, summary = said(
+    found, summary = warnings_of(
         cloud, tmp_path / "out.laz", cameras=model, cameras_offset=OFFSET_M, water=LEVEL_M
     )
     assert len(found) == 1
@@ -40,6 +42,8 @@ def test_bent_poses(tmp_path):
     # the land lies 0.96 m too low; the block's own centres tell most of it
     assert 0.6 < values["likely_error_m"] < 1.3
     assert found[0].as_dict() in summary.warnings
+    assert summary.absorbed is True
+    assert summary.as_dict()["uncertainty"]["s44"] is None and summary.why_no_order
 
 
 @rendered
@@ -50,7 +54,7 @@ def test_true_poses(tmp_path):
         (middle_of(TRUE, tmp_path) / "cloud.las", rendered_a),
         (SCENE / "cloud.laz", {"cameras": SCENE / "cameras.csv", "water": level}),
     ):
-        assert said(cloud, tmp_path / "out.laz", overwrite=True, **given)[0] == []
+        assert warnings_of(cloud, tmp_path / "out.laz", overwrite=True, **given)[0] == []
 
 
 @bent
@@ -66,7 +70,7 @@ def test_every_sign():
     # the README of the data: the land is 0.96 m too low
     assert report.figures["refraction"]["likely_error_m"] == pytest.approx(0.96, abs=0.05)
     text = cameras_text(report)
-    assert "The poses have absorbed the refraction" in text
+    assert "the poses have absorbed the refraction" in text
     assert "--gcps" in text
 
 
@@ -89,6 +93,28 @@ def test_no_sign():
     assert report.diagnosis.absorbed is False
     assert not any(sign.speaks for sign in report.diagnosis.signs)
     assert report.figures["refraction"]["likely_error_m"] is None
+
+
+@pytest.mark.parametrize(
+    ("share", "sigma", "is_fused", "absorbed"),
+    [
+        (0.02, 0.03, True, False),
+        (0.25, 0.02, True, False),
+        (0.86, 0.02, True, True),
+        (0.86, 0.02, False, None),  # the reconstruction type may be wrong
+        (0.25, 0.02, False, False),
+        (0.6, 0.05, True, None),
+    ],
+)
+def test_neighbours_sign(share, sigma, is_fused, absorbed):
+    assert neighbours_sign(share, sigma, is_fused=is_fused).speaks is absorbed
+
+
+def test_neighbours_last():
+    off = land_sign(np.ones(9), 0.05, "the reference")
+    assert Diagnosis((off, neighbours_sign(0.1, 0.01, is_fused=True))).absorbed is True
+    seems = Diagnosis((neighbours_sign(0.9, 0.01, is_fused=True),))
+    assert seems.sentence("pcfix adjust").startswith("The poses seem to have absorbed")
 
 
 def test_command():

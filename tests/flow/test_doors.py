@@ -13,6 +13,7 @@ import pytest
 
 import pcfix
 from pcfix.io.scenes import write_scene
+from pcfix.model import Lens, Outcome
 from tests.utils.program import run_pcfix
 from tests.utils.shared import needs
 
@@ -69,6 +70,18 @@ def test_arrays(scene, tmp_path):
     assert np.asarray(out.RayMiss) == pytest.approx(result.ray_miss_m, abs=0.00005001)
     assert np.asarray(out.WaterDepth) == pytest.approx(result.depth_m, abs=0.0005001)
     assert np.asarray(out.Incidence) == pytest.approx(result.incidence_deg, abs=0.05001)
+
+
+def test_outcomes():
+    """Straight below one of two cameras, between them, and outside of all frames."""
+    lens = Lens(500.0, 1000.0, 1000.0, 500.0, 500.0)  # 100 m up, 60 m apart
+    centres = np.array([[-30.0, 0.0, 100.0], [30.0, 0.0, 100.0]])
+    down = np.tile(np.diag([1.0, -1.0, -1.0]), (2, 1, 1))
+    cameras = pcfix.Cameras(("a", "b"), centres, down, (lens,) * 2)
+    xyz = [[30.0, 0.0, -2.0], [0.0, 0.0, -2.0], [0.0, 500.0, -2.0]]
+    with pytest.warns(pcfix.PcfixWarning):
+        found = pcfix.correct_points(xyz, cameras, 0.0, method="snell", max_angle=20.0)
+    assert found.outcome.tolist() == [Outcome.FLAT_RAYS, Outcome.CORRECTED, Outcome.NO_CAMERA]
 
 
 def test_progress(scene, tmp_path, monkeypatch):

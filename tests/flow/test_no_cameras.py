@@ -108,7 +108,7 @@ def test_saved_line(folder):
     again = pcfix.correct_file(folder / "cloud.las", folder / "again.las", **NONE, **line)
     one, other = (laspy.read(folder / name) for name in ("fit.las", "again.las"))
     assert np.array_equal(one.points.array, other.points.array)
-    assert "checks.csv" in again.told[0] and "cloud.las" in again.told[0]
+    assert "checks.csv" in again.notes[0] and "cloud.las" in again.notes[0]
     assert not fit.why_no_order and again.why_no_order
     assert again.as_dict()["uncertainty"]["s44"] is None
     las = laspy.read(folder / "cloud.las")
@@ -133,7 +133,7 @@ def test_extrapolation(folder):
         folder / "cloud.las", folder / "again.las", **NONE, method="regression",
         regression=folder / "line.json",
     )  # fmt: skip
-    (note,) = [note for note in again.told if "extrapolated" in note]
+    (note,) = [note for note in again.notes if "extrapolated" in note]
     assert f"{deepest:.2f} m" in note and f"{most:.2f} m" in note
     out = laspy.read(folder / "again.las")
     apparent = WATER_M - np.asarray(laspy.read(folder / "cloud.las").z)

@@ -164,7 +164,7 @@ def test_file(seen, waters, tmp_path):
     (tmp_path / "sensor.csv").write_text("focal,sensor_x,sensor_y\n25,100,100\n")
     options = {"cameras": str(tmp_path / "cameras.csv"), "water_per_image": str(waters)}
     summary = pcfix.correct_file(tmp_path / "cloud.las", tmp_path / "a.las", water=0, **options)
-    assert OWN_WATER in summary.made["because"]
+    assert OWN_WATER in summary.reconstruction["because"]
     out, las = laspy.read(tmp_path / "a.las"), laspy.read(tmp_path / "cloud.las")
     found = pcfix.correct_points(
         las.xyz, pcfix.read_cameras(tmp_path / "cameras.csv"), 0.0, water_per_image=waters

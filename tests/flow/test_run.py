@@ -162,7 +162,7 @@ def test_measured_uncertainty(finished):
     assert 0.95 < measured["s44"]["Exclusive"] < 1.0 == measured["s44"]["1a/1b"]
     assert f"{measured['tvu_95_m']:.3f} m at 95 %, at {measured['count']:,} points" in text
     assert "IHO S-44 Exclusive Order" in text
-    assert f"<td>{steps['correct']['made']['because']}</td>" in text
+    assert f"<td>{steps['correct']['reconstruction']['because']}</td>" in text
 
 
 @pytest.mark.usefixtures("undrawn")

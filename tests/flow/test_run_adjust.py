@@ -123,8 +123,8 @@ def test_auto_without_datum(scene, tmp_path):
     assert not (tmp_path / "out" / "adjusted").exists()
     lines = [line for line in said if line.startswith("adjust")]
     assert len(lines) == 1
-    assert lines[0].startswith("adjust    skipped: there is no datum")
-    assert "not adjusted: there is no datum" in page.read_text()
+    assert lines[0].startswith("adjust    skipped: the camera file has no GNSS positions")
+    assert "not adjusted: the camera file has no GNSS positions" in page.read_text()
 
 
 @pytest.mark.parametrize(("sigma_m", "is_datum"), [(0.03, True), (10.0, False)])

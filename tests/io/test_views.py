@@ -292,7 +292,7 @@ def test_cameras_that_look_elsewhere(tmp_path, cameras, scene):
     found, _, report = given(match, xyz)
     assert found == listed
     points = int(np.count_nonzero(first[::9]))
-    assert (report.beside_entries, report.beside_points) == (2 * points, points)
+    assert (report.outside_entries, report.outside_points) == (2 * points, points)
     assert codes(report) == ["views.not_in_frame"]
 
 

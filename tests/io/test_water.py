@@ -149,7 +149,7 @@ def test_bounds(tmp_path):
     assert water.height_m.shape[1] * 2.0 < 100.0 + 2 * MARGIN_M + 12.0
     at = places(50)[:, :] * 0 + [west + 33.3, north - 44.4, 0.0]
     expect_plane(water, at)
-    with refused("water.raster_apart"):
+    with refused("water.raster_far"):
         pcfix.read_water(path, UTM33, (west + 5000, north, west + 6000, north + 50))
 
 
@@ -237,7 +237,7 @@ FLAT = np.full((20, 20), 10.0)
     ("name", "content", "more", "code"),
     [
         ("rgb.tif", FLAT, {"bands": 3}, "water.raster_bands"),
-        ("row.tif", FLAT[:1], {}, "water.raster_apart"),
+        ("row.tif", FLAT[:1], {}, "water.raster_far"),
         ("n.tif", FLAT, {"transform": Affine.identity(), "crs": None}, "water.raster_place"),
         ("large.tif", FLAT, {}, "water.raster_size"),
         ("garbage.tif", b"II*\0nonsense", {}, "raster.damaged"),

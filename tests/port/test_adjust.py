@@ -13,7 +13,7 @@ from pcfix.errors import SettingError
 from pcfix.flow.adjust import adjust_cameras, correct_words
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.model import TiePoints
-from pcfix.options.survey import AdjustOptions
+from pcfix.options.correct import AdjustOptions
 from pcfix.port.light import coefficients
 from pcfix.port.shapes import DomePort, FlatPort
 from pcfix.port.shapes import port_of as port_of_text

@@ -14,8 +14,8 @@ import pcfix
 from pcfix.cli.commands import COMMANDS
 from pcfix.cli.plugin import OFFERED, plugin_zip
 from pcfix.io.scenes import write_scene
+from pcfix.options.correct import RunOptions
 from pcfix.options.declare import options_of
-from pcfix.options.survey import RunOptions
 from pcfix.qgis.command import CommandError, program_of, words_of
 
 QGIS = shutil.which("qgis_process.bin") or shutil.which("qgis_process")
@@ -56,11 +56,11 @@ def test_options(commands):
 
 def test_command_line(commands):
     values = {
-        "input": "a b.laz", "output": "o.laz", "water": "-0.37", "sigma_image": 0.5, "exact": True,
+        "input": "a b.laz", "output": "o.laz", "water": "-0.37", "sigma_image": 0.5, "deep": True,
         "sigma_index": 0.01, "method": "auto", "overwrite": False, "views": "", "max_angle": None,
     }  # fmt: skip
     assert words_of(commands["correct"], values) == [
-        "correct", "a b.laz", "o.laz", "--water=-0.37", "--exact", "--sigma-index=0.01",
+        "correct", "a b.laz", "o.laz", "--water=-0.37", "--sigma-index=0.01", "--deep",
     ]  # fmt: skip
     sections = {"cloud": "a.laz", "reference": "b.laz", "section": "0,0,1,1; 2,2,3,3"}
     expected = ["compare", "a.laz", "b.laz", "--section=0,0,1,1", "--section=2,2,3,3"]

@@ -156,7 +156,7 @@ def test_semi_global_matching(cloud, tmp_path):
     found = pcfix.correct_file(
         path, tmp_path / "out.las", cameras=block / "cameras.xml", water=0.37
     )
-    assert found.made["made_of"] == kind.words
+    assert found.reconstruction["type"] == kind.words
     las = laspy.read(tmp_path / "out.las")
     bed = np.flatnonzero(
         (np.asarray(las.classification) == 40) & (np.asarray(las.WaterDepth) > 0.2)

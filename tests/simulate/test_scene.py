@@ -28,21 +28,3 @@ def test_seed(nadir):
     again = pcfix.simulate_scene(4000, seed=11)
     assert np.array_equal(nadir.apparent_xyz, again.apparent_xyz)
     assert not np.array_equal(nadir.apparent_xyz, pcfix.simulate_scene(4000, seed=12).apparent_xyz)
-
-
-def errors_gsd(scene, xyz):
-    bed = scene.true_xyz[:, 2] < scene.water_level_m - 0.2
-    error = (xyz - scene.true_xyz)[bed] / scene.gsd_m
-    return np.sqrt((error**2).mean(axis=0))
-
-
-def test_corrected(nadir):
-    before = errors_gsd(nadir, nadir.apparent_xyz)
-    with_views = pcfix.correct_points(
-        nadir.apparent_xyz, nadir.cameras, nadir.water_level_m, views=nadir.views
-    )
-    after = errors_gsd(nadir, with_views.xyz)
-    assert before[2] > 50.0
-    assert after.max() < 1.0
-    in_frame = pcfix.correct_points(nadir.apparent_xyz, nadir.cameras, nadir.water_level_m)
-    assert errors_gsd(nadir, in_frame.xyz).max() < 1.3

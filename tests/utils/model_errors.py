@@ -16,7 +16,7 @@ from pcfix.adjust.normal import CAUCHY, SQUARES
 from pcfix.adjust.problem import intersect_fixed
 from pcfix.adjust.result import Adjusted
 from pcfix.model import Cameras, FloatArray, TiePoints, WaterPlane
-from pcfix.options.survey import AdjustRules
+from pcfix.options.correct import AdjustRules
 from tests.utils.tie_blocks import block_of
 from tests.utils.tie_points import TieScene, simulate_tie_points
 from tests.utils.unaware_blocks import unaware

@@ -1,8 +1,6 @@
-"""A block of images as it goes into a bundle adjustment: tie points, GNSS and control, with truth.
+"""Simulate the input of a bundle adjustment with its truth: tie points, GNSS and control points.
 
-The light is traced by `pcfix.simulate.tracing`, the lens is that of `pcfix.simulate.settings`:
-nothing here is shared with the adjustment. Everything measured is there twice, exact and with
-noise, and `TieScene.measured` draws the noise anew.
+Light is traced by `pcfix.simulate.tracing`, which shares nothing with the adjustment.
 """
 
 from __future__ import annotations
@@ -36,18 +34,15 @@ from pcfix.simulate.settings import SceneSettings
 
 _CANDIDATES = 4000
 _LEAST_TIES = 8
-"""An image with fewer tie points is left out of the block."""
+"""An image with fewer tie points is excluded from the block."""
 
 _CLEAR_M = 0.1
-"""Control and check points keep so far from the water surface, as people place them."""
+"""Minimum height difference of control and check points from the water surface."""
 
 
 @dataclass(frozen=True)
 class TieNoise:
-    """Standard deviations of what is measured: images, GNSS positions, surveyed points.
-
-    What has none is stated with the default, as no observation is infinitely precise.
-    """
+    """Standard deviations of observations; the default is stated for those without noise."""
 
     image_px: float = 0.5
     gnss_m: float = 0.03
@@ -56,52 +51,25 @@ class TieNoise:
 
 @dataclass(frozen=True, eq=False)
 class TieScene:
-    """What `simulate_tie_points` made; metres, UTM.
-
-    Attributes
-    ----------
-    true_cameras : Cameras
-        With which the images were made.
-    cameras : Cameras
-        The same with pose noise, and with GNSS positions: where an adjustment begins.
-    truth : array, shape (m, 3)
-        True points.
-    views : Views
-        The images that show each, three at least.
-    exact_xy : array, shape (o, 2)
-        Where, without noise, pixels.
-    ties : TiePoints
-        The same with noise; its points are the true ones.
-    is_wet : array of bool, shape (m,)
-        Which of them lie under water.
-    control : GroundControl
-        Control points on land; check points on land and under water. Survey and images with noise.
-    control_truth : array, shape (q, 3)
-    control_exact_xy : array, shape (r, 2)
-    water : WaterPlane
-    refractive_index : float
-    noise : TieNoise
-    settings : dict
-        The arguments that made it.
-    """
+    """A block of images; metres, UTM; all observations without and with noise."""
 
     true_cameras: Cameras
-    cameras: Cameras
-    truth: FloatArray
-    views: Views
-    exact_xy: FloatArray
-    ties: TiePoints
-    is_wet: BoolArray
-    control: GroundControl
-    control_truth: FloatArray
-    control_exact_xy: FloatArray
+    cameras: Cameras  # with noise, and with GNSS positions: the start of an adjustment
+    truth: FloatArray  # (m, 3)
+    views: Views  # three images or more for each point
+    exact_xy: FloatArray  # (o, 2), pixels, without noise
+    ties: TiePoints  # the true points, with noise in the images
+    is_wet: BoolArray  # (m,)
+    control: GroundControl  # control points on land, check points also under water; with noise
+    control_truth: FloatArray  # (q, 3)
+    control_exact_xy: FloatArray  # (r, 2)
     water: WaterPlane
     refractive_index: float
     noise: TieNoise
     settings: dict[str, Any]
 
     def measured(self, rng: np.random.Generator) -> TieScene:
-        """Return the scene with all noise drawn anew; poses, points and start values stay."""
+        """Return the scene with other noise; poses, points and start values stay."""
         image_px, k = self.noise.image_px, len(self.cameras)
         image = self.exact_xy + rng.normal(0.0, image_px, self.exact_xy.shape)
         marks = self.control_exact_xy + rng.normal(0.0, image_px, self.control_exact_xy.shape)
@@ -126,31 +94,10 @@ def simulate_tie_points(
     checks: int = 6,
     **settings: Any,
 ) -> TieScene:
-    """Make a block of images with tie points above and below the water.
+    """Simulate a block of images with tie points above and below the water.
 
-    Parameters
-    ----------
-    points : int
-        Tie points that are tried; those in fewer than three images are left out.
-    gnss_noise_m : float
-        Standard deviation of each coordinate of the GNSS positions.
-    survey_noise_m : float
-        Of each coordinate of the control and check points.
-    control, checks : int
-        Control points on land, and check points, every other one under water where there is
-        some; spread over the area.
-    **settings
-        Those of `pcfix.simulate.settings.SceneSettings` about block, lens, noise of start poses and
-        images, water, bed and seed.
-
-    Returns
-    -------
-    TieScene
-
-    Raises
-    ------
-    SettingError
-        If an argument is outside its rule.
+    Points in fewer than three images are left out. Control points are on land; every other check
+    point is under water if possible. `settings` are those of `SceneSettings`.
     """
     chosen = SceneSettings(points=points, **settings)
     site = lay_out(chosen)
@@ -181,10 +128,8 @@ def simulate_tie_points(
 
 
 def _only(cameras: Cameras, keep: BoolArray) -> Cameras:
-    """Return some of the images; obliques may look beside the area."""
+    """Return some of the images; obliques may show none of the area."""
     rows = np.flatnonzero(keep)
-    if cameras.rotations is None or cameras.lenses is None:
-        raise ValueError("a simulated block has angles and lenses")
     return Cameras(
         tuple(cameras.labels[i] for i in rows), cameras.centres[rows], cameras.rotations[rows],
         tuple(cameras.lenses[i] for i in rows),
@@ -197,7 +142,7 @@ def _above(xyz: FloatArray, plane: WaterPlane) -> FloatArray:
 
 
 def _seen(xyz: FloatArray, site: Site) -> tuple[FloatArray, Sight]:
-    """Return those points that enough images show, and where."""
+    """Return the points in enough images, and their images."""
     sight = see(xyz, site, site.luck)
     made = sight.paired
     start = np.concatenate([sight.start[:-1][made], sight.start[-1:]])
@@ -206,7 +151,7 @@ def _seen(xyz: FloatArray, site: Site) -> tuple[FloatArray, Sight]:
 
 
 def _spread(xyz: FloatArray, above: FloatArray, control: int, checks: int) -> FloatArray:
-    """Return rows of control points on land and of check points, each far from those before."""
+    """Return rows of control points on land and of check points, far from each other."""
     land, wet = np.flatnonzero(above > _CLEAR_M), np.flatnonzero(above < -_CLEAR_M)
     under = min(checks // 2, len(wet))
     on_land = _far_apart(xyz[land], control + checks - under)
@@ -214,7 +159,7 @@ def _spread(xyz: FloatArray, above: FloatArray, control: int, checks: int) -> Fl
 
 
 def _far_apart(xyz: FloatArray, count: int) -> FloatArray:
-    """Return rows of points of which each is the farthest in plan from those before it."""
+    """Return rows of points, each the farthest in plan from those before it."""
     rows: list[int] = []
     if len(xyz) == 0:
         return np.zeros(0, np.int64)
@@ -229,7 +174,7 @@ def _far_apart(xyz: FloatArray, count: int) -> FloatArray:
 def _control(
     xyz: FloatArray, marks: Sight, wet: BoolArray, control: int, chosen: SceneSettings
 ) -> GroundControl:
-    """Return surveyed points, the first so many on land as control, without noise yet."""
+    """Return surveyed points without noise; the first ones on land are control points."""
     rank = np.arange(len(xyz))
     is_check = wet | (rank >= control)
     names = tuple(f"{'CP' if check else 'GCP'}{i + 1}" for i, check in enumerate(is_check))

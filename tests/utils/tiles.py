@@ -31,6 +31,16 @@ def write(path, las, rows, **changes):
     return path
 
 
+def tiles_in(folder):
+    return sorted(folder.glob("*.la[sz]"))
+
+
+def figures(summary):
+    """Return a summary without the values that differ between calls."""
+    own = ("input", "output", "seconds", "cloud", "reference", "also")
+    return {name: value for name, value in summary.as_dict().items() if name not in own}
+
+
 def records(*paths):
     """Return the points of files as one array, field by field."""
     return np.concatenate([laspy.read(path).points.array for path in paths])

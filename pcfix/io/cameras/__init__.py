@@ -176,8 +176,8 @@ def _recognised(path: File, sensor: File | None, angles: Angles | None) -> tuple
         raise bad_file(where, "cameras.folder", sentence, files=[name for name, _ in inside[:3]])
     if known is not None:
         return source, known
-    sentence = "is not a camera file that pcfix knows. Give a CSV table with the columns label, x,"
-    sentence += " y, z and, if you have them, yaw, pitch, roll."
+    sentence = "is not a camera file that pcfix knows. Give a file that pcfix/io/cameras/README.md"
+    sentence += " lists, or a CSV table with label, x, y, z and, if known, yaw, pitch, roll."
     raise bad_file(where, "cameras.unknown", sentence)
 
 

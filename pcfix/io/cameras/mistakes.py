@@ -51,7 +51,7 @@ def likely_mistake(
         return _wrong_height(float(np.median(centres[:, 2])), low, high)
     for words, moved in _readings(centres, cloud_crs):
         if is_over(moved):
-            return f"The cameras would lie over the cloud {words}."
+            return f"The cameras would be over the cloud {words}."
     x, y = (low + high)[:2] / 2.0 - np.median(centres[:, :2], axis=0)
     span, away = np.ptp(centres[:, :2], axis=0).max(), float(np.hypot(x, y))
     advice = "check the CRS of both."

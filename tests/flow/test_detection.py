@@ -85,8 +85,8 @@ def test_merged_clouds(tmp_path):
     path = as_file(tmp_path / "both.las", xyz[order], sources[order])
     given = {"cameras": clouds[0].cameras, "water": clouds[0].water}
     summary = pcfix.correct_file(path, tmp_path / "out.las", **given)
-    assert "Point source 7" in summary.made["because"]
-    assert "Point source 9" in summary.made["because"]
+    assert "Point source 7" in summary.reconstruction["because"]
+    assert "Point source 9" in summary.reconstruction["because"]
     out = np.empty_like(xyz)
     out[order] = laspy.read(tmp_path / "out.las").xyz
     for source, scene, told in zip((7, 9), clouds, IN_FRAME[:2], strict=True):
@@ -108,11 +108,11 @@ def test_large_cloud(cloud, tmp_path, monkeypatch):
         monkeypatch.setattr(planning, name, 1200)
     monkeypatch.setattr(patches, "MOST_IN_SQUARES", 10_000)
     given = {"cameras": scene.cameras, "water": scene.water, "overwrite": True}
-    made = pcfix.correct_file(path, tmp_path / "out.las", **given).made
+    made = pcfix.correct_file(path, tmp_path / "out.las", **given).reconstruction
     assert made["sure"]
-    assert made["made_of"] == IN_FRAME[["tracks", "depth-maps"].index(cloud)].words
+    assert made["type"] == IN_FRAME[["tracks", "depth-maps"].index(cloud)].words
     monkeypatch.setattr(planning, "Squares", lambda width_m: None)
-    assert "sure" not in pcfix.correct_file(path, tmp_path / "out.las", **given).made
+    assert "sure" not in pcfix.correct_file(path, tmp_path / "out.las", **given).reconstruction
 
 
 def test_sources(tmp_path):
@@ -195,7 +195,7 @@ def test_list_of_half(tmp_path):
     write_vis(tmp_path / "fused.ply.vis", images)
     write_ply(tmp_path / "fused.ply", scene.apparent_xyz[rows], position="double")
     path = as_file(tmp_path / "cloud.las", scene.apparent_xyz, 0)
-    given = {"cameras": scene.cameras, "water": scene.water, "exact": True}
+    given = {"cameras": scene.cameras, "water": scene.water}
     out = {}
     for name, views in (("half", tmp_path / "fused.ply.vis"), ("none", None)):
         summary = pcfix.correct_file(path, tmp_path / f"{name}.las", views=views, **given)

@@ -181,7 +181,7 @@ def test_views(old):
         ({"labels": tuple("abcdefghi")}, "adjusted_from.no_image"),
         ({"rotations": None, "lenses": None}, "cameras.no_angles"),
         ({"lenses": None}, "cameras.no_lens"),
-        ({"centres": 40.0}, "adjusted_from.apart"),
+        ({"centres": 40.0}, "adjusted_from.too_far"),
         (
             {"labels": ("a/c0.jpg", "b/c0.jpg", *(f"c{i}" for i in range(2, 9)))},
             "adjusted_from.ambiguous",
