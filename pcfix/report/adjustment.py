@@ -81,15 +81,6 @@ def adjustment_page(d: Plain) -> str:
     return render(Report(title=TITLE, lead=lead, head=head, warnings=all_notes(d), tables=tables))
 
 
-def adjustment_tables(d: Plain, page: str) -> list[Table]:
-    """Return what an adjustment changed, for the page of a run, with a link to its own page."""
-    from markupsafe import Markup
-
-    rows = [list(row) for row in _facts(d)] + [["Note", note] for note in all_notes(d)]
-    rows.append(["Full report", Markup('<a href="{0}">{0}</a>').format(page)])
-    return [Table(TITLE, [], rows), _change_table(d), _residual_table(d)]
-
-
 def _head(d: Plain) -> str:
     points = d["points"]
     return (
