@@ -197,10 +197,10 @@ class Report:
     lead: str
     head: Table  # beside the map
     warnings: list[str]
+    maps: Maps | None  # None for a page without a map
+    layers: list[Layer]
+    pictures: list[Picture]  # the first `FIGURES` are shown, the others folded
     tables: list[Table]  # the first is shown, the others folded
-    maps: Maps | None = None  # None for a page without a map
-    layers: Sequence[Layer] = ()
-    pictures: Sequence[Picture] = ()  # the first `FIGURES` are shown, the others folded
     provenance: list[Table] = field(default_factory=list)
     tiles: Sequence[Tile] = ()
     place: str = ""  # CRS and vertical datum of the map
@@ -248,7 +248,7 @@ SMOOTH_CELLS = 1.5
 """Single cells are noisy: the shade is of a surface smoothed by this."""
 
 
-def map_json(maps: Maps, layers: Sequence[Layer]) -> str:
+def map_json(maps: Maps, layers: list[Layer]) -> str:
     """Return the data as JSON without "<", so that no text in it can end the script element.
 
     Layers are differences of 16-bit integers, compressed by zlib, in base 64.
