@@ -194,11 +194,11 @@ class Report:
     lead: str
     head: Table  # beside the map
     warnings: list[str]
-    lattice: Lattice  # the cells of the map
-    height_m: FloatArray  # their heights, shape (rows, columns), shown as relief
-    layers: list[Layer]
-    pictures: list[Picture]  # the first `FIGURES` are shown, the others folded
     tables: list[Table]  # the first is shown, the others folded
+    lattice: Lattice | None = None  # the cells of the map; None for a page without a map
+    height_m: FloatArray | None = None  # their heights, shape (rows, columns), shown as relief
+    layers: Sequence[Layer] = ()
+    pictures: Sequence[Picture] = ()  # the first `FIGURES` are shown, the others folded
     provenance: list[Table] = field(default_factory=list)
     tiles: Sequence[Tile] = ()
     files: Sequence[tuple[str, str]] = ()  # path from the page, and its contents
@@ -230,7 +230,9 @@ def render(report: Report) -> str:
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, finalize=_as_read,
     ).get_template("page.html.j2")  # fmt: skip
-    data = Markup(map_json(report.lattice, report.height_m, report.layers))
+    data = None
+    if report.lattice is not None and report.height_m is not None:
+        data = Markup(map_json(report.lattice, report.height_m, report.layers))
     return template.render(report=report, figures=FIGURES, map_data=data)
 
 
@@ -251,7 +253,7 @@ def extent_of(lattice: Lattice) -> Extent:
     return west, east, south, north
 
 
-def map_json(lattice: Lattice, height_m: FloatArray, layers: list[Layer]) -> str:
+def map_json(lattice: Lattice, height_m: FloatArray, layers: Sequence[Layer]) -> str:
     """Return the data as JSON without "<", so that no text in it can end the script element.
 
     Layers are differences of 16-bit integers, compressed by zlib, in base 64.
