@@ -78,7 +78,7 @@ def adjustment_page(d: Plain) -> str:
     head = Table("In short", [], [list(row) for row in _facts(d)])
     tables = [_change_table(d), _residual_table(d), _survey_table(d), _correlation_table(d)]
     tables = [table for table in tables if table.rows]
-    return render(Report(TITLE, lead, head, all_notes(d), None, [], [], tables))
+    return render(Report(TITLE, lead, head, all_notes(d), tables))
 
 
 def _head(d: Plain) -> str:

@@ -195,7 +195,7 @@ class Report:
     head: Table  # beside the map
     warnings: list[str]
     tables: list[Table]  # the first is shown, the others folded
-    lattice: Lattice | None = None  # the cells of the map; None for a page without one
+    lattice: Lattice | None = None  # the cells of the map; None for a page without a map
     height_m: FloatArray | None = None  # their heights, shape (rows, columns), shown as relief
     layers: Sequence[Layer] = ()
     pictures: Sequence[Picture] = ()  # the first `FIGURES` are shown, the others folded

@@ -159,8 +159,8 @@ def test_escaped():
     table = Table(evil, [evil], [[evil, evil]])
     page = render(
         Report(
-            evil, evil, table, [evil], Lattice(0.5, 0, 0, 5, 4), depth,
-            [Layer(evil, evil, depth, plus_minus=evil)], [], [table, table], [table],
+            evil, evil, table, [evil], [table, table], Lattice(0.5, 0, 0, 5, 4), depth,
+            [Layer(evil, evil, depth, plus_minus=evil)], [], [table],
             [Tile(evil, evil, [(evil, evil)], [evil])], [(f"compare/{evil}.csv", evil)],
         )
     )  # fmt: skip
