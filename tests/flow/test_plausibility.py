@@ -83,7 +83,7 @@ DOUBTED = {
 UNCHECKED = {
     "47 m too high": "heights (no tie points; cameras 129 m above the cloud)",
     "feet": "heights (no tie points; cameras 26",
-    "yaw + 90": "yaw (the images lie across the flight lines)",
+    "yaw + 90": "yaw (the images are across the flight lines)",
     "40 m beside": "a shift in plan (no GNSS positions)",
 }
 
