@@ -78,6 +78,8 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     """Maximum number of rays per point; those closest to nadir are used. [default: no limit]"""
     occlusion: Literal["auto", "on", "off"] = option("auto", with_cameras=True)
     """Skip cameras from which the cloud occludes the point; auto: if there are oblique images."""
+    exact: bool = option(False)
+    """No effect: every point is solved exactly. The option remains for older scripts."""
     depth_factor: float | str | None = option(
         None, least=1, most=3, needs="method factor", parse=number_or("auto"), metavar="N"
     )
