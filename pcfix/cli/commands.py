@@ -38,13 +38,14 @@ CLOUD = "LAS or LAZ to write; a folder for tiles."
 
 def _summarized(
     title: str, name: str, quiet: bool, work: Callable[..., Any], *given: Any, unit: str = "points"
-) -> None:
-    """Call a function of two files and options with a progress bar, and print its summary."""
+) -> Any:
+    """Call a function of two files and options with a progress bar, print and return its result."""
     from pcfix.report.text import text_of
 
     with progress_bar(title, quiet, unit=unit) as progress:
         result = work(*given[:2], options=given[2], progress=progress)
     say(text_of(name, result), quiet)
+    return result
 
 
 @command(
@@ -81,10 +82,18 @@ def run(
     "pcfix correct cloud.laz corrected.laz --cameras cameras.csv --water 0.37",
     input=TILED,
     output=CLOUD,
+    verbose="Also print the evidence for the reconstruction type, and the error budget.",
 )
-def correct(input: str, output: Path, /, *, options: CorrectOptions, quiet: bool) -> None:
+def correct(
+    input: str, output: Path, /, *, options: CorrectOptions, verbose: bool = False, quiet: bool
+) -> None:
     """Correct a point cloud for refraction at the water surface."""
-    _summarized("Correcting", "correct", quiet, pcfix.correct_file, input, output, options)
+    from pcfix.report.text import details_text
+
+    work = pcfix.correct_file
+    found = _summarized("Correcting", "correct", quiet, work, input, output, options)
+    if verbose:
+        say(details_text(found), quiet)
 
 
 @command(

@@ -361,6 +361,13 @@ def formal_words(s: Summary) -> str:
     return words if poses_m is None else f"{words}. Adjusted poses: {poses_m:.3f} m"
 
 
+def details_text(s: Summary) -> str:
+    """Return the evidence for the reconstruction type, and the error budget."""
+    found = [] if s.reconstruction is None else [s.reconstruction["because"]]
+    found += [] if s.uncertainty is None else [f"{formal_words(s)}."]
+    return "\n".join(wrapped("", one) for one in found)
+
+
 def order_sentence(s: Summary, measured: Plain | None = None) -> str:
     """Return which order of S-44 the errors of a run allow, or why none is claimed.
 
