@@ -33,6 +33,7 @@ import numpy as np
 from pcfix.errors import PcfixError, SettingError, show_warning
 from pcfix.io.pdal import NAME, OUTCOME, Dimensions, PdalCloud, Results, metadata_of
 from pcfix.model import LOW_NOISE, WaterDimension, WaterSurface
+from pcfix.options.correct import RasterOutputs
 from pcfix.options.declare import OptionSet, named, options_of
 from pcfix.options.shared import PartOptions
 
@@ -192,7 +193,9 @@ def _options(namespace: dict[str, Any], kind: type[Set]) -> Set:
         sentence = f"pdalargs: {twice} is given twice, with dashes and underscores."
         raise SettingError("option.twice", sentence, option=twice)
     given = {name.replace("-", "_"): value for name, value in given.items()}
-    elsewhere = {"port", *(one.name for one in options_of(PartOptions))}  # readers choose points
+    # readers choose points, and writers make rasters
+    files = (*options_of(PartOptions), *options_of(RasterOutputs))
+    elsewhere = {"port", *(one.name for one in files)}
     known = {one.name: one for one in options_of(kind) if one.name not in elsewhere}
     values = named(given, known.values(), "pdalargs")
     for name, value in values.items():

@@ -13,8 +13,12 @@ SCRIPTS = sorted((ROOT / "samples").glob("0*.py"))
 PRINTED = {
     "01": "14,736 of 20,000", "02": "uncorrected  bias +1.8", "03": "depth.png: 12.",
     "04": "14,736 of 20,000 points corrected,", "05": "14,736 of 20,000", "06": "201 stations",
+    "08": "6,93",
 }  # fmt: skip
-WRITTEN = {"03": ["depth.tif", "depth.qml", "depth.png"], "06": ["section.png"]}
+WRITTEN = {
+    "03": ["depth.tif", "depth.qml", "depth.png"], "06": ["section.png"],
+    "08": ["corrected.tif", "dsm_depth.tif", "dsm_uncertainty.tif"],
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from pcfix.io.clouds import (
 )
 from pcfix.io.crs import parse_crs
 from pcfix.io.files import check_output, scratch_arrays, write_text
-from pcfix.io.tiles import Clouds, cloud_of, inputs_of
+from pcfix.io.tiles import Clouds, cloud_of, inputs_of, part_of
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CompareOptions, CompareRules
@@ -49,7 +49,8 @@ def compare_clouds(
     Parameters
     ----------
     cloud : path, or list of paths
-        LAS or LAZ, or many as `pcfix.io.tiles.tiles_of` has them, or the view of a cloud in memory.
+        LAS or LAZ, or many as `pcfix.io.tiles.tiles_of` has them; a GeoTIFF of heights; or the view
+        of a cloud in memory.
         If `correct_file` wrote it with all its dimensions, the apparent points are compared too.
     reference : path, or list of paths
         LAS or LAZ, or many; CSV check points (x, y, z); or a GeoTIFF of heights. At check points
@@ -64,7 +65,7 @@ def compare_clouds(
     given = taken(CompareOptions, options, keywords, "compare_clouds")
     lines = [parse_line(line) if isinstance(line, str) else line for line in given.section]
     held = cloud if isinstance(cloud, CloudView) else None
-    clouds = [] if isinstance(cloud, CloudView) else [cloud_of(cloud)]
+    clouds = [] if isinstance(cloud, CloudView) else [part_of(cloud_of(cloud), given)]
     also = {name: cloud_of(path) for name, path in given.also}
     surveyed = reference_of(reference)
     read = (*clouds, surveyed, *also.values())

@@ -21,12 +21,14 @@ from pcfix.flow.diagnosis import diagnose_in_passing, quick_ties
 from pcfix.flow.inputs import CameraInputs, Inputs, paths_in, transfer_between
 from pcfix.flow.planning import plan_correction, plan_of, read_inputs
 from pcfix.flow.plausibility import CloudSample, Plausible, plausible
-from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
+from pcfix.flow.raster import command_for
+from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of, write_shoreline
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps, part_report
 from pcfix.io.las.writing import output_header
+from pcfix.io.raster_cloud import is_raster
 from pcfix.io.saved import write_regression
 from pcfix.io.tiles import Clouds
 from pcfix.io.views import ViewReport, beside
@@ -69,7 +71,7 @@ def correct_file(
     progress: Progress | None = None,
     **keywords: Any,
 ) -> Summary:
-    """Correct a LAS or LAZ cloud, of one file or many; what ``pcfix correct`` runs.
+    """Correct a LAS or LAZ cloud, of one file or many, or a DSM; what ``pcfix correct`` runs.
 
     Parameters
     ----------
@@ -77,7 +79,8 @@ def correct_file(
         The names end in ``.las`` or ``.laz``; the output is LAS 1.4, point format 6, 7 or 8 (9
         or 10 for inputs with waveforms). For many files (a list of paths; see
         `pcfix.io.tiles.tiles_of`) the output is a folder, and every point is corrected as in one
-        file of all points.
+        file of all points. A GeoTIFF of heights is corrected as the cloud of the centres of its
+        cells; an output that ends in ``.tif`` has the same grid, see `pcfix.flow.raster`.
     options : CorrectOptions, optional
         Or its attributes as keywords, as of ``pcfix correct``: ``cameras`` (a path or
         `pcfix.Cameras`), ``water`` (what `pcfix.read_water` takes, a `pcfix.WaterSurface`,
@@ -97,15 +100,19 @@ def correct_file(
         """Return the plan for a file, or for many as one cloud."""
         return plan_correction(read_inputs(given, view_of(task.source, given.jobs)))
 
-    return run_command(
+    run = command_for(output, given)
+    result: Summary = run(
         "correct", input, output, given, plan=plan, work=_correcting, finish=finish,
         reads=paths_in(given), progress=progress,
     )  # fmt: skip
+    return result
 
 
 def _correcting(plan: Plan, source: LasSource) -> FileWork:
     """Return the correction of one file: its header, and each chunk."""
     written = columns.columns_for(plan.options.dimensions, plan.options.unsure)
+    if is_raster(source.path):
+        written = (*columns.columns_for("all", plan.options.unsure), columns.OUTCOME)
     steps = centring_steps(source.header)
     header = output_header(source, "settings", plan.provenance(), written, steps)
     uncorrected = plan.options.uncorrected

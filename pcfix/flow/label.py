@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from pcfix.errors import PcfixWarning
 from pcfix.flow.inputs import labelling_of, mask_of, paths_in
-from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
+from pcfix.flow.raster import command_for
+from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress
 from pcfix.flow.surfaces import (
     CloudView,
     Points,
@@ -69,7 +70,8 @@ def label_points(
     crs : str, optional
         CRS of the points, for a mask from a file.
     options : LabelRules, optional
-        Or its attributes as keywords: band, dead_band, connected, respect_classes and others.
+        Or its attributes as keywords: surface_band, dead_band, connected, respect_classes and
+        others.
 
     Returns
     -------
@@ -111,17 +113,20 @@ def label_file(
     ----------
     input, output : path
         The names end in ``.las`` or ``.laz``; the output is LAS 1.4. Or many files and a folder,
-        see `pcfix.correct_file`.
+        see `pcfix.correct_file`. Of a GeoTIFF of heights the classes of its cells are a GeoTIFF
+        too, with 255 for nodata.
     options, progress
         See `pcfix.correct_file`. With a dead band or connectivity the cloud is read twice. A point
         on the border of the mask is inside.
     """
     given = taken(LabelOptions, options, keywords, "label_file")
-    return run_command(
+    run = command_for(output, given)
+    result: Figures = run(
         "label", input, output, given, work=_labelling, finish=_finish, reads=paths_in(given),
         plan=lambda task: plan_labelling(given, view_of(task.source, given.jobs)),
         progress=progress,
     )  # fmt: skip
+    return result
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 import shapely
 
 from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
+from pcfix.flow.raster import write_cells
 from pcfix.flow.request import SURFACE, RunFolder
 from pcfix.flow.runner import Progress
 from pcfix.flow.surfaces import file_points, shoreline_layer, view_of
@@ -21,6 +22,7 @@ from pcfix.grid.maps import contours, depth_interval
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
+from pcfix.io.las.source import CloudPart
 from pcfix.io.styles import Symbol, limits_of, vector_style
 from pcfix.io.tables import read_check_depths
 from pcfix.io.tiles import Tiles
@@ -33,7 +35,7 @@ from pcfix.water.surface import surface_above
 
 Plain = dict[str, Any]
 BED, DEPTH, UNCERTAINTY = "bed.tif", "depth.tif", "uncertainty.tif"
-COUNTS, SHADED = "surface_counts.tif", "shaded.tif"
+COUNTS, SHADED, CORRECTED = "surface_counts.tif", "shaded.tif", "corrected.tif"
 HOLE_CELLS = 3.0
 """Width of holes that are filled: of cells with random points, one in twenty is empty."""
 SUN_DEG = 315.0, 45.0
@@ -44,19 +46,28 @@ DARK, RED, GREY = (8, 48, 107), (203, 24, 29), (120, 120, 120)
 ORANGE, GREEN = (253, 141, 60), (35, 139, 69)
 
 
-def raster_files(folder: Path, *, errors: bool) -> list[Path]:
-    """Return the files of `write_rasters`; `errors` is whether the cloud has standard errors."""
+def raster_files(folder: Path, *, errors: bool, cells: bool) -> list[Path]:
+    """Return the files of `write_rasters`.
+
+    `errors` is whether the cloud has standard errors, and `cells` whether it was a raster.
+    """
     maps = [SURFACE, BED, DEPTH, *([UNCERTAINTY] if errors else [])]
-    files = [folder / name for name in (*maps, COUNTS, SHADED)]
+    files = [folder / name for name in (*maps, COUNTS, SHADED, *([CORRECTED] if cells else []))]
     return [*files, *((folder / name).with_suffix(".qml") for name in maps)]
 
 
 def write_rasters(run: RunFolder, *, errors: bool, progress: Progress | None = None) -> Plain:
     """Write all rasters of a corrected cloud as cloud optimised GeoTIFF, with styles for QGIS.
 
-    By default the cells have 2 to 4 points. Returns their side for ``run.json``.
+    By default the cells have 2 to 4 points, or those of a raster are as large as its own. This is
+    also written on its own grid. Returns the side of the cells for ``run.json``.
     """
     folder, cloud, cell_m = run.folder, run.cleaned_cloud, run.request.resolution
+    source = run.request.source
+    if isinstance(source, CloudPart) and isinstance(cloud, Path):
+        write_cells(source, cloud, {"height": folder / CORRECTED})
+        with rasters.open_raster(source.path) as raster:
+            cell_m = cell_m or float(raster.res[0])
     if cell_m is None:
         cell_m = round_resolution(point_spacing_m(cloud, folder / SURFACE))
     plain = DsmOptions(resolution=cell_m, cog=True, style=True, overwrite=True)

@@ -20,7 +20,16 @@ from pcfix.flow.surfaces import view_of
 from pcfix.io.clouds import is_cloud, own_water, reference_of
 from pcfix.io.files import belonging, file_state, files_in, read_json, refusing, write_text
 from pcfix.io.rasters import open_raster
-from pcfix.io.tiles import Tiles, cloud_of, inputs_of, open_cloud, tiles_from, tiles_of
+from pcfix.io.tiles import (
+    CloudFiles,
+    Tiles,
+    cloud_of,
+    inputs_of,
+    open_cloud,
+    part_of,
+    tiles_from,
+    tiles_of,
+)
 from pcfix.model import Cameras, WaterSurface
 from pcfix.options.correct import RunOptions
 from pcfix.options.declare import named, options_of
@@ -40,9 +49,9 @@ class Request(RunOptions):
     """The cloud; for many files see `tiles_of`."""
 
     @cached_property
-    def source(self) -> Path | Tiles:
-        """The cloud, in one file or many."""
-        return tiles_of(self.input) or Path(str(self.input))
+    def source(self) -> CloudFiles:
+        """The cloud, in one file or many, or the cells of a raster."""
+        return tiles_of(self.input) or part_of(Path(str(self.input)), self)
 
     @cached_property
     def surveyed(self) -> Path | Tiles:
@@ -122,8 +131,8 @@ class Request(RunOptions):
         return paths_in(self, but=("water", "reference"))
 
 
-def _files_of(cloud: Path | Tiles) -> list[Path]:
-    return inputs_of(cloud) if isinstance(cloud, Tiles) else files_in(cloud)
+def _files_of(cloud: CloudFiles) -> list[Path]:
+    return files_in(cloud) if isinstance(cloud, Path) else inputs_of(cloud)
 
 
 LATER = {

@@ -12,6 +12,7 @@ from pcfix.flow.runner import Chunk, FileWork, run_command
 from pcfix.io.las.columns import SHIFTS, UNSURE, columns_for, convert, move
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import read_settings, record_errors, restored_header
+from pcfix.io.raster_cloud import is_raster
 from pcfix.io.tiles import Clouds
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import TileOptions
@@ -48,6 +49,9 @@ def restore_file(
         If pcfix did not correct the file, or the dimensions for undoing it are missing.
     """
     given = taken(TileOptions, options, keywords, "restore_file")
+    if is_raster(input):
+        sentence = "is a raster, whose cells were interpolated: nothing can restore it. Use the"
+        raise bad_file(input, "raster.no_restore", f"{sentence} input of its correction.")
     return run_command(
         "restore", input, output, given, plan=lambda task: None, work=_restoring,
         finish=lambda plan, task, points: int(points), progress=progress,

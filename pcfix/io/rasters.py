@@ -6,7 +6,7 @@ import errno
 import math
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,13 +40,19 @@ check_tif = partial(check_output, suffixes=(".tif", ".tiff"))
 def open_raster(path: File) -> Iterator[DatasetReader]:
     """Open a raster to read parts of it; what cannot be read is a ``raster.damaged``."""
     import rasterio
-    from rasterio import errors
 
     found = check_input(path)
+    with raster_errors(found), rasterio.open(found) as source:
+        yield source
+
+
+def raster_errors(path: Path) -> AbstractContextManager[None]:
+    """Turn what GDAL raises on reading a raster into one sentence."""
+    from rasterio import errors
+
     kinds = (errors.RasterioError, errors.RasterioIOError, UnicodeDecodeError)
     sentence = "is damaged, or is not a raster ({}). Export a GeoTIFF."
-    with refusing(found, "raster.damaged", sentence, kinds), rasterio.open(found) as source:
-        yield source
+    return refusing(path, "raster.damaged", sentence, kinds)
 
 
 def place_of(transform: Affine, column: Any, row: Any) -> tuple[Any, Any]:
@@ -57,7 +63,7 @@ def place_of(transform: Affine, column: Any, row: Any) -> tuple[Any, Any]:
 
 def read_within(source: DatasetReader, window: Window) -> FloatArray:
     """Return part of the first band, shape (rows, columns), NaN for no value and beyond it."""
-    return read_masked(source, window=_slices(window), boundless=True)
+    return read_masked(source, window=slices(window), boundless=True)
 
 
 def lattice_of(source: DatasetReader) -> Lattice:
@@ -67,9 +73,9 @@ def lattice_of(source: DatasetReader) -> Lattice:
     return Lattice(size, *first, source.width, source.height)
 
 
-def read_masked(raster: Any, **how: Any) -> FloatArray:
-    """Return the first band as float64, NaN for no value; `how` goes to rasterio."""
-    return np.asarray(raster.read(1, masked=True, **how).astype(np.float64).filled(np.nan))
+def read_masked(raster: Any, band: int = 1, **how: Any) -> FloatArray:
+    """Return a band as float64, NaN for no value; `how` goes to rasterio."""
+    return np.asarray(raster.read(band, masked=True, **how).astype(np.float64).filled(np.nan))
 
 
 def read_onto(path: Path, lattice: Lattice) -> FloatArray:
@@ -106,40 +112,47 @@ def write_part(target: DatasetWriter, values: npt.NDArray[Any], window: Window, 
     """Write part of a band, shape (rows, columns); NaN becomes the raster's nodata."""
     if np.issubdtype(values.dtype, np.floating):
         values = np.where(np.isnan(values), target.nodata, values)
-    target.write(values.astype(target.dtypes[band - 1]), band, window=_slices(window))
+    target.write(values.astype(target.dtypes[band - 1]), band, window=slices(window))
 
 
-def _slices(window: Window) -> tuple[tuple[int, int], tuple[int, int]]:
+def slices(window: Window) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the rows and columns of a window as rasterio takes them."""
     return (window.row, window.row_stop), (window.column, window.column_stop)
 
 
 @contextmanager
 def new_raster(
     path: Path,
-    lattice: Lattice,
+    lattice: Lattice | DatasetReader,
     crs: CRS | str | None,
     bands: Mapping[str, str],
     *,
     dtype: str = "float32",
     nodata: float | None = NO_HEIGHT,
     tags: Mapping[str, str] | None = None,
+    scale_offset: tuple[float, float] = (1.0, 0.0),
 ) -> Iterator[DatasetWriter]:
     """Open a new tiled, compressed GeoTIFF for `write_part`.
 
-    `bands` maps the description of each band to its unit; `dtype` and `nodata` are those of all
-    bands, `tags` the metadata of the file. Bands with names of colours, alpha too, are such.
+    Its cells are those of `lattice`, which may be another raster. `bands` maps the description of
+    each band to its unit; `dtype` and `nodata` are those of all bands, `tags` the metadata of the
+    file. Bands with names of colours, alpha too, are such.
     """
     import rasterio
     from rasterio.enums import ColorInterp
     from rasterio.transform import from_origin
 
-    size = lattice.resolution_m
+    if isinstance(lattice, Lattice):
+        size = lattice.resolution_m
+        transform = from_origin(lattice.left_m, lattice.top_m, size, size)
+    else:
+        transform = lattice.transform
     profile = {
         "driver": "GTiff", "width": lattice.width, "height": lattice.height, "count": len(bands),
         "dtype": dtype, "nodata": nodata, "interleave": "band", "tiled": True,
         "blockxsize": TILE, "blockysize": TILE, **_compression(dtype),
         "crs": None if crs is None else rasterio.CRS.from_user_input(crs),
-        "transform": from_origin(lattice.left_m, lattice.top_m, size, size),
+        "transform": transform,
     }  # fmt: skip
     with _written(path), rasterio.open(path, "w", **profile) as target:
         for number, (name, unit) in enumerate(bands.items(), start=1):
@@ -149,6 +162,8 @@ def new_raster(
         if bands.keys() & known.keys():
             target.colorinterp = [known.get(name, ColorInterp.undefined) for name in bands]
         target.update_tags(**(tags or {}))
+        if scale_offset != (1.0, 0.0):
+            target.scales, target.offsets = ([one] * len(bands) for one in scale_offset)
         yield target
 
 
@@ -196,15 +211,15 @@ def _compression(dtype: str) -> dict[str, Any]:
     return {"compress": "deflate", "predictor": predictor, "bigtiff": "IF_SAFER"}
 
 
-def copy_as_cog(source: Path, target: Path) -> None:
-    """Copy a GeoTIFF as a cloud optimised one (COG)."""
+def copy_as_cog(source: Path, target: Path, resampling: str = "average") -> None:
+    """Copy a GeoTIFF as a cloud optimised one (COG); `resampling` is for its overviews."""
     from rasterio.shutil import copy
 
     with open_raster(source) as raster:
         options = _compression(raster.dtypes[0])
     with _written(target):
         copy(
-            source, target, driver="COG", blocksize=TILE, overview_resampling="average",
+            source, target, driver="COG", blocksize=TILE, overview_resampling=resampling,
             statistics="YES", **options,
         )  # fmt: skip
 

@@ -15,6 +15,7 @@ import shapely
 from pcfix.errors import InputError, PcfixWarning, SettingError, bad_file
 from pcfix.io.files import path_of, read_json, refusing
 from pcfix.io.las.source import CloudPart, LasSource, coordinates, metric_crs
+from pcfix.io.raster_cloud import RasterSource, is_raster
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 
@@ -69,31 +70,45 @@ CloudFiles: TypeAlias = Path | CloudPart | Tiles
 
 
 def open_cloud(cloud: CloudFiles, jobs: int | None = None) -> LasSource:
-    """Return the points of a file, of a part of one, or of many; see `LasSource`."""
+    """Return the points of a file, of a part of one, or of many; see `LasSource`.
+
+    The points of a raster are its cells.
+    """
     if isinstance(cloud, Tiles):
         return TiledSource(cloud, jobs)
+    if is_raster(cloud):
+        return RasterSource(cloud if isinstance(cloud, CloudPart) else part_of(cloud))
     path, part = (cloud.path, cloud) if isinstance(cloud, CloudPart) else (cloud, None)
     return LasSource(path, jobs, part=part)
 
 
-def part_of(path: Path, options: Any) -> Path | CloudPart:
+def part_of(path: CloudFiles, options: Any = None) -> Any:
     """Return the part of a cloud that the options of a command ask for, or else its path.
 
-    The points of the part are counted, once for all readers; an `InputError` if there are none.
+    The points of the part, and of any raster, are counted, once for all readers; an `InputError` if
+    there are none.
     """
-    bounds = getattr(options, "bounds", None)
-    part = CloudPart(path, bounds, getattr(options, "read_resolution", None))
-    if part.bounds is None is part.resolution:
+    if not isinstance(path, Path):
+        return path
+    bounds, band = getattr(options, "bounds", None), getattr(options, "band", None)
+    part = CloudPart(path, bounds, getattr(options, "read_resolution", None), band)
+    if band is not None and not is_raster(path):
+        words = "band has an effect only if the input is a raster; omit it."
+        raise SettingError("option.needs", words, option="band", needs="raster")
+    if part.is_whole and not is_raster(path):
         return path
     west, south, east, north = bounds or (0.0, 0.0, 1.0, 1.0)
     if not (west < east and south < north):
         words = f"bounds {west:g},{south:g},{east:g},{north:g} must be west,south,east,north."
         raise SettingError("option.range", words, option="bounds")
-    with LasSource(path, getattr(options, "jobs", None)) as source:
+    jobs = getattr(options, "jobs", None)
+    with RasterSource(part) if is_raster(path) else LasSource(path, jobs) as source:
         header, count, ends = source.header, 0, list[FloatArray]()
         for points in source.chunks(part):
             xyz, count = coordinates(points), count + len(points)
             ends += [xyz.min(axis=0), xyz.max(axis=0)]
+    if not count and bounds is None:
+        raise bad_file(path, "raster.empty", "no cell contains a height.")
     if not count:
         asked, reach = (
             ",".join(f"{one:.12g}" for one in box)
@@ -102,7 +117,7 @@ def part_of(path: Path, options: Any) -> Path | CloudPart:
         sentence = f"has no point within {asked}. The cloud extends over {reach}."
         raise bad_file(path, "cloud.bounds", sentence)
     mins, maxs = np.min(ends, axis=0), np.max(ends, axis=0)
-    total = int(header.point_count)
+    total = source.points_of_file
     return replace(part, points=count, points_of_file=total, mins=mins, maxs=maxs)
 
 
@@ -118,6 +133,8 @@ def check_one_file(cloud: Any, options: Any) -> None:
 
 def inputs_of(cloud: Any) -> list[Any]:
     """Return the files of a cloud, one or many."""
+    if isinstance(cloud, CloudPart):
+        return [cloud.path]
     return list(cloud.paths) if isinstance(cloud, Tiles) else [cloud]
 
 
@@ -187,6 +204,9 @@ def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
     heads: dict[Path, tuple[Any, ...]] = {}
     broken: dict[Path, str] = {}
     for path in paths:
+        if is_raster(path):
+            sentence = "is one of several rasters. Merge them first, for example with gdalbuildvrt."
+            raise bad_file(path, "cloud.rasters", sentence)
         try:
             with LasSource(path) as source:
                 header, form = source.header, source.header.point_format

@@ -220,8 +220,8 @@ class Labelling:
         if self.settings.reset:
             new[before & ~respected] = UNCLASSIFIED
         at_surface = np.zeros(len(wet), np.bool_)
-        if self.settings.band > 0.0:
-            near = _within(part.xyz[:, 2] - part.surface.height_m, self.settings.band)
+        if self.settings.surface_band > 0.0:
+            near = _within(part.xyz[:, 2] - part.surface.height_m, self.settings.surface_band)
             rows = np.flatnonzero(near & ~respected)
             x, y = np.ascontiguousarray(part.xyz[rows, :2].T)
             keep = self._is_inside(x, y)

@@ -7,6 +7,7 @@ from typing import Any, Literal, get_args
 from pcfix.errors import SettingError
 from pcfix.options.declare import File, OptionSet, number_or, option, options_of, words
 from pcfix.options.shared import (
+    BandOption,
     CameraFileOptions,
     IndexOptions,
     InputOptions,
@@ -184,9 +185,22 @@ class ScienceOptions(RefractionOptions, panel=Panel.OUTPUT):
     """Extra dimensions to write; 'pcfix restore' needs all."""
 
 
+class RasterOutputs(OptionSet, panel=Panel.OUTPUT):
+    """Further rasters of a corrected raster, on the same grid."""
+
+    depth: File | None = option(None, writes=True)
+    """GeoTIFF for the depth of the bed, if the input is a raster."""
+    shift: File | None = option(None, writes=True)
+    """GeoTIFF for the shift of each cell of the input along X, Y and Z."""
+    uncertainty: File | None = option(None, writes=True)
+    """GeoTIFF for the vertical uncertainty at 95 %, with the standard error as second band."""
+    outcome: File | None = option(None, writes=True)
+    """GeoTIFF for the outcome of each cell: 0 land, 1 corrected, others not corrected."""
+
+
 class CorrectOptions(
-    PartOptions, ShorelineOption, TileOptions, SummaryOption, ScienceOptions, WaterPerImageOption,
-    MaskOption, LandRules, InputOptions, panel=Panel.OUTPUT,
+    RasterOutputs, PartOptions, ShorelineOption, TileOptions, SummaryOption, ScienceOptions,
+    WaterPerImageOption, MaskOption, LandRules, InputOptions, panel=Panel.OUTPUT,
 ):  # fmt: skip
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
 
@@ -197,7 +211,7 @@ class CorrectOptions(
 class LabelRules(LandRules, panel=Panel.WATER):
     """The rules of a labelling; see `pcfix.label`."""
 
-    band: float = option(0.0, least=0)
+    surface_band: float = option(0.0, least=0)
     """Points up to this distance from the surface, above or below, become class 41. [m] [default:
     no class 41]"""
     dead_band: float = option(0.0, least=0)
@@ -207,15 +221,16 @@ class LabelRules(LandRules, panel=Panel.WATER):
     """Set points of class 40 or 41 to class 1 if they are no longer in either class."""
 
     def check(self) -> None:
-        """Check that the dead band is wider than the band."""
-        if 0.0 < self.dead_band <= self.band:
+        """Check that the dead band is wider than the surface band."""
+        if 0.0 < self.dead_band <= self.surface_band:
             raise SettingError(
                 "option.range",
-                f"dead-band {self.dead_band:g} must be more than band {self.band:g}, where all"
-                " points are class 41. Give a wider one, or 0 for none.",
+                f"dead-band {self.dead_band:g} must be more than surface-band"
+                f" {self.surface_band:g}, where all points are class 41. Give a wider one, or 0"
+                " for none.",
                 option="dead_band",
                 value=self.dead_band,
-                above=self.band,
+                above=self.surface_band,
             )
 
 
@@ -276,7 +291,7 @@ class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions, panel=Pane
 
 
 class RunOptions(
-    ReferenceOption, ShorelineOption, TileOptions, DistanceOptions, SurveyedOptions,
+    BandOption, ReferenceOption, ShorelineOption, TileOptions, DistanceOptions, SurveyedOptions,
     RefractionOptions, MaskOption, LandRules, SurveyOptions, panel=Panel.OUTPUT,
 ):  # fmt: skip
     """The options of ``pcfix run``; ``run.json`` records all that affect its results."""

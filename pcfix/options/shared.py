@@ -181,7 +181,14 @@ class InputOptions(SurveyOptions, PortOptions):
     """Inputs of any correction: through a water surface, or the port of a housing."""
 
 
-class PartOptions(OptionSet, panel=Panel.INPUT):
+class BandOption(OptionSet, panel=Panel.INPUT):
+    """The band of a raster that has the heights."""
+
+    band: int | None = option(None, least=1)
+    """Band with the heights, if the input is a raster with several."""
+
+
+class PartOptions(BandOption, panel=Panel.INPUT):
     """The part of a cloud to read; see `pcfix.io.las.source`."""
 
     bounds: tuple[float, float, float, float] | None = option(

@@ -12,6 +12,7 @@ from typing import Any, Literal
 from pcfix.errors import SettingError
 from pcfix.options.declare import File, OptionSet, numbers, option
 from pcfix.options.shared import (
+    BandOption,
     CameraFileOptions,
     CamerasOptions,
     IndexOptions,
@@ -285,7 +286,7 @@ class ReferenceOption(OptionSet, panel=Panel.OUTPUT):
     """LiDAR cloud, CSV check points or GeoTIFF to compare with."""
 
 
-class CompareOptions(OverwriteOption, SummaryOption, CompareRules, panel=Panel.OUTPUT):
+class CompareOptions(BandOption, OverwriteOption, SummaryOption, CompareRules, panel=Panel.OUTPUT):
     """The options of ``pcfix compare``."""
 
     out_dir: File | None = option(None, writes=True, basic=True)

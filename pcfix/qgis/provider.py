@@ -13,7 +13,9 @@ from .command import CommandError, program_of, run, words_of
 
 PROGRAM = "PCFIX_PROGRAM"
 SAID = "said"
-CLOUDS = "Point clouds (*.las *.laz);;All files (*.*)"
+CLOUDS = "Point clouds and DSMs (*.las *.laz *.tif *.tiff *.vrt);;All files (*.*)"
+LAYER = "raster_layer"
+"""A field for a raster layer of the project, which replaces the file of a cloud."""
 
 
 class Plugin:
@@ -99,6 +101,10 @@ class Algorithm(core.QgsProcessingAlgorithm):
                 flag = core.QgsProcessingParameterDefinition.FlagAdvanced
                 parameter.setFlags(parameter.flags() | flag)
             self.addParameter(parameter, createOutput=True)
+            if one["kind"] == "cloud":
+                words = "Raster layer of heights, instead of the cloud"
+                layer = core.QgsProcessingParameterRasterLayer(LAYER, words, None, True)
+                self.addParameter(layer)
         self.addOutput(core.QgsProcessingOutputString(SAID, "Messages of pcfix"))
 
     def processAlgorithm(  # noqa: N802
@@ -106,6 +112,12 @@ class Algorithm(core.QgsProcessingAlgorithm):
     ) -> dict[str, Any]:
         """Run pcfix and load its output."""
         values = {one["name"]: self._value(one, parameters, context) for one in self.fields}
+        layer = self.parameterAsRasterLayer(parameters, LAYER, context)
+        for one in self.fields:
+            if one["kind"] == "cloud":
+                values[one["name"]] = layer.source() if layer else values[one["name"]]
+                if not values[one["name"]]:
+                    raise core.QgsProcessingException("Give a cloud, or a raster layer.")
         said: list[str] = []
 
         def say(line: str) -> None:
@@ -147,7 +159,7 @@ def _parameter(one: dict[str, Any]) -> Any:
     """Return the field of a form for an argument or an option; only needed ones are required."""
     name, kind, default = one["name"], one["kind"], one["default"]
     label = name.replace("_", " ").capitalize() + (f" [{one['unit']}]" if one["unit"] else "")
-    optional = not one["needed"]
+    optional = not one["needed"] or kind == "cloud"  # or the raster layer
     file, number = core.QgsProcessingParameterFile, core.QgsProcessingParameterNumber
     if kind == "bool":
         return core.QgsProcessingParameterBoolean(name, label, default, optional)
@@ -167,7 +179,9 @@ def _parameter(one: dict[str, Any]) -> Any:
             name, label, None, optional, not optional
         )
     if kind == "written":
-        filters = "LAZ (*.laz);;LAS (*.las)" if one["needed"] else "All files (*.*)"
+        filters = (
+            "LAZ (*.laz);;LAS (*.las);;GeoTIFF (*.tif)" if one["needed"] else "All files (*.*)"
+        )
         return core.QgsProcessingParameterFileDestination(
             name, label, filters, None, optional, not optional
         )

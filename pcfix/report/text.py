@@ -72,6 +72,8 @@ _CORRECTED: RowTable = (
     _NO_SURFACE,
     ("Withheld", "{unsure:,} corrected points ({unsure:of corrected}) are visible at large"
      " incidence angles only", "unsure"),
+    ("Raster", "{raster[cells_changed]:,} cells changed, {raster[cells_empty]:,} of them have no"
+     " height any more", "raster"),
     ("Depth", "{depth_m[min]:.2f} to {depth_m[max]:.2f} m, mean {depth_m[mean]:.2f} m", "depth_m"),
     ("Z shift", "mean {shift_z_m[mean]:.3f} m (5th to 95th percentile {shift_z_m[p5]:.3f} to"
      " {shift_z_m[p95]:.3f} m)", "shift_z_m"),
@@ -100,8 +102,8 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
     "label": ("Labelled {input} -> {output}      {points:,} points in {seconds:.1f} s", (
         *_PART,
         ("Class 40", "{submerged:,} points ({submerged:of points})", ""),
-        ("Class 41", "{water_surface:,} points within {settings[band]:g} m of the surface",
-         "settings[band]"),
+        ("Class 41", "{water_surface:,} points within {settings[surface_band]:g} m of the surface",
+         "settings[surface_band]"),
         ("Formerly", "{stale:,} points of class 40 or 41 are in neither class now:"
          " {settings[reset]:?class 1 now|unchanged; --reset sets class 1}", "stale"),
         _NO_SURFACE,

@@ -100,7 +100,7 @@ CHOICES = [
     {},
     {"dead_band": 0.5, "reset": True},
     {"connected": True, "least_pool": 300.0},
-    {"band": 0.2, "dead_band": 0.6, "connected": True, "respect_classes": "2,5,6,7,8,9"},
+    {"surface_band": 0.2, "dead_band": 0.6, "connected": True, "respect_classes": "2,5,6,7,8,9"},
 ]
 
 

@@ -140,10 +140,10 @@ def test_least_pool():
 def test_band():
     x, _, _, xyz = beach(20_000)
     height = xyz[:, 2] - WATER_M
-    found, _ = labelled(part_of(xyz), band=0.05)
+    found, _ = labelled(part_of(xyz), surface_band=0.05)
     expected = np.where(np.abs(height) <= 0.05, 41, np.where(height < 0, 40, 0))
     np.testing.assert_array_equal(found, expected)
-    joined, _ = labelled(part_of(xyz), band=0.05, connected=True)
+    joined, _ = labelled(part_of(xyz), surface_band=0.05, connected=True)
     assert not np.isin(joined[x > 70.0], (40, 41)).any()
     np.testing.assert_array_equal(joined[x < 48], expected[x < 48])
 
@@ -156,7 +156,9 @@ def test_respect_classes():
     kept = np.isin(classes, (2, 5))
     np.testing.assert_array_equal(found, np.where(wet & ~kept, 40, classes))
     assert labelling.report()["respected"] == (wet & kept).sum()
-    found, _ = labelled(part_of(xyz, classes), respect_classes=(2, 41), reset=True, band=0.02)
+    found, _ = labelled(
+        part_of(xyz, classes), respect_classes=(2, 41), reset=True, surface_band=0.02
+    )
     kept = np.isin(classes, (2, 41))
     np.testing.assert_array_equal(found[kept], classes[kept])
     assert (found[(classes == 40) & (xyz[:, 2] > WATER_M + 0.02)] == 1).all()
@@ -187,7 +189,8 @@ def test_line_and_outlier():
 @pytest.mark.parametrize(
     "choices",
     [
-        {"band": -0.1}, {"dead_band": -1}, {"band": float("nan")}, {"band": 0.2, "dead_band": 0.1},
+        {"surface_band": -0.1}, {"dead_band": -1}, {"surface_band": float("nan")},
+        {"surface_band": 0.2, "dead_band": 0.1},
         {"respect_classes": (2, 256)}, {"respect_classes": (-1,)}, {"least_pool": 5.0},
         {"least_pool": -5.0, "connected": True},
     ],

@@ -146,6 +146,26 @@ def test_correct_recipe(tmp_path: Path) -> None:
 
 
 @needs_pdal
+def test_raster_recipe(tmp_path: Path) -> None:
+    """The cells of a raster are the same points for PDAL, in the same order."""
+    pcfix.grid_dsm(SCENE / "cloud.laz", tmp_path / "dsm.tif", resolution=1.0, method="tin")
+    words = options_of("correct_raster.json", tmp_path)[1:]
+    words += [f"--readers.gdal.filename={tmp_path / 'dsm.tif'}"]
+    words += [f"--writers.gdal.filename={tmp_path / 'out.tif'}"]
+    recipe = ROOT / "pipelines" / "correct_raster.json"
+    done = pdal("pipeline", recipe, *words, folder=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    pcfix.correct_file(
+        tmp_path / "dsm.tif", tmp_path / "cli.las", cameras=SCENE / "cameras.csv", water=0.37,
+        method="snell", max_angle=None,
+    )  # fmt: skip
+    one, other = laspy.read(tmp_path / "cli.las"), laspy.read(tmp_path / "out.las")
+    np.testing.assert_allclose(other.xyz, one.xyz, rtol=0, atol=2.1e-4)  # of two roundings
+    np.testing.assert_array_equal(np.array(other.classification), np.array(one.classification))
+    assert (tmp_path / "out.tif").stat().st_size > 1000
+
+
+@needs_pdal
 def test_label_recipe(tmp_path: Path) -> None:
     recipe = ROOT / "pipelines" / "label.json"
     done = pdal("pipeline", recipe, *options_of("label.json", tmp_path), folder=tmp_path)
@@ -211,8 +231,8 @@ def test_options_of_recipes(path: Path) -> None:
     assert writer["dataformat_id"] >= 6
     assert writer["forward"] == "all"
     assert {s["type"] for s in stages} <= {
-        "readers.las", "filters.python", "filters.merge", "filters.splitter", "filters.outlier",
-        "filters.range", "writers.las", "writers.gdal",
+        "readers.las", "readers.gdal", "filters.python", "filters.merge", "filters.splitter",
+        "filters.outlier", "filters.range", "writers.las", "writers.gdal",
     }  # fmt: skip
 
 

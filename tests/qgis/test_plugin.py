@@ -1,11 +1,13 @@
 """The plugin of QGIS: its table, its words, its process, and the same bytes under Debian's QGIS."""
 
+import importlib
 import io
 import json
 import os
 import shutil
 import subprocess
 import sys
+import types
 import zipfile
 
 import pytest
@@ -65,6 +67,47 @@ def test_command_line(commands):
     sections = {"cloud": "a.laz", "reference": "b.laz", "section": "0,0,1,1; 2,2,3,3"}
     expected = ["compare", "a.laz", "b.laz", "--section=0,0,1,1", "--section=2,2,3,3"]
     assert words_of(commands["compare"], sections) == expected
+
+
+class Field:
+    """A field of a form, or a flag of one; it accepts everything."""
+
+    FlagAdvanced = Folder = File = Integer = Double = 0
+
+    def __init__(self, *given, **more):
+        self.given = given
+
+    def __getattr__(self, name):
+        return lambda *given: 0
+
+
+def test_raster_layer(commands, monkeypatch):
+    """A raster layer of the project replaces the file of the cloud; one of the two is needed."""
+    core = types.ModuleType("qgis.core")
+    core.__getattr__ = lambda name: Field
+    core.QgsProcessingException = RuntimeError
+    config = types.ModuleType("processing.core.ProcessingConfig")
+    config.ProcessingConfig = types.SimpleNamespace(getSetting=lambda name: sys.executable)
+    config.Setting = Field
+    for module in (core, config, *map(types.ModuleType, ("qgis", "processing", "processing.core"))):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(sys.modules["qgis"], "core", core, raising=False)
+    monkeypatch.delitem(sys.modules, "pcfix.qgis.provider", raising=False)
+    provider = importlib.import_module("pcfix.qgis.provider")
+    ran = []
+    monkeypatch.setattr(provider, "run", lambda program, words, *more: ran.append(words))
+    monkeypatch.setattr(provider, "_load", lambda *given: None)
+    layer = types.SimpleNamespace(source=lambda: "/survey/dsm.tif")
+    for name in ("run", "correct", "label", "compare"):
+        one = provider.Algorithm(commands[name])
+        one._value = lambda field, parameters, context: parameters.get(field["name"], "")
+        for chosen, file in ((layer, ""), (None, "cloud.laz")):
+            one.parameterAsRasterLayer = lambda *given, chosen=chosen: chosen
+            one.processAlgorithm({"input": file, "cloud": file}, None, Field())
+            assert ran[-1][:2] == [name, "/survey/dsm.tif" if chosen else "cloud.laz"]
+        with pytest.raises(RuntimeError, match="raster layer"):
+            one.processAlgorithm({}, None, Field())
+    sys.modules.pop("pcfix.qgis.provider")
 
 
 def test_no_pcfix(tmp_path):

@@ -67,6 +67,8 @@ COLUMNS = (
 )  # fmt: skip
 UNSURE = Column("Unsure", "unsure", "uint8", 1.0, "withheld: only oblique rays")
 """Written where such points are withheld."""
+OUTCOME = Column("Outcome", "outcome", "uint8", 1.0, "whether and why not corrected")
+"""Written for the cells of rasters; see `pcfix.Outcome`."""
 SHIFTS = ("ShiftX", "ShiftY", "ShiftZ")
 MINIMAL = ("ShiftZ", "RayCount")
 

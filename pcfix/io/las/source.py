@@ -77,11 +77,15 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class CloudPart:
-    """A part of the cloud in a file; see `pcfix.io.tiles.part_of`, which counts its points."""
+    """A part of the cloud in a file; see `pcfix.io.tiles.part_of`, which counts its points.
+
+    Of a raster it may be all cells.
+    """
 
     path: Path
     bounds: Box | None = None  # west, south, east, north, metres; points on the edges belong to it
     resolution: float | None = None  # of COPC: levels down to the first with this spacing, metres
+    band: int | None = None  # of a raster, if it has several
     points: int = 0
     points_of_file: int = 0
     # the lowest and highest coordinates of the part, shape (3,), metres
@@ -90,6 +94,13 @@ class CloudPart:
 
     def __str__(self) -> str:
         return str(self.path)
+
+    __fspath__ = __str__
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it is all of its file."""
+        return self.bounds is None and self.resolution is None
 
     def holds(self, points: laspy.ScaleAwarePointRecord) -> BoolArray:
         """Return which points of a chunk are within the bounds."""
@@ -103,7 +114,7 @@ class CloudPart:
 
 def part_report(cloud: object) -> dict[str, Any] | None:
     """Return what a summary says of the part that was read; None unless the cloud is a part."""
-    if not isinstance(cloud, CloudPart):
+    if not isinstance(cloud, CloudPart) or cloud.is_whole:
         return None
     return {
         "points": cloud.points,
@@ -497,6 +508,6 @@ def metric_crs(source: LasSource) -> CRS | None:
     units |= {axis.unit_name for axis in axes}
     if not units.issubset(METRES):
         unit = " and ".join(sorted(units.difference(METRES)))
-        sentence = f"its CRS {name} is in {unit}. Reproject the cloud to metres first."
+        sentence = f"its CRS {name} is in {unit}. Reproject it to metres first."
         raise bad_file(source.path, "cloud.crs_unit", sentence, crs=name)
     return crs
