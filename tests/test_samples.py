@@ -13,7 +13,7 @@ SCRIPTS = sorted((ROOT / "samples").glob("0*.py"))
 PRINTED = {
     "01": "14,736 of 20,000", "02": "uncorrected  bias +1.8", "03": "depth.png: 12.",
     "04": "14,736 of 20,000 points corrected,", "05": "14,736 of 20,000", "06": "201 stations",
-    "08": "6,93",
+    "08": "7,021 of 9,539 cells",
 }  # fmt: skip
 WRITTEN = {
     "03": ["depth.tif", "depth.qml", "depth.png"], "06": ["section.png"],
