@@ -28,7 +28,10 @@ def regression_of(
     path, where = inputs.check_depths, ""
     if inputs.regression is not None:
         found = read_regression(inputs.regression)
-        where = f" It comes from {inputs.regression}; whether it fits this cloud is not checked."
+        fitted = f", fitted to {found.source}" if found.source else ""
+        where = (
+            f" It comes from {inputs.regression}{fitted}; whether it fits this cloud is not checked."
+        )
     else:
         found = learn_regression(path, parts_of(chunks, survey.water), survey.settings)
         source = f"{Path(path).name} on {Path(view.name).name}, water {survey.water}"

@@ -79,8 +79,8 @@ _SINGLE, _NEAREST = "single depth maps", "single depth maps of the nearest image
 _MVS = {"method": "consistent", "camera_set": "mvs"}
 MODEL_ERRORS = {
     frozenset((_TRACKS, _NEAREST)): 0.005,
-    frozenset((_TRACKS, _PAIRS)): 0.02,
-    frozenset((_MAPS, _PAIRS)): 0.02,
+    frozenset((_TRACKS, _PAIRS)): 0.018,
+    frozenset((_MAPS, _PAIRS)): 0.018,
 }
 """`MODEL_ERROR` where it differs. Tracks and nearest maps name one place for each point: the right
 one was better in each of 18 clouds. The noise of stereo pairs is not modelled, so that tracks and

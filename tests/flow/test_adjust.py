@@ -236,7 +236,7 @@ def test_doors_agree(files, written, tmp_path):
     for name in ("colmap/images.bin", "colmap/points3D.bin", "cameras.csv", "adjustment.json"):
         assert (tmp_path / "cli" / name).read_bytes() == (out / name).read_bytes(), name
     assert "Next step:\n  pcfix correct" in done.stdout
-    assert "Sigma0" in done.stdout
+    assert "sigma0" in done.stdout
 
 
 @pytest.mark.usefixtures("undrawn")

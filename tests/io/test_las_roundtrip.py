@@ -550,7 +550,7 @@ def test_any_chunk_size(
 
 
 def test_documented_dimensions() -> None:
-    units = {0.0: "file's scale", 0.001: "1 mm", 0.0001: "0.1 mm", 0.1: "0.1°", 1.0: ""}
+    units = {0.0: "scale of the file", 0.001: "1 mm", 0.0001: "0.1 mm", 0.1: "0.1°", 1.0: ""}
     head = "| extra dimension | type | unit | |\n|---|---|---|---|\n"
     rows = [
         re.escape(f"| `{c.name}` | {c.dtype} | {units[c.scale]} |".replace("  ", " "))

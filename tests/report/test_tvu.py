@@ -72,7 +72,7 @@ def test_measured_replaces_predicted(summary):
     rows = dict(summary_rows(summary, far))
     assert rows["Uncertainty"].endswith("(predicted)")
     assert rows["Measured"].startswith("0.300 m at 95 %, at 100 points")
-    assert "order 1a/1b" in rows["IHO S-44"] and "Exclusive" not in rows["IHO S-44"]
+    assert "Order 1a/1b" in rows["IHO S-44"] and "Exclusive" not in rows["IHO S-44"]
     few = tvu_of(np.full(FEWEST - 1, 0.01), np.full(FEWEST - 1, 2.0)).as_dict()
     assert f"fewer than {FEWEST} points" in order_sentence(summary, few)
 
