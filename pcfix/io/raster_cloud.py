@@ -171,7 +171,7 @@ class RasterSource(LasSource):
         raster = self.heights.source
         header = laspy.LasHeader(version="1.4", point_format=6)
         step = 10.0 ** np.floor(np.log10(self.heights.cell_m / STEPS_A_CELL))
-        header.scales = np.array([step, step, min(step, 0.001)])
+        header.scales = np.array([step, step, min(step, 0.0001)])
         box = np.array([[*raster.bounds[:2], 0.0], [*raster.bounds[2:], 0.0]])
         header.offsets = np.floor(box.mean(axis=0))
         header.add_crs(self.heights.crs)

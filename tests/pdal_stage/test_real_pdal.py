@@ -160,7 +160,8 @@ def test_raster_recipe(tmp_path: Path) -> None:
         method="snell", max_angle=None,
     )  # fmt: skip
     one, other = laspy.read(tmp_path / "cli.las"), laspy.read(tmp_path / "out.las")
-    np.testing.assert_allclose(other.xyz, one.xyz, rtol=0, atol=2.1e-4)  # of two roundings
+    # pcfix rounds the places of cells of 1 m to 1 mm, PDAL to 0.1 mm
+    np.testing.assert_allclose(other.xyz, one.xyz, rtol=0, atol=6e-4)
     np.testing.assert_array_equal(np.array(other.classification), np.array(one.classification))
     assert (tmp_path / "out.tif").stat().st_size > 1000
 
