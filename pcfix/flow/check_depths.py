@@ -30,7 +30,8 @@ def regression_of(
         found = read_regression(inputs.regression)
         fitted = f", fitted to {found.source}" if found.source else ""
         where = (
-            f" It comes from {inputs.regression}{fitted}; whether it fits this cloud is not checked."
+            f" It comes from {inputs.regression}{fitted}; whether it fits this cloud is not"
+            " checked."
         )
     else:
         found = learn_regression(path, parts_of(chunks, survey.water), survey.settings)
