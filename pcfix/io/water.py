@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import shapely
 from rasterio.windows import Window
-from scipy.ndimage import map_coordinates
 
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
 from pcfix.io import crs as systems
@@ -316,6 +315,8 @@ def _resampled(
     The heights have the unit of `to_cloud`; `from_cloud` transforms the plan only; `bounds` are in
     the cloud's CRS. Return heights in metres, left, top and size of the cells.
     """
+    from scipy.ndimage import map_coordinates  # slow to import
+
     # where the raster is, from points all over it, and the sides of its middle cell
     high, wide = given.shape
     share = np.linspace(0.0, 1.0, _EDGE_POINTS)
