@@ -330,7 +330,7 @@ def datum_notes(found: Adjusted) -> list[PcfixWarning]:
     side, level = ("above", "low") if offset_m > 0.0 else ("below", "high")
     water = "" if found.water is None else f", or a water level that is too {level}"
     words = (
-        f"The GNSS positions lie {abs(offset_m):.2f} m {side} the projection centres (standard"
+        f"The GNSS positions are {abs(offset_m):.2f} m {side} the projection centres (standard"
         f" error {sigma_m:.2f} m): an antenna lever arm, another height datum{water}. The block"
         " followed them. Correct them, or omit them if there are control points."
     )

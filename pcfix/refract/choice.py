@@ -101,7 +101,7 @@ def chosen_views(batch: Batch, shift_m: FloatArray | None = None) -> Views:
     """Return the cameras whose rays each point gets, as a list.
 
     Those of the list of the batch, in its order and with its weights, that can have imaged the
-    point (`pcfix.lens.frames.BESIDE`); or, without a list, all in whose frame the point lies. With
+    point (`pcfix.lens.frames.BESIDE`); or, without a list, all whose frames contain the point. With
     `shift_m`, shape (m, 3), the frames hold the image of the true point instead, which is the
     apparent one plus the shift.
     """
@@ -145,7 +145,7 @@ def views_in_frame(xyz: FloatArray, cameras: Cameras) -> Views:
 
 
 def near_borders(batch: Batch, shift_m: FloatArray) -> IntArray:
-    """Return the points whose images lie in other frames than the apparent points do.
+    """Return the points that are imaged in other frames than their apparent points.
 
     The true points are the apparent ones plus `shift_m`, shape (m, 3).
     """
@@ -211,10 +211,10 @@ def _choose_all(
             tiling.gather_three(room, rows, shift)
         for c in near:
             if len(shift):
-                some_seen = _mark_images(marks[seeing], tile, room, rig, frames, c, points.n)
+                is_near = _mark_images(marks[seeing], tile, room, rig, frames, c, points.n)
             else:
-                some_seen = mark(marks[seeing], tile, TILE, frames, c, rig.centres[c])
-            if some_seen:
+                is_near = mark(marks[seeing], tile, TILE, frames, c, rig.centres[c])
+            if is_near:
                 near[seeing] = c
                 seeing += 1
         near = near[:seeing]
