@@ -8,8 +8,9 @@ import shutil
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import Context, copy_context
 from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
@@ -20,10 +21,12 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import PcfixWarning
-from pcfix.running import current
+from pcfix.running import current, running
 from pcfix.version import __version__
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+_Value = TypeVar("_Value")
+_Result = TypeVar("_Result")
 
 KERNEL_SOURCES = (
     "kernels.py", "model.py", "io/ply.py", "adjust/*.py", "clean/*.py", "compare/*.py", "grid/*.py",
@@ -163,6 +166,24 @@ def in_tiles(run: Callable[..., Any], rows: int, *given: Any, points: int = 0) -
             done = pool.map(lambda span: run(span, *given), rest)
             for span, _ in zip(rest, done, strict=True):
                 report(span)
+
+
+def in_threads(run: Callable[[_Value], _Result], values: Sequence[_Value]) -> list[_Result]:
+    """Return ``[run(value) for value in values]``, computed at the same time.
+
+    Much of `run` is numpy, which has one thread; its kernels share the other threads.
+    """
+    each = -(-current().threads // len(values))
+
+    def one(context: Context, value: _Value) -> _Result:
+        return context.run(shared, value)
+
+    def shared(value: _Value) -> _Result:
+        with running(threads=each):
+            return run(value)
+
+    with ThreadPoolExecutor(current().threads) as pool:
+        return list(pool.map(one, [copy_context() for _ in values], values))
 
 
 @device

@@ -29,6 +29,8 @@ STARTS = (0.0, 0.75, -0.75, 1.5, -1.5)
 """First beds, above that through the mean candidates, by the spread of these."""
 WIDER = (3.0, 2.0, 1.4, 1.0, 1.0)
 """Noise of the steps to the bed, by sigma: wide at first, so that no candidate is excluded."""
+AGAIN = WIDER[-2:]
+"""The same from a bed that was found with another sigma."""
 FREEDOM, DENSITY = 7.0, 0.385
 """Degrees of freedom of t, with which the power is a whole number, and t(0)."""
 SIGMA_GSD, SIGMAS_GSD = 0.8, (0.05, 30.0)
@@ -66,6 +68,7 @@ def log_likelihood(
     depth = np.maximum(level_m - apparent_m, 0.05)
     gain = np.clip((level_m[..., None] - height) / depth[..., None], 1.0, 4.0)
     rest, sigma = np.empty_like(height), SIGMA_GSD * gsd_m
+    beds = np.full((len(terms), FOLDS, terms.shape[2]), np.nan)
 
     def log_density(log_sigma: float) -> FloatArray:
         sigma = np.exp(log_sigma)
@@ -77,7 +80,7 @@ def log_likelihood(
 
     bounds = np.log(np.multiply(SIGMAS_GSD, gsd_m)).tolist()
     for _ in range(2):
-        in_tiles(_predict, len(terms), terms, height, gain, prior, sigma, rest)
+        in_tiles(_predict, len(terms), terms, height, gain, prior, sigma, beds, rest)
         found = minimize_scalar(misfit, bounds=bounds, method="bounded", options={"xatol": 0.02})
         sigma = float(np.exp(found.x))
     return np.asarray(log_density(found.x).mean(axis=1))
@@ -95,29 +98,37 @@ def standard_errors(of: FloatArray, other: FloatArray, model_error: float = MODE
 @kernel(allocates=True)
 def _predict(
     span: Span, terms: FloatArray, height: FloatArray, gain: FloatArray, prior: FloatArray,
-    sigma: float, rest: FloatArray,
+    sigma: float, beds: FloatArray, rest: FloatArray,
 ) -> None:  # fmt: skip
-    """Set the residuals of all candidates from the bed of the other points of their patch."""
+    """Set the residuals of all candidates from the bed of the other points of their patch.
+
+    `beds`, shape (p, FOLDS, 6), are NaN at first, later where the search begins.
+    """
     n, k = height.shape[1:]
     bed, best, normal = np.zeros(6), np.zeros(6), np.empty((6, 7))
     for p in range(*span):
         # of the candidates, which says how far apart beds may be
         spread = _spread(height[p], prior[p])
         for fold in range(FOLDS):
-            most = -np.inf
-            for start in range(len(STARTS) if k > 1 else 1):
-                bed[:] = 0.0
-                # through the mean candidates, with the largest noise that there can be
-                _step(terms[p], height[p], gain[p], prior[p], fold, 1e6, normal, bed)
-                bed[0] += STARTS[start] * spread / terms[p, 0, 0]
-                likelihood = 0.0
-                for wider in WIDER:
-                    likelihood = _step(
-                        terms[p], height[p], gain[p], prior[p], fold, wider * sigma, normal, bed
-                    )
-                if likelihood > most:
-                    most = likelihood
-                    best[:] = bed
+            most, best[:] = -np.inf, beds[p, fold]
+            if not np.isnan(best[0]):
+                for wider in AGAIN:
+                    _step(terms[p], height[p], gain[p], prior[p], fold, wider * sigma, normal, best)
+            else:
+                for start in range(len(STARTS) if k > 1 else 1):
+                    bed[:] = 0.0
+                    # through the mean candidates, with the largest noise that there can be
+                    _step(terms[p], height[p], gain[p], prior[p], fold, 1e6, normal, bed)
+                    bed[0] += STARTS[start] * spread / terms[p, 0, 0]
+                    likelihood = 0.0
+                    for wider in WIDER:
+                        likelihood = _step(
+                            terms[p], height[p], gain[p], prior[p], fold, wider * sigma, normal, bed
+                        )
+                    if likelihood > most:
+                        most = likelihood
+                        best[:] = bed
+            beds[p, fold] = best
             # the best bed predicts the points that it was not fitted to
             for i in range(fold, n, FOLDS):
                 for c in range(k):

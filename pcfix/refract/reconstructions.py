@@ -9,11 +9,13 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from functools import partial
 from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from pcfix.kernels import in_threads
 from pcfix.model import FloatArray, IntArray, Outcome, ViewKind
 from pcfix.options.correct import Dimensions, ScienceOptions
 from pcfix.refract import patches
@@ -341,7 +343,7 @@ def _beds(
     part: Batch, around: Batch, place: IntArray, types: tuple[Reconstruction, ...]
 ) -> _Beds | None:
     """Correct the points of the patches for each type; None if fewer than two can."""
-    z = np.array([_heights(part, around, one) for one in types])
+    z: FloatArray = np.array(in_threads(partial(_heights, part, around), types))
     covered = np.isfinite(z).sum(axis=1)
     kept = np.flatnonzero(covered >= COVERED * covered.max())
     if len(kept) < 2 or not covered.max():
@@ -359,7 +361,9 @@ def _beds(
         # The maps of a point are chosen by a smooth bed: their likelihood allows for that, the
         # discontinuities do not. But neighbours in sparse clouds show little of their scatter.
         if place.shape[1] == patches.PATCH_POINTS[0]:
-            likely = [_log_likelihood(part, place, one, z[i]) for i, one in enumerate(types)]
+            likely = in_threads(
+                partial(_log_likelihood, part, place), [*zip(types, z, strict=True)]
+            )
             for a, b in permutations(range(len(types)), 2):
                 two = frozenset((types[a].words, types[b].words))
                 error = MODEL_ERRORS.get(two, MODEL_ERROR)
@@ -369,8 +373,11 @@ def _beds(
     return _Beds(types, z, place, len(place), share, sigma, errors)
 
 
-def _log_likelihood(part: Batch, place: IntArray, one: Reconstruction, z: FloatArray) -> FloatArray:
-    """Return the log likelihood of each patch for a type, per point."""
+def _log_likelihood(
+    part: Batch, place: IntArray, bed: tuple[Reconstruction, FloatArray]
+) -> FloatArray:
+    """Return the log likelihood of each patch for a type and its bed, per point."""
+    one, z = bed
     candidates = Candidates(z[:, None], np.ones((len(z), 1)))
     if one.words in (_MAPS, _SINGLE):  # which of several images made a point is unknown
         from pcfix.refract.depth_maps import candidates_of
