@@ -111,7 +111,7 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
         )
         raise SettingError("option.not_in_pdal", sentence, option="uncorrected")
     cloud = PdalCloud(ins, namespace.get("metadata"))
-    results = Results(cloud, columns_for(options.dimensions, options.unsure))
+    results = Results(cloud, columns_for(options.dimensions))
     plan = read_inputs(options, _view(cloud))
     check_summary(options, paths_in(options))
     tally: Any = None

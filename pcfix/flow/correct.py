@@ -9,7 +9,6 @@ from __future__ import annotations
 import warnings
 from dataclasses import fields, replace
 from itertools import compress
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,6 @@ from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps, part_report
 from pcfix.io.las.writing import output_header
 from pcfix.io.raster_cloud import is_raster
-from pcfix.io.saved import write_regression
 from pcfix.io.tiles import Clouds
 from pcfix.io.views import ViewReport, beside
 from pcfix.label.labelling import Labelling
@@ -54,7 +52,7 @@ from pcfix.options.correct import (
     ScienceOptions,
 )
 from pcfix.options.declare import File, taken
-from pcfix.refract.regression import LEAST_BEYOND, DepthRegression
+from pcfix.refract.regression import DepthRegression
 from pcfix.refract.tally import Tally
 from pcfix.report.summary import Summary
 from pcfix.version import __version__
@@ -110,9 +108,9 @@ def correct_file(
 
 def _correcting(plan: Plan, source: LasSource) -> FileWork:
     """Return the correction of one file: its header, and each chunk."""
-    written = columns.columns_for(plan.options.dimensions, plan.options.unsure)
+    written = columns.columns_for(plan.options.dimensions)
     if is_raster(source.path):
-        written = (*columns.columns_for("all", plan.options.unsure), columns.OUTCOME)
+        written = (*columns.COLUMNS, columns.OUTCOME)
     steps = centring_steps(source.header)
     header = output_header(source, "settings", plan.provenance(), written, steps)
     uncorrected = plan.options.uncorrected
@@ -142,7 +140,7 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
 def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     """Refuse a result in which cloud, water and cameras do not fit, else summarize it.
 
-    Warns of what is uncertain, and writes the shoreline and the line of a regression if asked.
+    Warns of what is uncertain, and writes the shoreline if asked.
     """
     options, figures, transfer = plan.options, tally.figures, plan.transfer
     report = None
@@ -170,17 +168,11 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     else:  # no depths, and no orders by depth
         counts["depth_m"], uncertainty = {}, None
         water = f"all around, seen through a {plan.inputs.port}"
-    path, line = options.save_regression, plan.regression
-    if path is not None and line is not None:
-        write_regression(path, line, overwrite=options.overwrite)
-    if options.unsure != "withhold":
-        counts["unsure"] = None
     unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
     not_moved = sum(counts["uncorrected"].values()) + int(figures.outcomes[Outcome.NOT_TRANSFERRED])
     reconstruction, detected = plan.reconstruction, [*plan.notes]
-    if tally.beyond is not None and line is not None:
-        least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
-        detected += coded("regression.range", tally.beyond.notes(line, least))
+    if tally.beyond is not None and plan.regression is not None:
+        detected += coded("regression.range", tally.beyond.notes(plan.regression))
     notes = [
         *plan.input_notes,
         *([] if report is None else report.warnings()),
@@ -308,7 +300,7 @@ def correct_points(
     may_be_submerged: npt.ArrayLike | None = None,
     level_offset_m: npt.ArrayLike | None = None,
     adjusted_from: Cameras | None = None,
-    regression: DepthRegression | File | None = None,
+    regression: DepthRegression | None = None,
     **keywords: Any,
 ) -> Correction:
     """Correct apparent points for refraction at the water surface.
@@ -326,9 +318,9 @@ def correct_points(
         each point, NaN where it is unknown.
     options : RefractionOptions, optional
         Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
-        from the surface normal), max_cameras, camera_set, matcher, depth_factor, unsure (with
-        ``"withhold"`` the result has a flag), sigma_image and the other standard deviations. With
-        water_per_image, `water` still decides which points are submerged, and how deep.
+        from the surface normal), camera_set, matcher, depth_factor, sigma_image and the other
+        standard deviations. With water_per_image, `water` still decides which points are submerged,
+        and how deep.
     views : Views, optional
         The view list: the images that contributed to each point, as rows of `adjusted_from` if it
         is given, else of `cameras`. Default: as the option `camera_set` says.
@@ -343,8 +335,8 @@ def correct_points(
         The original cameras, in the same frame, if `cameras` are the same images (matched by their
         labels) after an adjustment. All points are first transferred to the adjusted cameras; see
         `pcfix.adjust.transfer`.
-    regression : DepthRegression or path, optional
-        For the method regression: see `pcfix.refract.regression`, or the file of a line.
+    regression : DepthRegression, optional
+        For the method regression; see `pcfix.refract.regression`.
 
     Returns
     -------
@@ -404,28 +396,25 @@ def correct_points(
         "xyz", None, *corners(*xyz[:, :2].T), len(xyz), lambda water=None: iter([points])
     )
     transfer = None if adjusted_from is None else transfer_between(adjusted_from, cameras)
-    line, path = regression, None
-    if isinstance(line, str | PathLike):
-        line, path = None, line
     plan = plan_of(
         with_index(all_options),
-        Inputs(cameras=cameras, water=surface, regression=path),
+        Inputs(cameras=cameras, water=surface),
         view,
         CameraInputs(cameras, None, original, transfer),
         FoundSurface(surface),
         offset,
         views,
         Labelling(LabelRules(respect_classes=(NOT_SUBMERGED,))),
-        line,
+        regression,
     )
     plan = plan_correction(plan)
     correction, tally = correct_chunk(plan, points, 0, covariances=True)
     if tally.water is not None:
         tally.water.check_reach("xyz", surface, deep=given.deep)
     check_fit(plan, tally)
-    line, beyond = plan.regression, list[str]()
-    if line is not None and tally.beyond is not None:
-        beyond = tally.beyond.notes(line)
+    beyond = list[str]()
+    if regression is not None and tally.beyond is not None:
+        beyond = tally.beyond.notes(regression)
     for note in (*plan.input_notes, *coded("regression.range", beyond)):
         warnings.warn(note, stacklevel=2)
     return correction

@@ -83,8 +83,9 @@ class Plan:
     def settings(self) -> dict[str, Any]:
         """What the summary and the output file say of the settings besides the options."""
         options, port = self.options, self.inputs.port
-        files = {name: getattr(options, name) for name in ("regression", "water_per_image")}
-        more: dict[str, Any] = {name: str(one) for name, one in files.items() if one is not None}
+        more: dict[str, Any] = {}
+        if options.water_per_image is not None:
+            more["water_per_image"] = str(options.water_per_image)
         if port is not None:
             return {"port": asdict(port)}
         if options.depth_factor == "auto":

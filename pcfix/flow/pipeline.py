@@ -41,7 +41,7 @@ def pipeline_for(input: Path, output: Path | None, options: CorrectOptions) -> d
     if output is not None:
         check_suffix(output)
     read_inputs(options, view_of(input))
-    columns = columns_for(options.dimensions, options.unsure)
+    columns = columns_for(options.dimensions)
     first = {name: plain[name] for name in ("cameras", "water") if name in plain}
     added = [add_dimension(columns), CLASS_FLAGS, f"{OUTCOME}=uint8" if drop else ""]
     stage: dict[str, Any] = {

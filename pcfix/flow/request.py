@@ -229,7 +229,7 @@ class RunFolder:
         ending = ".laz" if self._tiles is None else ""
         self.corrected, self.cleaned = folder / f"corrected{ending}", folder / f"cleaned{ending}"
         self.compare = folder / "compare"
-        self.regression, self.dod = folder / "regression.json", self.compare / "dod.tif"
+        self.dod = self.compare / "dod.tif"
 
     def files_of(self, cloud: Path) -> list[Path]:
         """Return the files of a cloud in the folder: one, or as many as the input has."""

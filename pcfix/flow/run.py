@@ -167,7 +167,6 @@ def run_all(
     run = RunFolder(out_dir, request)
 
     outputs = run.files_of(run.corrected)
-    outputs += [] if request.check_depths is None else [run.regression]
     outputs += [] if request.shoreline is None else [Path(request.shoreline)]
     corrected = step("correct", "Correcting", run.corrected, partial(_correct, run), outputs)
     poses = corrected["poses"]
@@ -305,8 +304,6 @@ def _adjust(request: Request, target: Path, files: list[Path]) -> str:
 def _correct(run: RunFolder, progress: Progress | None) -> Plain:
     """Correct the cloud."""
     options = replace(run.request, overwrite=True).part(CorrectOptions)
-    if options.check_depths is not None:
-        options = replace(options, save_regression=run.regression)
     source = run.request.source
     return vars(correct_file(source, run.corrected, options=options, progress=progress))
 

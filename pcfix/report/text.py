@@ -70,8 +70,6 @@ _CORRECTED: RowTable = (
     ("Submerged", "{submerged:,} points ({submerged:of points}), {corrected_words}", ""),
     ("", "{count:,} not corrected: {name} ({fate})", "*uncorrected"),
     _NO_SURFACE,
-    ("Withheld", "{unsure:,} corrected points ({unsure:of corrected}) are visible at large"
-     " incidence angles only", "unsure"),
     ("Raster", "{raster[cells_changed]:,} cells changed, {raster[cells_empty]:,} of them have no"
      " height any more", "raster"),
     ("Depth", "{depth_m[min]:.2f} to {depth_m[max]:.2f} m, mean {depth_m[mean]:.2f} m", "depth_m"),

@@ -44,8 +44,6 @@ def options(draw, scene: Scene) -> dict[str, object]:
     if method != "factor":
         found |= {
             "max_angle": draw(st.sampled_from(["auto", None, 20.0])),
-            "max_cameras": draw(st.sampled_from([None, 2, 5])),
-            "unsure": draw(st.sampled_from(["keep", "withhold"])),
             "occlusion": draw(st.sampled_from(["auto", "off"])),
         }
     return found

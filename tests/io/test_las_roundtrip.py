@@ -15,7 +15,7 @@ from laspy.vlrs.vlrlist import VLRList
 import pcfix
 from pcfix import PcfixError
 from pcfix.flow.plausibility import CloudSample
-from pcfix.io.las.columns import COLUMNS, UNSURE, UPGRADE
+from pcfix.io.las.columns import COLUMNS, UPGRADE
 from tests.utils.beyond_frames import BEYOND_FRAMES, DEEP
 from tests.utils.clouds import (
     EAST_M,
@@ -554,7 +554,7 @@ def test_documented_dimensions() -> None:
     head = "| extra dimension | type | unit | |\n|---|---|---|---|\n"
     rows = [
         re.escape(f"| `{c.name}` | {c.dtype} | {units[c.scale]} |".replace("  ", " "))
-        for c in (*COLUMNS, UNSURE)
+        for c in COLUMNS
     ]
     table = re.compile(re.escape(head) + "".join(f"{row} .+ \\|\n" for row in rows) + "\n")
     root = Path(__file__).parents[2]

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.io.las.columns import COLUMNS, UNSURE
+from pcfix.io.las.columns import COLUMNS
 from pcfix.io.pdal import STAGE_SOURCE, add_dimension
 from tests.utils.beyond_frames import BEYOND_FRAMES
 from tests.utils.clouds import WATER_M, block, cameras_csv, framed_block, random_cloud, write_cloud
-from tests.utils.half_oblique import write_half_oblique
 
 pytestmark = BEYOND_FRAMES
 
@@ -112,20 +111,6 @@ def test_withheld(tmp_path, keeps, uncorrected):
         np.testing.assert_array_equal(outs["ClassFlags"] & ~np.uint8(4), others)
 
 
-def test_unsure(tmp_path):
-    more = {"method": "snell", "max_angle": "none", "occlusion": "off", "unsure": "withhold"}
-    more |= write_half_oblique(tmp_path)
-    before = laspy.read(tmp_path / "cloud.las")
-    ins = arrays_of(before, add_dimension((*COLUMNS, UNSURE)))
-    outs, report = run("correct", ins, metadata_of(before.header), **more)
-    pcfix.correct_file(tmp_path / "cloud.las", tmp_path / "out.las", **more)
-    las = laspy.read(tmp_path / "out.las")
-    np.testing.assert_array_equal(outs["Unsure"], las.Unsure)
-    np.testing.assert_array_equal(outs["ClassFlags"] >> 2 & 1, las.withheld)
-    (told,) = (node["value"] for node in report["children"] if node["name"] == "unsure")
-    assert told > np.array(las.Unsure).sum() > 0  # some came withheld
-
-
 def test_label(cloud):
     _, ins, metadata = cloud
     outs, report = run("label", ins, metadata, water=WATER_M)
@@ -162,10 +147,10 @@ MISTAKES = [
     ({**GOOD, "watre": 1}, None),
     ({"water": 1.0}, "option.missing"),
     ({"cameras": "cameras.csv"}, "option.missing"),
-    ({**GOOD, "max_cameras": "few"}, "option.type"),
+    ({**GOOD, "jobs": "few"}, "option.type"),
     ({**GOOD, "max_angle": True}, "option.type"),
     ({**GOOD, "cameras": ["a"]}, "option.type"),
-    ({**GOOD, "max_cameras": 2.5}, "option.type"),
+    ({**GOOD, "jobs": 2.5}, "option.type"),
     ("cameras.csv", "option.type"),
     ({**GOOD, "max-angle": 30, "max_angle": 30}, "option.twice"),
     ({**GOOD, "uncorrected": "drop"}, "option.not_in_pdal"),
