@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -52,30 +51,11 @@ def _summarized(
     "pcfix run cloud.laz out --cameras cameras.xml --water 0.37 --reference lidar.laz",
     input=TILED,
     out_dir="Folder for all results.",
-    config="Repeat the run of this run.json.",
 )
-def run(
-    input: str | None = None, out_dir: Path | None = None, /, *, options: RunOptions,
-    config: Path | None = None, quiet: bool,
-) -> None:  # fmt: skip
-    """Adjust, correct, clean, grid, compare and report; resumes where it stopped.
-
-    With --config give only the folder: pcfix run OUT_DIR --config run.json.
-    """
+def run(input: str, out_dir: Path, /, *, options: RunOptions, quiet: bool) -> None:
+    """Adjust, correct, clean, grid, compare and report; resumes where it stopped."""
     shown: Any = {"say": partial(say, quiet=quiet), "bar": partial(progress_bar, quiet=quiet)}
-    if config is None:
-        if input is None or out_dir is None:
-            raise UsageError("INPUT and OUT_DIR are needed")
-        pcfix.run(input, out_dir, options=options, **shown)
-        return
-    from pcfix.flow.request import request_of
-    from pcfix.flow.run import run_all
-
-    folder = out_dir or input
-    if folder is None or options.cameras is not None or options.water is not None:
-        raise UsageError("with --config give only OUT_DIR")
-    request = replace(request_of(config), overwrite=options.overwrite, jobs=options.jobs)
-    run_all(request, Path(folder), **shown)
+    pcfix.run(input, out_dir, options=options, **shown)
 
 
 @command(

@@ -267,8 +267,8 @@ class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions, panel=Pane
 
 
 class RunOptions(
-    BandOption, ReferenceOption, ShorelineOption, TileOptions, DistanceOptions, SurveyedOptions,
-    RefractionOptions, MaskOption, LandRules, SurveyOptions, panel=Panel.OUTPUT,
+    BandOption, ReferenceOption, TileOptions, DistanceOptions, SurveyedOptions, RefractionOptions,
+    MaskOption, LandRules, SurveyOptions, panel=Panel.OUTPUT,
 ):  # fmt: skip
     """The options of ``pcfix run``; ``run.json`` records all that affect its results."""
 
