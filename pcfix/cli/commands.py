@@ -234,7 +234,7 @@ def pipeline(
     say(json.dumps(pipeline_for(input, None if stage else output, options), indent=2))
 
 
-@command("pcfix plan --height 60 --overlap 0.8 --sidelap 0.7 --depth 5 --plot plan.png")
+@command("pcfix plan --height 60 --overlap 0.8 --sidelap 0.7 --depth 1,2,5")
 def plan(*, options: PlanOptions, quiet: bool) -> None:
     """Predict the accuracy of a planned flight."""
     from pcfix.flow.plan import plan_text

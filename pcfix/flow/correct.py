@@ -282,8 +282,7 @@ def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> P
     sought = (plan.found.as_dict() or {}).get("model") == "auto"
     tested = plausible(
         plan.cameras, sample.xyz, ties, () if sought else sample.level_doubts(),
-        file="" if isinstance(given, Cameras) else given or "", water_m=sample.water_m,
-        listed=plan.kind is not None, every=sample.every,
+        file="" if isinstance(given, Cameras) else given or "", listed=plan.kind is not None,
     )  # fmt: skip
     for warning in tested.doubts:
         warnings.warn(warning, stacklevel=3)

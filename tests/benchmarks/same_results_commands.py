@@ -150,7 +150,7 @@ OF_ADJUST = {
 OF_OBLIQUES = {"default": "", "views": "--views {inputs}/c.vis", "snell": "--method snell"}
 OF_PHOTOS = {"exact": "--dsm {dsm.block/out.tif}", "paper": "--mapping paper --dsm {inputs}/a.las"}
 OF_PLAN = {
-    "nadir": "--height 60 --depth 1:5:1",
+    "nadir": "--height 60 --depth 1,2,3,4,5",
     "obliques": "--height 40 --obliques 30 --overlap 0.7 --depth 3",
 }
 OF_CLEAN = {
