@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pcfix
-from pcfix.cli.flags import COMMANDS, UsageError, command, progress_bar, say, status_line
+from pcfix.cli.flags import COMMANDS, command, progress_bar, say, status_line
 from pcfix.options.correct import (
     AdjustOptions,
     CamerasCheckOptions,
@@ -221,17 +221,12 @@ def simulate(out_dir: Path, /, *, options: SimulateOptions, quiet: bool) -> None
     "pcfix pipeline cloud.laz corrected.laz --cameras cameras.csv --water 0.37",
     input="LAS or LAZ cloud.",
     output="LAS or LAZ to write.",
-    stage="Print only the stage, for use in another pipeline.",
 )
-def pipeline(
-    input: Path, output: Path | None = None, /, *, options: CorrectOptions, stage: bool = False
-) -> None:
+def pipeline(input: Path, output: Path, /, *, options: CorrectOptions) -> None:
     """Print the PDAL pipeline equivalent to 'pcfix correct', as JSON."""
     from pcfix.flow.pipeline import pipeline_for
 
-    if output is None and not stage:
-        raise UsageError("Give OUTPUT, or --stage to print only the stage")
-    say(json.dumps(pipeline_for(input, None if stage else output, options), indent=2))
+    say(json.dumps(pipeline_for(input, output, options), indent=2))
 
 
 @command("pcfix plan --height 60 --overlap 0.8 --sidelap 0.7 --depth 1,2,5")

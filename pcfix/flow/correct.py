@@ -22,7 +22,7 @@ from pcfix.flow.planning import plan_correction, plan_of, read_inputs
 from pcfix.flow.plausibility import CloudSample, Plausible, plausible
 from pcfix.flow.raster import command_for
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress
-from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of, write_shoreline
+from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps, part_report
@@ -132,7 +132,7 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
         columns.fill(new, changes)
         new.array["classification"][correction.corrected] = BATHYMETRIC_POINT
         new["withheld"][:] = (withheld | changes.flagged).astype(np.uint8)
-        return new[~correction.uncorrected] if uncorrected == "drop" else new
+        return new
 
     return FileWork(header, compute, apply)
 
@@ -140,7 +140,7 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
 def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     """Refuse a result in which cloud, water and cameras do not fit, else summarize it.
 
-    Warns of what is uncertain, and writes the shoreline if asked.
+    Warns of what is uncertain.
     """
     options, figures, transfer = plan.options, tally.figures, plan.transfer
     report = None
@@ -148,16 +148,11 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         report = replace(tally.views, notes=plan.match.notes)
     water_notes = _check_counts(plan, tally, report)
     counts, uncertainty = figures.as_dict(), figures.uncertainty(plan.reconstruction)
-    tested, poses, absorbed, shoreline = None, None, None, None
+    tested, poses, absorbed = None, None, None
     if plan.inputs.port is None:
         ties = quick_ties(plan.inputs, plan.view.crs) if len(plan.cameras) else None
         tested = check_fit(plan, tally, ties)
         poses, absorbed = diagnose_in_passing(plan, ties)
-        if tally.shore is not None and options.shoreline is not None:
-            shoreline = write_shoreline(
-                options.shoreline, tally.shore, plan.found, plan.view.crs,
-                overwrite=options.overwrite, sigma_level_m=options.sigma_level,
-            )  # fmt: skip
         water, moved = str(plan.found.surface), plan.survey.level_offset_m
         if moved is not None:
             times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
@@ -169,16 +164,13 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         counts["depth_m"], uncertainty = {}, None
         water = f"all around, seen through a {plan.inputs.port}"
     unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
-    not_moved = sum(counts["uncorrected"].values()) + int(figures.outcomes[Outcome.NOT_TRANSFERRED])
-    reconstruction, detected = plan.reconstruction, [*plan.notes]
-    if tally.beyond is not None and plan.regression is not None:
-        detected += coded("regression.range", tally.beyond.notes(plan.regression))
+    reconstruction = plan.reconstruction
     notes = [
         *plan.input_notes,
         *([] if report is None else report.warnings()),
         *coded("cloud.labels", plan.labelling.notes),
         *(() if tested is None else tested.doubts),
-        *detected,
+        *plan.notes,
         *coded("water.extent", water_notes),
         *([] if absorbed is None else [absorbed]),
     ]
@@ -187,7 +179,6 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         output=str(task.target),
         pcfix=__version__,
         **counts,
-        dropped=not_moved if options.uncorrected == "drop" else 0,
         cameras=len(plan.cameras),
         cameras_used=len(plan.cameras) - len(unused),
         cameras_unused=unused,  # labels of those without corrected points
@@ -205,11 +196,10 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         # other notes on the cloud, also in `warnings`
         notes=[
             one
-            for one in map(str, detected)
+            for one in map(str, plan.notes)
             if reconstruction is None or one not in reconstruction["because"]
         ],
         poses=poses,  # whether they have absorbed the refraction
-        shoreline=shoreline,
         fit=None if tested is None else tested.as_dict(),
     )
 
@@ -411,10 +401,7 @@ def correct_points(
     if tally.water is not None:
         tally.water.check_reach("xyz", surface, deep=given.deep)
     check_fit(plan, tally)
-    beyond = list[str]()
-    if regression is not None and tally.beyond is not None:
-        beyond = tally.beyond.notes(regression)
-    for note in (*plan.input_notes, *coded("regression.range", beyond)):
+    for note in plan.input_notes:
         warnings.warn(note, stacklevel=2)
     return correction
 

@@ -15,7 +15,7 @@ from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
 from pcfix.flow.raster import write_cells
 from pcfix.flow.run_folder import SURFACE, RunFolder
 from pcfix.flow.runner import Progress
-from pcfix.flow.surfaces import file_points, shoreline_layer, view_of
+from pcfix.flow.surfaces import file_points, view_of
 from pcfix.grid.colours import hillshade, relief_colours
 from pcfix.grid.lattice import round_resolution
 from pcfix.grid.maps import contours, depth_interval
@@ -142,7 +142,7 @@ def write_map(path: Path, run: RunFolder, corrected: Plain, compared: Plain) -> 
     layers = [
         Layer("corrected_area", "Polygon", shapes, {"area_m2": area}, style),
         _contours(folder),
-        _waterline(cloud, run.water, sigma_m),
+        waterline(cloud, run.water, sigma_m),
         *([_sections(sections)] if sections else []),
         _cameras(run.cameras, corrected["cameras_unused"]),
         *_checks(folder, points, options.check_depths),
@@ -164,8 +164,11 @@ def _contours(folder: Path) -> Layer:
     return Layer("depth_contours", "LineString", lines, values, style)
 
 
-def _waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Layer:
-    """Return where the water meets the corrected cloud."""
+def waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Layer:
+    """Return where the water meets the corrected cloud, with the standard error across the line.
+
+    `sigma_m` is that of the height of the water.
+    """
     near = NearWater()
     for points in file_points(cloud, water, ("WaterDepth", "SigmaZ")):
         known = points.dimensions or {}
@@ -175,8 +178,13 @@ def _waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Laye
         above[~points.counts()] = np.nan
         near += NearWater.of(points.xyz, above, known["SigmaZ"])
     lines = near.lines(lambda xy: np.full(len(xy), sigma_m))
+    values = {
+        figure: np.array([getattr(one, figure) for one in lines], np.float64)
+        for figure in ("level_m", "sigma_m", "length_m")
+    }
+    geometries = [shapely.linestrings(one.xy) for one in lines]
     style = vector_style({"line": Symbol("line", RED, 0.5)})
-    return shoreline_layer("waterline", lines, style)
+    return Layer("waterline", "LineString", geometries, values, style)
 
 
 def _sections(sections: Sequence[Mapping[str, float]]) -> Layer:

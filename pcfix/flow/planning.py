@@ -15,22 +15,8 @@ import numpy as np
 from pcfix.errors import PcfixWarning, SettingError, coded
 from pcfix.flow.check_depths import fit_check_depths
 from pcfix.flow.correction import Plan, batch_of, transferred
-from pcfix.flow.inputs import (
-    CameraInputs,
-    Inputs,
-    labelling_of,
-    original_ties,
-    paths_in,
-    read_blocks,
-)
-from pcfix.flow.surfaces import (
-    CloudView,
-    Points,
-    check_shoreline,
-    own_water_of,
-    parts_of,
-    sample_of,
-)
+from pcfix.flow.inputs import CameraInputs, Inputs, labelling_of, original_ties, read_blocks
+from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
 from pcfix.io.las.source import CHUNK_POINTS
 from pcfix.io.views import ViewMatch
 from pcfix.label.labelling import Labelling
@@ -82,9 +68,6 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
             match, None if listed is None else listed.kind, input_notes=cameras.notes,
             notes=tuple(notes),
         )  # fmt: skip
-    if options.shoreline is not None:
-        reads = paths_in(options)
-        check_shoreline(options.shoreline, overwrite=options.overwrite, inputs=reads)
     found = inputs.surface(view)
     if match is None and not isinstance(options.cameras, Cameras):
         _check_frames(blocks.cameras, options)
@@ -181,7 +164,11 @@ def plan_correction(plan: Plan) -> Plan:
         notes = coded("regression.fit", (line.words, *line.notes))
         plan = replace(plan, survey=survey, notes=tuple(notes))
     plan = _estimated_from_cloud(plan, chunks)
-    if plan.options.dimensions == "all" and plan.regression is None and len(plan.cameras):
+    if (
+        plan.options.dimensions == "all"
+        and plan.survey.learned.regression is None
+        and len(plan.cameras)
+    ):
         plan = _with_pose_errors(plan)
     if first is not None and plan.kind is not None:
         plan = _with_type_of_list(plan, first)

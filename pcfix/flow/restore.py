@@ -41,7 +41,7 @@ def restore_file(
     Returns
     -------
     int
-        Number of points written. Points dropped by ``uncorrected="drop"`` are lost.
+        Number of points written.
 
     Raises
     ------

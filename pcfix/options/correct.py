@@ -19,7 +19,6 @@ from pcfix.options.shared import (
     Panel,
     PartOptions,
     PortOptions,
-    ShorelineOption,
     SummaryOption,
     SurveyOptions,
     TileOptions,
@@ -158,8 +157,8 @@ class PointsOptions(RefractionOptions, WaterPerImageOption):
 class ScienceOptions(RefractionOptions, panel=Panel.OUTPUT):
     """All options that affect a corrected file; the file records them."""
 
-    uncorrected: Literal["withhold", "keep", "drop"] = option("withhold", basic=True)
-    """Submerged points with fewer than two usable rays: flag, keep or drop them."""
+    uncorrected: Literal["withhold", "keep"] = option("withhold", basic=True)
+    """Submerged points with fewer than two usable rays: flag them as withheld, or keep them."""
     dimensions: Dimensions = option("all")
     """Extra dimensions to write; 'pcfix restore' needs all."""
 
@@ -178,7 +177,7 @@ class RasterOutputs(OptionSet, panel=Panel.OUTPUT):
 
 
 class CorrectOptions(
-    RasterOutputs, PartOptions, ShorelineOption, TileOptions, SummaryOption, ScienceOptions,
+    RasterOutputs, PartOptions, TileOptions, SummaryOption, ScienceOptions,
     WaterPerImageOption, MaskOption, LandRules, InputOptions, panel=Panel.OUTPUT,
 ):  # fmt: skip
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
@@ -262,8 +261,6 @@ class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions, panel=Pane
     """LAS or LAZ cloud under the water surface."""
     plot: File | None = option(None, writes=True, basic=True)
     """PNG of points and residuals, or of the evidence for auto."""
-    shoreline: File | None = option(None, writes=True, basic=True, needs="cloud")
-    """GeoPackage (.gpkg) for the shoreline of the cloud, with its standard error."""
 
 
 class RunOptions(

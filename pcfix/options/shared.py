@@ -225,10 +225,3 @@ class SummaryOption(OptionSet, panel=Panel.OUTPUT):
 
     summary: File | None = option(None, writes=True, basic=True)
     """JSON file for the summary."""
-
-
-class ShorelineOption(OptionSet, panel=Panel.OUTPUT):
-    """The shoreline of the cloud as a file."""
-
-    shoreline: File | None = option(None, writes=True, basic=True, needs="water")
-    """GeoPackage (.gpkg) for the shoreline of the cloud, with its standard error."""

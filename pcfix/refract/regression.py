@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from pcfix.errors import GeometryError
 from pcfix.label.labelling import Part
 from pcfix.model import NOISE_CLASSES, FloatArray, IntArray
-from pcfix.sums import MOST, Sums
 from pcfix.water.fit import NearestPoints
 from pcfix.water.surface import is_submerged
 
@@ -156,36 +155,6 @@ def notes_of(count: int, slope: float) -> tuple[str, ...]:
             " Check the water level and the check depths."
         )
     return tuple(notes)
-
-
-LEAST_BEYOND = 0.05
-"""Share of the points beyond the fitted depths above which there is a note."""
-
-
-@dataclass(frozen=True)
-class BeyondRange(Sums):
-    """Counts of apparent depths beyond those that a line was fitted to."""
-
-    count: int
-    beyond: int
-    deepest_m: float = field(metadata=MOST)
-
-    @classmethod
-    def of(cls, apparent_m: FloatArray, line: DepthRegression) -> BeyondRange:
-        """Return the counts of submerged points, shape (m,)."""
-        beyond = (apparent_m < line.shallowest_m) | (apparent_m > line.deepest_m)
-        return cls(len(apparent_m), int(beyond.sum()), float(apparent_m.max(initial=0.0)))
-
-    def notes(self, line: DepthRegression) -> list[str]:
-        """Return a sentence on them if their share is above `LEAST_BEYOND`."""
-        if self.beyond <= LEAST_BEYOND * self.count:
-            return []
-        return [
-            f"The regression was fitted to apparent depths of {line.shallowest_m:.2f} to"
-            f" {line.deepest_m:.2f} m and is extrapolated for"
-            f" {100.0 * self.beyond / self.count:.1f} % of the submerged points (down to"
-            f" {self.deepest_m:.2f} m), where SigmaZ grows."
-        ]
 
 
 NEIGHBOURS = 16

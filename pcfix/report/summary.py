@@ -32,7 +32,7 @@ class Summary(Figures):
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON; optional parts only if there are any."""
-        optional = ("labelling", "transfer", "poses", "shoreline", "fit", "part")
+        optional = ("labelling", "transfer", "poses", "fit", "part")
         values = {
             name: value for name, value in vars(self).items()
             if name != "notes" and not (name in optional and value is None)

@@ -63,7 +63,6 @@ OF_RIVER = {
     ),
     "keep": "--max-angle 1 --uncorrected keep",
     "withhold": "--max-angle 4 --uncorrected withhold",
-    "drop": "--max-angle 4 --uncorrected drop",
     "mask": "--water-mask {inputs}/mask.geojson",
     "mask-wkt": "--water-mask {inputs}/mask.wkt",
     "quiet": "--quiet",
@@ -318,7 +317,7 @@ def table() -> dict[str, str]:
     views = "--views {inputs}/free.vis --method consistent"
     add("carried", carried, {"snell": "", "views": views})
     tiles = "--cameras {samples}/scene/cameras.csv --water 0.37 --summary summary.json"
-    commands["tiles.correct"] = f"correct {{inputs}}/tiles out {tiles} --shoreline shore.gpkg"
+    commands["tiles.correct"] = f"correct {{inputs}}/tiles out {tiles}"
     commands["tiles.clean"] = "clean {tiles.correct/out} out --summary summary.json"
     commands["tiles.dsm"] = "dsm {tiles.correct/out} out.tif --resolution 2 --what depth"
     commands["tiles.restore"] = "restore {tiles.correct/out} out"

@@ -87,17 +87,6 @@ def test_arrays_refused():
         pcfix.correct_points(xyz, None, WATER_M, method="factor", level_offset_m=[0.1])
 
 
-def test_beyond_the_depths(folder):
-    """The line is extrapolated below the deepest check depth, and a note says so."""
-    lines = (folder / "checks.csv").read_text().splitlines()
-    depths = [float(line.split(",")[2]) for line in lines[1:]]
-    shallow = [x for x, d in zip(lines[1:], depths, strict=True) if d < np.median(depths)]
-    (folder / "checks.csv").write_text("\n".join([lines[0], *shallow]) + "\n")
-    found = pcfix.correct_file(folder / "cloud.las", folder / "out.las", **NONE, **fitted(folder))
-    assert sum("extrapolated" in note for note in found.notes) == 1
-    assert not found.why_no_order
-
-
 def test_cleaning(folder):
     pcfix.correct_file(folder / "cloud.las", folder / "out.las", **NONE, method="factor")
     found = pcfix.clean_file(folder / "out.las", folder / "clean.las")

@@ -122,24 +122,18 @@ def test_label(cloud):
 
 
 def test_report(cloud, tmp_path):
-    """The metadata and the summary are those of a file; so is the shoreline."""
+    """The metadata and the summary are those of a file."""
     path, ins, metadata = cloud
-    pyogrio = pytest.importorskip("pyogrio")
     options = {"cameras": str(tmp_path / "cameras.csv"), "water": str(WATER_M), "max_angle": 80.0}
-    names = {"summary": str(tmp_path / "s.json"), "shoreline": str(tmp_path / "stage.gpkg")}
-    _, report = run("correct", ins, metadata, **options, **names)
+    _, report = run("correct", ins, metadata, **options, summary=str(tmp_path / "s.json"))
     found = {node["name"]: node["value"] for node in report["children"]}
-    lines = {"shoreline": tmp_path / "file.gpkg"}
-    summary = pcfix.correct_file(path, tmp_path / "out.las", **options, **lines)
+    summary = pcfix.correct_file(path, tmp_path / "out.las", **options)
     for name in ("points", "submerged", "corrected", "rays", "cameras_used", "water"):
         assert found[name] == getattr(summary, name), name
     assert json.loads(found["shift_z_m"]) == summary.shift_z_m
     written = json.loads((tmp_path / "s.json").read_text())
     assert set(written) == set(summary.as_dict())
     assert written["depth_m"] == summary.depth_m
-    stage, file = (pyogrio.raw.read(tmp_path / f"{door}.gpkg") for door in ("stage", "file"))
-    assert list(stage[2]) == list(file[2])
-    assert json.loads(found["shoreline"])["lines"] == len(stage[2])
 
 
 GOOD = {"cameras": "cameras.csv", "water": WATER_M, "max_angle": 80.0}
@@ -153,7 +147,6 @@ MISTAKES = [
     ({**GOOD, "jobs": 2.5}, "option.type"),
     ("cameras.csv", "option.type"),
     ({**GOOD, "max-angle": 30, "max_angle": 30}, "option.twice"),
-    ({**GOOD, "uncorrected": "drop"}, "option.not_in_pdal"),
     ({**GOOD, "water": "dim:w_surf"}, "cloud.dimension_missing"),
     ({**GOOD, "water": "wet"}, "water.spec"),
     ({**GOOD, "index": 1.6}, None),
