@@ -188,8 +188,7 @@ def cameras(path: Path, /, *, options: CamerasCheckOptions) -> None:
 
 
 @command(
-    "pcfix water shore.csv --cloud cloud.laz --plot water.png",
-    spec="Water surface, as --water of 'pcfix correct'.",
+    "pcfix water shore.csv --cloud cloud.laz", spec="Water surface, as --water of 'pcfix correct'."
 )
 def water(spec: str, /, *, options: WaterCheckOptions) -> None:
     """Read, fit or detect a water surface, with its standard error."""

@@ -56,6 +56,7 @@ from pcfix.refract.regression import DepthRegression
 from pcfix.refract.tally import Tally
 from pcfix.report.summary import Summary
 from pcfix.version import __version__
+from pcfix.water.auto import WaterProposal
 from pcfix.water.checks import as_surface, check_submerged, checked_points, refuse_under_water
 from pcfix.water.index import with_index
 from pcfix.water.surface import FoundSurface
@@ -268,12 +269,10 @@ def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
 
 def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> Plausible:
     """Test cameras, cloud and water against each other; warn of what does not fit."""
-    sample, given = tally.sample or CloudSample(), plan.inputs.cameras
-    sought = (plan.found.as_dict() or {}).get("model") == "auto"
-    tested = plausible(
-        plan.cameras, sample.xyz, ties, () if sought else sample.level_doubts(),
-        file="" if isinstance(given, Cameras) else given or "", listed=plan.kind is not None,
-    )  # fmt: skip
+    sample, sought = tally.sample or CloudSample(), isinstance(plan.found, WaterProposal)
+    doubts = () if sought else sample.level_doubts()
+    listed = plan.kind is not None
+    tested = plausible(plan.cameras, sample.rows[:, :3], ties, doubts, listed=listed)
     for warning in tested.doubts:
         warnings.warn(warning, stacklevel=3)
     return tested

@@ -259,8 +259,6 @@ class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions, panel=Pane
 
     cloud: File | None = option(None, basic=True)
     """LAS or LAZ cloud under the water surface."""
-    plot: File | None = option(None, writes=True, basic=True)
-    """PNG of points and residuals, or of the evidence for auto."""
 
 
 class RunOptions(
