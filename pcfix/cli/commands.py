@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -214,18 +213,6 @@ def simulate(out_dir: Path, /, *, options: SimulateOptions, quiet: bool) -> None
         scene = pcfix.simulate_scene(options=options, progress=progress)
         write_scene(scene, out_dir, overwrite=options.overwrite)
     say(f"{out_dir}: {scene.description}", quiet)
-
-
-@command(
-    "pcfix pipeline cloud.laz corrected.laz --cameras cameras.csv --water 0.37",
-    input="LAS or LAZ cloud.",
-    output="LAS or LAZ to write.",
-)
-def pipeline(input: Path, output: Path, /, *, options: CorrectOptions) -> None:
-    """Print the PDAL pipeline equivalent to 'pcfix correct', as JSON."""
-    from pcfix.flow.pipeline import pipeline_for
-
-    say(json.dumps(pipeline_for(input, output, options), indent=2))
 
 
 @command("pcfix plan --height 60 --overlap 0.8 --sidelap 0.7 --depth 1,2,5")

@@ -261,7 +261,7 @@ API += """
         for word in inspect.signature(thing).parameters.values():
             print("   ", word.replace(annotation=word.empty), word.kind.name)
 """
-NAMES = "run correct adjust label clean dsm compare cameras water pipeline restore simulate demo"
+NAMES = "run correct adjust label clean dsm compare cameras water restore simulate demo"
 
 
 def table() -> dict[str, str]:
@@ -331,8 +331,6 @@ def table() -> dict[str, str]:
     shown = "--reference {samples}/scene/lidar.laz --cameras {samples}/scene/cameras.csv"
     commands["view"] = f"view {{scene.snell/out.laz}} {shown} --water 0.37 --image out.png"
     commands["qgis-plugin"] = "qgis-plugin out.zip"
-    add("pipeline", f"pipeline {SCENE}", {"scene": "", "more": "--max-angle 40 --connected"})
-    commands["pipeline.river"] = IN_RIVER.replace("correct ", "pipeline ", 1)
     flight = "--block oblique --detection 0.9 --position-noise-m 0.03"
     kinds = {"tracks": "", "river": "--bed river", "oblique": flight}
     kinds["waves"] = "--wave-slope-deg 1 --tilt-percent 0.2 --bed steps --seed 3 --lidar-per-m2 1"
