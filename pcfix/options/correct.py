@@ -26,7 +26,7 @@ from pcfix.options.shared import (
     WaterOptions,
     WaterPerImageOption,
 )
-from pcfix.options.steps import DistanceOptions, ReferenceOption
+from pcfix.options.steps import DistanceOptions
 
 Dimensions = Literal["all", "minimal", "none"]
 Method = Literal[
@@ -262,11 +262,13 @@ class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions, panel=Pane
 
 
 class RunOptions(
-    BandOption, ReferenceOption, TileOptions, DistanceOptions, SurveyedOptions, RefractionOptions,
-    MaskOption, LandRules, SurveyOptions, panel=Panel.OUTPUT,
+    BandOption, TileOptions, DistanceOptions, SurveyedOptions, RefractionOptions, MaskOption,
+    LandRules, SurveyOptions, panel=Panel.OUTPUT,
 ):  # fmt: skip
     """The options of ``pcfix run``; ``run.json`` records all that affect its results."""
 
+    reference: File | None = option(None, basic=True)
+    """LiDAR cloud, CSV check points or GeoTIFF to compare with."""
     resolution: float | None = option(None, basic=True, above=0)
     """Cell size of the rasters. [m] [default: 2 to 4 points a cell]"""
     project: str | None = option(None, basic=True)
