@@ -171,10 +171,6 @@ def _options(namespace: dict[str, Any], kind: type[Set]) -> Set:
     if not isinstance(given, dict):
         sentence = f"pdalargs: must be an object of options, not {given!r}."
         raise SettingError("option.type", sentence, value=given)
-    twice = next((name for name in given if "-" in name and name.replace("-", "_") in given), None)
-    if twice is not None:
-        sentence = f"pdalargs: {twice} is given twice, with dashes and underscores."
-        raise SettingError("option.twice", sentence, option=twice)
     given = {name.replace("-", "_"): value for name, value in given.items()}
     # readers choose points, and writers make rasters
     files = (*options_of(PartOptions), *options_of(RasterOutputs))

@@ -285,7 +285,6 @@ def correct_points(
     *,
     options: RefractionOptions | None = None,
     views: Views | None = None,
-    may_be_submerged: npt.ArrayLike | None = None,
     level_offset_m: npt.ArrayLike | None = None,
     adjusted_from: Cameras | None = None,
     regression: DepthRegression | None = None,
@@ -303,7 +302,7 @@ def correct_points(
         none.
     water : WaterSurface, float, or array of shape (n,)
         The water surface (see `pcfix.read_water`), its level in metres, or its height above
-        each point, NaN where it is unknown.
+        each point, NaN for land (`pcfix.label_points` finds it) and where it is unknown.
     options : RefractionOptions, optional
         Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
         from the surface normal), camera_set, matcher, depth_factor, sigma_image and the other
@@ -312,9 +311,6 @@ def correct_points(
     views : Views, optional
         The view list: the images that contributed to each point, as rows of `adjusted_from` if it
         is given, else of `cameras`. Default: as the option `camera_set` says.
-    may_be_submerged : array of bool, shape (n,), optional
-        The other points are land, even below the surface; `pcfix.label_points` finds them.
-        Default: all.
     level_offset_m : array, shape (k,), optional
         Height of the water above `water` when each image was taken; see
         `pcfix.io.tides.level_offsets`. Each ray is refracted at its own surface; `water` decides
@@ -372,14 +368,7 @@ def correct_points(
     original = cameras if adjusted_from is None else adjusted_from
     if views is not None:
         _check_views(views, xyz, original)
-    classes = np.zeros(len(xyz), np.uint8)
-    if may_be_submerged is not None:
-        allowed = np.asarray(may_be_submerged)
-        if allowed.shape != classes.shape or allowed.dtype != np.bool_:
-            sentence = f"may_be_submerged must be {len(xyz)} booleans, not {allowed.dtype}."
-            raise SettingError("array.shape", sentence, shape=allowed.shape)
-        classes[~allowed] = NOT_SUBMERGED
-    points = Points(xyz, heights, classes, views=views)
+    points = Points(xyz, heights, np.zeros(len(xyz), np.uint8), views=views)
     view = CloudView(
         "xyz", None, *corners(*xyz[:, :2].T), len(xyz), lambda water=None: iter([points])
     )
@@ -392,7 +381,7 @@ def correct_points(
         FoundSurface(surface),
         offset,
         views,
-        Labelling(LabelRules(respect_classes=(NOT_SUBMERGED,))),
+        Labelling(LabelRules()),
         regression,
     )
     plan = plan_correction(plan)
@@ -403,10 +392,6 @@ def correct_points(
     for note in plan.input_notes:
         warnings.warn(note, stacklevel=2)
     return correction
-
-
-NOT_SUBMERGED = 255
-"""The class of points that may not be submerged, for the rules of a labelling."""
 
 
 def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:

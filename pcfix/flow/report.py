@@ -65,7 +65,7 @@ def report_run(
     options, summary = run.options, Summary(**corrected)
     rasters = [SURFACE, DEPTH, *([] if summary.uncertainty is None else [UNCERTAINTY])]
     rasters += [DIFFERENCE] if compared and run.has_surface else []
-    with open_cloud(run.cleaned) as source:
+    with open_cloud(run.cloud("cleaned")) as source:
         maps = read_maps(run.folder, rasters, *crs_words(stated_crs(source)))
     if compared:
         figures = evaluation(

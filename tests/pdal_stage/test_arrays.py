@@ -146,7 +146,6 @@ MISTAKES = [
     ({**GOOD, "cameras": ["a"]}, "option.type"),
     ({**GOOD, "jobs": 2.5}, "option.type"),
     ("cameras.csv", "option.type"),
-    ({**GOOD, "max-angle": 30, "max_angle": 30}, "option.twice"),
     ({**GOOD, "water": "dim:w_surf"}, "cloud.dimension_missing"),
     ({**GOOD, "water": "wet"}, "water.spec"),
     ({**GOOD, "index": 1.6}, None),
