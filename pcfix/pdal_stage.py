@@ -113,7 +113,7 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
         plan = plan_correction(plan)
         for rows, points in _chunks(cloud, plan.found.surface):
             correction, one = correct_chunk(plan, points, rows.start)
-            results.add(rows, correction, options.uncorrected == "withhold")
+            results.add(rows, correction)
             tally = one if tally is None else tally + one
     summary = finish(plan, task, tally)
     outs.update(results.dimensions)

@@ -114,7 +114,6 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
         written = (*columns.COLUMNS, columns.OUTCOME)
     steps = centring_steps(source.header)
     header = output_header(source, "settings", plan.provenance(), written, steps)
-    uncorrected = plan.options.uncorrected
 
     def compute(points: Chunk, row: int) -> tuple[Correction, CloudTally]:
         return correct_chunk(plan, points_of(points, source, plan.found.surface), row)
@@ -126,9 +125,7 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
         # whole steps of the file's own scale, so that 'pcfix restore' gets back every bit
         classes = np.array(new["classification"])
         withheld = np.asarray(new["withheld"]).astype(bool)
-        changes = columns.changes_of(
-            written, correction, classes, withheld, new.scales, withhold=uncorrected == "withhold"
-        )
+        changes = columns.changes_of(written, correction, classes, withheld, new.scales)
         columns.move(new, changes.steps + np.array(steps), source.path)
         columns.fill(new, changes)
         new.array["classification"][correction.corrected] = BATHYMETRIC_POINT

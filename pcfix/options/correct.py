@@ -157,8 +157,6 @@ class PointsOptions(RefractionOptions, WaterPerImageOption):
 class ScienceOptions(RefractionOptions, panel=Panel.OUTPUT):
     """All options that affect a corrected file; the file records them."""
 
-    uncorrected: Literal["withhold", "keep"] = option("withhold", basic=True)
-    """Submerged points with fewer than two usable rays: flag them as withheld, or keep them."""
     dimensions: Dimensions = option("all")
     """Extra dimensions to write; 'pcfix restore' needs all."""
 

@@ -61,8 +61,7 @@ OF_RIVER = {
         "--sigma-image 1 --sigma-level 0.05 --sigma-tilt 0.1 --sigma-index 0.005 --sigma-waves 1"
         " --sigma-centre 0.03 --sigma-attitude 0.01"
     ),
-    "keep": "--max-angle 1 --uncorrected keep",
-    "withhold": "--max-angle 4 --uncorrected withhold",
+    "withhold": "--max-angle 4",
     "mask": "--water-mask {inputs}/mask.geojson",
     "mask-wkt": "--water-mask {inputs}/mask.wkt",
     "quiet": "--quiet",
@@ -354,7 +353,7 @@ def pdal_table() -> dict[str, str]:
     more = {
         "options": {"max_angle": 30, "connected": True, "summary": "summary.json", "jobs": 1},
         "consistent": {"method": "consistent", "camera_set": "all", "dimensions": "minimal"},
-        "keep": {"uncorrected": "keep", "index": "sea", "sigma_waves": 1},
+        "sea": {"index": "sea", "sigma_waves": 1},
         "wrong": {"method": "magic"},
         "unknown": {"kamera": 1},
     }
