@@ -243,7 +243,6 @@ BAD = {
     "reference": "compare {samples}/scene/cloud.laz nowhere.las",
     "other-reference": "compare {samples}/scene/cloud.laz {shared}/river/points.las",
     "run-nothing": "run",
-    "run-config": "run out --config nowhere.json",
     "no-ties": "adjust {samples}/scene/cameras.csv out --water 0.37",
     "adjust-words": f"adjust {FREE}/sparse out --water 0.37 --free nonsense",
     "no-command": "corect",
