@@ -1,4 +1,4 @@
-"""The functions of PDAL's ``filters.python``: correct, label, clean and compare.
+"""The functions of PDAL's ``filters.python``: correct, label and clean.
 
 A pipeline imports one of them. PDAL passes options, metadata and the report through the globals of
 the source of the stage::
@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 import numpy as np
 
 from pcfix.errors import PcfixError, SettingError, show_warning
-from pcfix.io.pdal import NAME, OUTCOME, Dimensions, PdalCloud, Results, metadata_of
+from pcfix.io.pdal import NAME, Dimensions, PdalCloud, Results, metadata_of
 from pcfix.model import LOW_NOISE, WaterDimension, WaterSurface
 from pcfix.options.correct import RasterOutputs
 from pcfix.options.declare import OptionSet, named, options_of
@@ -50,7 +50,7 @@ COLOURS = ("Red", "Green", "Blue")
 
 def __getattr__(name: str) -> Stage:
     """Return the stage of this name, bound to the globals of the module that imports it."""
-    work = {"correct": _correct, "label": _label, "clean": _clean, "compare": _compare}.get(name)
+    work = {"correct": _correct, "label": _label, "clean": _clean}.get(name)
     if work is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     namespace = sys._getframe(1).f_globals
@@ -104,14 +104,8 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
 
     task = FileTask(NAME, Path(NAME))
     options = _options(namespace, CorrectOptions)
-    if options.uncorrected == "drop":
-        sentence = (
-            f"uncorrected 'drop' is not for PDAL. Use withhold, add \"{OUTCOME}=uint8\" to"
-            f' add_dimension, and let filters.range keep "{OUTCOME}[0:1]".'
-        )
-        raise SettingError("option.not_in_pdal", sentence, option="uncorrected")
     cloud = PdalCloud(ins, namespace.get("metadata"))
-    results = Results(cloud, columns_for(options.dimensions, options.unsure))
+    results = Results(cloud, columns_for(options.dimensions))
     plan = read_inputs(options, _view(cloud))
     check_summary(options, paths_in(options))
     tally: Any = None
@@ -119,7 +113,7 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
         plan = plan_correction(plan)
         for rows, points in _chunks(cloud, plan.found.surface):
             correction, one = correct_chunk(plan, points, rows.start)
-            results.add(rows, correction, options.uncorrected == "withhold")
+            results.add(rows, correction)
             tally = one if tally is None else tally + one
     summary = finish(plan, task, tally)
     outs.update(results.dimensions)
@@ -171,27 +165,12 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     namespace["out_metadata"] = metadata_of(summary, unpacked=cloud.unpacked and not options.drop)
 
 
-def _compare(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
-    """Compare the cloud, and pass all points on unchanged."""
-    from pcfix.flow.compare import compare_clouds
-    from pcfix.options.steps import StageCompareOptions
-
-    options = _options(namespace, StageCompareOptions)
-    cloud = PdalCloud(ins, namespace.get("metadata"))
-    found = compare_clouds(_view(cloud), options.reference or "", options=options)
-    namespace["out_metadata"] = metadata_of(found.as_dict())
-
-
 def _options(namespace: dict[str, Any], kind: type[Set]) -> Set:
     """Return the options of the stage, checked."""
     given = namespace.get("pdalargs") or {}
     if not isinstance(given, dict):
         sentence = f"pdalargs: must be an object of options, not {given!r}."
         raise SettingError("option.type", sentence, value=given)
-    twice = next((name for name in given if "-" in name and name.replace("-", "_") in given), None)
-    if twice is not None:
-        sentence = f"pdalargs: {twice} is given twice, with dashes and underscores."
-        raise SettingError("option.twice", sentence, option=twice)
     given = {name.replace("-", "_"): value for name, value in given.items()}
     # readers choose points, and writers make rasters
     files = (*options_of(PartOptions), *options_of(RasterOutputs))

@@ -34,9 +34,8 @@ def test_declared(kind):
         ({"max_angel": 30}, "option.unknown", {"near": "max_angle"}),
         ({"max_angle": 95}, "option.range", {"option": "max_angle", "value": 95, "most": 90}),
         ({"max_angle": "wide"}, "option.type", {"option": "max_angle", "value": "wide"}),
-        ({"max_cameras": 2.5}, "option.type", {"option": "max_cameras"}),
-        ({"max_cameras": 1}, "option.range", {"option": "max_cameras"}),
-        ({"max_cameras": "two"}, "option.type", {"option": "max_cameras"}),
+        ({"jobs": 2.5}, "option.type", {"option": "jobs"}),
+        ({"jobs": "two"}, "option.type", {"option": "jobs"}),
         ({"method": "snel"}, "option.choice", {"option": "method", "value": "snel"}),
         ({"index": 1.7}, "option.range", {"option": "index"}),
         ({"sigma_image": float("nan")}, "option.range", {"option": "sigma_image"}),
@@ -92,19 +91,3 @@ def test_part():
     given = with_index(CorrectOptions(salinity=10.0))
     part = given.part(ScienceOptions)
     assert (part.index, part.index_from) == (given.index, "10 PSU, 15 C, 0.53 um")
-
-
-@pytest.mark.parametrize(
-    ("options", "plain"),
-    [
-        (
-            {"cameras_offset": (319900.125, 4650123.4567, 0.0), "respect_classes": (2, 5)},
-            {"cameras_offset": "319900.125,4650123.4567,0", "respect_classes": "2,5"},
-        ),
-        ({"max_angle": None}, {"max_angle": "none"}),
-    ],
-)
-def test_stage(options, plain):
-    given = CorrectOptions(**options)
-    assert given.plain() == plain
-    assert CorrectOptions(**plain) == given

@@ -9,7 +9,6 @@ from __future__ import annotations
 import warnings
 from dataclasses import fields, replace
 from itertools import compress
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -23,13 +22,12 @@ from pcfix.flow.planning import plan_correction, plan_of, read_inputs
 from pcfix.flow.plausibility import CloudSample, Plausible, plausible
 from pcfix.flow.raster import command_for
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress
-from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of, write_shoreline
+from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource, centring_steps, part_report
 from pcfix.io.las.writing import output_header
 from pcfix.io.raster_cloud import is_raster
-from pcfix.io.saved import write_regression
 from pcfix.io.tiles import Clouds
 from pcfix.io.views import ViewReport, beside
 from pcfix.label.labelling import Labelling
@@ -54,10 +52,11 @@ from pcfix.options.correct import (
     ScienceOptions,
 )
 from pcfix.options.declare import File, taken
-from pcfix.refract.regression import LEAST_BEYOND, DepthRegression
+from pcfix.refract.regression import DepthRegression
 from pcfix.refract.tally import Tally
 from pcfix.report.summary import Summary
 from pcfix.version import __version__
+from pcfix.water.auto import WaterProposal
 from pcfix.water.checks import as_surface, check_submerged, checked_points, refuse_under_water
 from pcfix.water.index import with_index
 from pcfix.water.surface import FoundSurface
@@ -110,12 +109,11 @@ def correct_file(
 
 def _correcting(plan: Plan, source: LasSource) -> FileWork:
     """Return the correction of one file: its header, and each chunk."""
-    written = columns.columns_for(plan.options.dimensions, plan.options.unsure)
+    written = columns.columns_for(plan.options.dimensions)
     if is_raster(source.path):
-        written = (*columns.columns_for("all", plan.options.unsure), columns.OUTCOME)
+        written = (*columns.COLUMNS, columns.OUTCOME)
     steps = centring_steps(source.header)
     header = output_header(source, "settings", plan.provenance(), written, steps)
-    uncorrected = plan.options.uncorrected
 
     def compute(points: Chunk, row: int) -> tuple[Correction, CloudTally]:
         return correct_chunk(plan, points_of(points, source, plan.found.surface), row)
@@ -127,14 +125,12 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
         # whole steps of the file's own scale, so that 'pcfix restore' gets back every bit
         classes = np.array(new["classification"])
         withheld = np.asarray(new["withheld"]).astype(bool)
-        changes = columns.changes_of(
-            written, correction, classes, withheld, new.scales, withhold=uncorrected == "withhold"
-        )
+        changes = columns.changes_of(written, correction, classes, withheld, new.scales)
         columns.move(new, changes.steps + np.array(steps), source.path)
         columns.fill(new, changes)
         new.array["classification"][correction.corrected] = BATHYMETRIC_POINT
         new["withheld"][:] = (withheld | changes.flagged).astype(np.uint8)
-        return new[~correction.uncorrected] if uncorrected == "drop" else new
+        return new
 
     return FileWork(header, compute, apply)
 
@@ -142,7 +138,7 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
 def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     """Refuse a result in which cloud, water and cameras do not fit, else summarize it.
 
-    Warns of what is uncertain, and writes the shoreline and the line of a regression if asked.
+    Warns of what is uncertain.
     """
     options, figures, transfer = plan.options, tally.figures, plan.transfer
     report = None
@@ -150,16 +146,11 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         report = replace(tally.views, notes=plan.match.notes)
     water_notes = _check_counts(plan, tally, report)
     counts, uncertainty = figures.as_dict(), figures.uncertainty(plan.reconstruction)
-    tested, poses, absorbed, shoreline = None, None, None, None
+    tested, poses, absorbed = None, None, None
     if plan.inputs.port is None:
         ties = quick_ties(plan.inputs, plan.view.crs) if len(plan.cameras) else None
         tested = check_fit(plan, tally, ties)
         poses, absorbed = diagnose_in_passing(plan, ties)
-        if tally.shore is not None and options.shoreline is not None:
-            shoreline = write_shoreline(
-                options.shoreline, tally.shore, plan.found, plan.view.crs,
-                overwrite=options.overwrite, sigma_level_m=options.sigma_level,
-            )  # fmt: skip
         water, moved = str(plan.found.surface), plan.survey.level_offset_m
         if moved is not None:
             times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
@@ -170,23 +161,14 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     else:  # no depths, and no orders by depth
         counts["depth_m"], uncertainty = {}, None
         water = f"all around, seen through a {plan.inputs.port}"
-    path, line = options.save_regression, plan.regression
-    if path is not None and line is not None:
-        write_regression(path, line, overwrite=options.overwrite)
-    if options.unsure != "withhold":
-        counts["unsure"] = None
     unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
-    not_moved = sum(counts["uncorrected"].values()) + int(figures.outcomes[Outcome.NOT_TRANSFERRED])
-    reconstruction, detected = plan.reconstruction, [*plan.notes]
-    if tally.beyond is not None and line is not None:
-        least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
-        detected += coded("regression.range", tally.beyond.notes(line, least))
+    reconstruction = plan.reconstruction
     notes = [
         *plan.input_notes,
         *([] if report is None else report.warnings()),
         *coded("cloud.labels", plan.labelling.notes),
         *(() if tested is None else tested.doubts),
-        *detected,
+        *plan.notes,
         *coded("water.extent", water_notes),
         *([] if absorbed is None else [absorbed]),
     ]
@@ -195,7 +177,6 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         output=str(task.target),
         pcfix=__version__,
         **counts,
-        dropped=not_moved if options.uncorrected == "drop" else 0,
         cameras=len(plan.cameras),
         cameras_used=len(plan.cameras) - len(unused),
         cameras_unused=unused,  # labels of those without corrected points
@@ -213,11 +194,10 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         # other notes on the cloud, also in `warnings`
         notes=[
             one
-            for one in map(str, detected)
+            for one in map(str, plan.notes)
             if reconstruction is None or one not in reconstruction["because"]
         ],
         poses=poses,  # whether they have absorbed the refraction
-        shoreline=shoreline,
         fit=None if tested is None else tested.as_dict(),
     )
 
@@ -286,13 +266,10 @@ def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
 
 def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> Plausible:
     """Test cameras, cloud and water against each other; warn of what does not fit."""
-    sample, given = tally.sample or CloudSample(), plan.inputs.cameras
-    sought = (plan.found.as_dict() or {}).get("model") == "auto"
-    tested = plausible(
-        plan.cameras, sample.xyz, ties, () if sought else sample.level_doubts(),
-        file="" if isinstance(given, Cameras) else given or "", water_m=sample.water_m,
-        listed=plan.kind is not None, every=sample.every,
-    )  # fmt: skip
+    sample, sought = tally.sample or CloudSample(), isinstance(plan.found, WaterProposal)
+    doubts = () if sought else sample.level_doubts()
+    listed = plan.kind is not None
+    tested = plausible(plan.cameras, sample.rows[:, :3], ties, doubts, listed=listed)
     for warning in tested.doubts:
         warnings.warn(warning, stacklevel=3)
     return tested
@@ -305,10 +282,9 @@ def correct_points(
     *,
     options: RefractionOptions | None = None,
     views: Views | None = None,
-    may_be_submerged: npt.ArrayLike | None = None,
     level_offset_m: npt.ArrayLike | None = None,
     adjusted_from: Cameras | None = None,
-    regression: DepthRegression | File | None = None,
+    regression: DepthRegression | None = None,
     **keywords: Any,
 ) -> Correction:
     """Correct apparent points for refraction at the water surface.
@@ -323,18 +299,15 @@ def correct_points(
         none.
     water : WaterSurface, float, or array of shape (n,)
         The water surface (see `pcfix.read_water`), its level in metres, or its height above
-        each point, NaN where it is unknown.
+        each point, NaN for land (`pcfix.label_points` finds it) and where it is unknown.
     options : RefractionOptions, optional
         Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
-        from the surface normal), max_cameras, camera_set, matcher, depth_factor, unsure (with
-        ``"withhold"`` the result has a flag), sigma_image and the other standard deviations. With
-        water_per_image, `water` still decides which points are submerged, and how deep.
+        from the surface normal), camera_set, matcher, depth_factor, sigma_image and the other
+        standard deviations. With water_per_image, `water` still decides which points are submerged,
+        and how deep.
     views : Views, optional
         The view list: the images that contributed to each point, as rows of `adjusted_from` if it
         is given, else of `cameras`. Default: as the option `camera_set` says.
-    may_be_submerged : array of bool, shape (n,), optional
-        The other points are land, even below the surface; `pcfix.label_points` finds them.
-        Default: all.
     level_offset_m : array, shape (k,), optional
         Height of the water above `water` when each image was taken; see
         `pcfix.io.tides.level_offsets`. Each ray is refracted at its own surface; `water` decides
@@ -343,8 +316,8 @@ def correct_points(
         The original cameras, in the same frame, if `cameras` are the same images (matched by their
         labels) after an adjustment. All points are first transferred to the adjusted cameras; see
         `pcfix.adjust.transfer`.
-    regression : DepthRegression or path, optional
-        For the method regression: see `pcfix.refract.regression`, or the file of a line.
+    regression : DepthRegression, optional
+        For the method regression; see `pcfix.refract.regression`.
 
     Returns
     -------
@@ -392,47 +365,30 @@ def correct_points(
     original = cameras if adjusted_from is None else adjusted_from
     if views is not None:
         _check_views(views, xyz, original)
-    classes = np.zeros(len(xyz), np.uint8)
-    if may_be_submerged is not None:
-        allowed = np.asarray(may_be_submerged)
-        if allowed.shape != classes.shape or allowed.dtype != np.bool_:
-            sentence = f"may_be_submerged must be {len(xyz)} booleans, not {allowed.dtype}."
-            raise SettingError("array.shape", sentence, shape=allowed.shape)
-        classes[~allowed] = NOT_SUBMERGED
-    points = Points(xyz, heights, classes, views=views)
+    points = Points(xyz, heights, np.zeros(len(xyz), np.uint8), views=views)
     view = CloudView(
         "xyz", None, *corners(*xyz[:, :2].T), len(xyz), lambda water=None: iter([points])
     )
     transfer = None if adjusted_from is None else transfer_between(adjusted_from, cameras)
-    line, path = regression, None
-    if isinstance(line, str | PathLike):
-        line, path = None, line
     plan = plan_of(
         with_index(all_options),
-        Inputs(cameras=cameras, water=surface, regression=path),
+        Inputs(cameras=cameras, water=surface),
         view,
         CameraInputs(cameras, None, original, transfer),
         FoundSurface(surface),
         offset,
         views,
-        Labelling(LabelRules(respect_classes=(NOT_SUBMERGED,))),
-        line,
+        Labelling(LabelRules()),
+        regression,
     )
     plan = plan_correction(plan)
     correction, tally = correct_chunk(plan, points, 0, covariances=True)
     if tally.water is not None:
         tally.water.check_reach("xyz", surface, deep=given.deep)
     check_fit(plan, tally)
-    line, beyond = plan.regression, list[str]()
-    if line is not None and tally.beyond is not None:
-        beyond = tally.beyond.notes(line)
-    for note in (*plan.input_notes, *coded("regression.range", beyond)):
+    for note in plan.input_notes:
         warnings.warn(note, stacklevel=2)
     return correction
-
-
-NOT_SUBMERGED = 255
-"""The class of points that may not be submerged, for the rules of a labelling."""
 
 
 def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:

@@ -279,13 +279,6 @@ class CompareRules(DistanceOptions, panel=Panel.FIGURES):
         return not self.c2c_only
 
 
-class ReferenceOption(OptionSet, panel=Panel.OUTPUT):
-    """The reference of a cloud."""
-
-    reference: File | None = option(None, basic=True)
-    """LiDAR cloud, CSV check points or GeoTIFF to compare with."""
-
-
 class CompareOptions(BandOption, OverwriteOption, SummaryOption, CompareRules, panel=Panel.OUTPUT):
     """The options of ``pcfix compare``."""
 
@@ -297,12 +290,6 @@ class CompareOptions(BandOption, OverwriteOption, SummaryOption, CompareRules, p
     """A cross-section x1,y1,x2,y2; may be repeated."""
     plot: File | None = option(None, writes=True, basic=True)
     """PNG of the C2C histograms, with Gauss curves."""
-
-
-class StageCompareOptions(ReferenceOption, CompareOptions):
-    """The options of the PDAL stage ``compare``, whose cloud is not a file."""
-
-    reference: File | None = option(None, basic=True, needed="needed")
 
 
 class ViewerOptions(OverwriteOption, CameraFileOptions, WaterOptions, panel=Panel.OUTPUT):

@@ -45,12 +45,6 @@ _PART: RowTable = (
     ("", "at a resolution of {part[read_resolution]:g} m", "part[read_resolution]"),
 )
 _NO_SURFACE = ("No surface", "{water_unknown:,} points have no water surface", "water_unknown")
-_SHORELINE: RowTable = (
-    ("Shoreline", "{shoreline[lines]} lines, {shoreline[length_m]:.1f} m, standard error in plan"
-     " {shoreline[sigma_m]:.2f} m: {shoreline[path]}", "shoreline[lines]"),
-    ("Shoreline", "none: the water does not intersect the cloud; {shoreline[path]} is empty",
-     "!shoreline[lines]"),
-)  # fmt: skip
 _LABELLING: RowTable = (
     ("Mask", "{labelling[outside_mask]:,} points below the surface are outside of it and count as"
      " land", "labelling[water_mask]"),
@@ -66,12 +60,10 @@ _CORRECTED: RowTable = (
      " poses: {transfer[shift_m][rms]:.3f} m rms, at most {transfer[shift_m][max]:.3f} m, mean Z"
      " {transfer[shift_m][mean_z]:+.3f} m", "transfer"),
     ("", "{transfer[not_transferred]:,} not transferred: {transfer[not_transferred_reason]}"
-     " ({fate})", "transfer[not_transferred]"),
+     " (not moved, withheld)", "transfer[not_transferred]"),
     ("Submerged", "{submerged:,} points ({submerged:of points}), {corrected_words}", ""),
-    ("", "{count:,} not corrected: {name} ({fate})", "*uncorrected"),
+    ("", "{count:,} not corrected: {name} (not moved, withheld)", "*uncorrected"),
     _NO_SURFACE,
-    ("Withheld", "{unsure:,} corrected points ({unsure:of corrected}) are visible at large"
-     " incidence angles only", "unsure"),
     ("Raster", "{raster[cells_changed]:,} cells changed, {raster[cells_empty]:,} of them have no"
      " height any more", "raster"),
     ("Depth", "{depth_m[min]:.2f} to {depth_m[max]:.2f} m, mean {depth_m[mean]:.2f} m", "depth_m"),
@@ -86,7 +78,6 @@ _CORRECTED: RowTable = (
     ("", "fitted {water_fit[model]}, standard error {water_fit[sigma_level_m]:.3f} m",
      "water_fit"),
     ("", "accepted {water_fit[accepted]} of {water_fit[points]} points", "water_fit[points]"),
-    *_SHORELINE,
     ("Uncertainty", "{uncertainty[tvu_95_m][mean]:.3f} m at 95 % (predicted)", "uncertainty"),
     ("Uncertainty", "not known: without cameras there are no rays", "no_uncertainty"),
     ("Measured", "{measured[tvu_95_m]:.3f} m at 95 %, at {measured[count]:,} points of the bed",
@@ -306,10 +297,8 @@ def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
             check = "cameras may not match the cloud; see the warnings"
         elif not s.fit["fits"]:
             check = "cameras and cloud could not be tested"
-    fates = {"withhold": "not moved, withheld", "keep": "not moved", "drop": "dropped"}
     corrected = f"{s.corrected:,} corrected ({share(s.corrected, s.submerged)})"
     return filled(_CORRECTED, vars(s) | {
-        "fate": fates[s.settings["uncorrected"]],
         "corrected_words": "all corrected" if s.corrected == s.submerged else corrected,
         "method": method,
         "rays_per_point": s.rays / max(s.corrected, 1),
@@ -321,11 +310,6 @@ def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
         "order": order_sentence(s, measured),
         "check": check,
     })  # fmt: skip
-
-
-def shoreline_rows(found: Plain | None) -> Rows:
-    """Return the length and the standard error of a shoreline, where one was written."""
-    return filled(_SHORELINE, {"shoreline": found})
 
 
 _BUDGET: RowTable = (

@@ -49,10 +49,9 @@ OF_RIVER = {
     **{method.split()[0]: f"--method {method}" for method in METHODS},
     "consistent-all": "--method consistent --camera-set all",
     "max-angle": "--max-angle 35",
-    "max-cameras": "--max-cameras 5 --dimensions minimal",
+    "minimal": "--dimensions minimal",
     "dietrich-35": "--method dietrich --max-angle 35 --index 1.337",
     "factor-given": "--method factor --depth-factor 1.4 --dimensions none",
-    "regression-refused": f"--method regression {DEPTHS} --least-r2 0.9999",
     "mvs": "--camera-set mvs",
     "occlusion": "--occlusion on",
     "no-occlusion": "--occlusion off --jobs 1",
@@ -62,9 +61,7 @@ OF_RIVER = {
         "--sigma-image 1 --sigma-level 0.05 --sigma-tilt 0.1 --sigma-index 0.005 --sigma-waves 1"
         " --sigma-centre 0.03 --sigma-attitude 0.01"
     ),
-    "keep": "--max-angle 1 --uncorrected keep",
-    "withhold": "--max-angle 4 --uncorrected withhold",
-    "drop": "--max-angle 4 --uncorrected drop",
+    "withhold": "--max-angle 4",
     "mask": "--water-mask {inputs}/mask.geojson",
     "mask-wkt": "--water-mask {inputs}/mask.wkt",
     "quiet": "--quiet",
@@ -72,7 +69,7 @@ OF_RIVER = {
 OF_A_TENTH = {
     "consistent": "--method consistent",
     "consistent-pairs": "--method consistent --matcher pairs",
-    "consistent-35": "--method consistent --max-angle 35 --max-cameras 8",
+    "consistent-35": "--method consistent --max-angle 35",
     "snell-pairs": "--camera-set mvs --matcher pairs",
     "offset": "--cameras-offset 1,2,0.5 --sensor {shared}/river/sensor.csv",
     "crs": "--cameras-crs EPSG:27700 --angles yaw-pitch-roll",
@@ -148,15 +145,10 @@ OF_ADJUST = {
     "free-datum": "--datum free --lens {inputs}/lens.csv --sigma-image 0.5",
     "not-told-apart": "--free level,tilt,index",
 }
-OF_OBLIQUES = {
-    "default": "",
-    "views": "--views {inputs}/c.vis",
-    "snell": "--method snell",
-    "withhold": "--unsure withhold --occlusion on",
-}
+OF_OBLIQUES = {"default": "", "views": "--views {inputs}/c.vis", "snell": "--method snell"}
 OF_PHOTOS = {"exact": "--dsm {dsm.block/out.tif}", "paper": "--mapping paper --dsm {inputs}/a.las"}
 OF_PLAN = {
-    "nadir": "--height 60 --depth 1:5:1",
+    "nadir": "--height 60 --depth 1,2,3,4,5",
     "obliques": "--height 40 --obliques 30 --overlap 0.7 --depth 3",
 }
 OF_CLEAN = {
@@ -251,7 +243,6 @@ BAD = {
     "reference": "compare {samples}/scene/cloud.laz nowhere.las",
     "other-reference": "compare {samples}/scene/cloud.laz {shared}/river/points.las",
     "run-nothing": "run",
-    "run-config": "run out --config nowhere.json",
     "no-ties": "adjust {samples}/scene/cameras.csv out --water 0.37",
     "adjust-words": f"adjust {FREE}/sparse out --water 0.37 --free nonsense",
     "no-command": "corect",
@@ -268,7 +259,7 @@ API += """
         for word in inspect.signature(thing).parameters.values():
             print("   ", word.replace(annotation=word.empty), word.kind.name)
 """
-NAMES = "run correct adjust label clean dsm compare cameras water pipeline restore simulate demo"
+NAMES = "run correct adjust label clean dsm compare cameras water restore simulate demo"
 
 
 def table() -> dict[str, str]:
@@ -309,7 +300,7 @@ def table() -> dict[str, str]:
     commands["label.respected"] = f"correct {labelled} --respect-classes 41 --summary summary.json"
     commands["restore"] = "restore {clean.default/out.laz} out.laz"
     commands["restore.river"] = "restore {river.sigmas/out.laz} out.las"
-    commands["restore.minimal"] = "restore {river.max-cameras/out.laz} out.las"
+    commands["restore.minimal"] = "restore {river.minimal/out.laz} out.las"
     for path in CAMERAS:
         name = path.replace("/", "-")
         commands[f"cameras.{name}"] = f"cameras {{shared}}/cameras/{path} --summary summary.json"
@@ -324,7 +315,7 @@ def table() -> dict[str, str]:
     views = "--views {inputs}/free.vis --method consistent"
     add("carried", carried, {"snell": "", "views": views})
     tiles = "--cameras {samples}/scene/cameras.csv --water 0.37 --summary summary.json"
-    commands["tiles.correct"] = f"correct {{inputs}}/tiles out {tiles} --shoreline shore.gpkg"
+    commands["tiles.correct"] = f"correct {{inputs}}/tiles out {tiles}"
     commands["tiles.clean"] = "clean {tiles.correct/out} out --summary summary.json"
     commands["tiles.dsm"] = "dsm {tiles.correct/out} out.tif --resolution 2 --what depth"
     commands["tiles.restore"] = "restore {tiles.correct/out} out"
@@ -338,8 +329,6 @@ def table() -> dict[str, str]:
     shown = "--reference {samples}/scene/lidar.laz --cameras {samples}/scene/cameras.csv"
     commands["view"] = f"view {{scene.snell/out.laz}} {shown} --water 0.37 --image out.png"
     commands["qgis-plugin"] = "qgis-plugin out.zip"
-    add("pipeline", f"pipeline {SCENE}", {"scene": "", "more": "--max-angle 40 --connected"})
-    commands["pipeline.river"] = IN_RIVER.replace("correct ", "pipeline ", 1)
     flight = "--block oblique --detection 0.9 --position-noise-m 0.03"
     kinds = {"tracks": "", "river": "--bed river", "oblique": flight}
     kinds["waves"] = "--wave-slope-deg 1 --tilt-percent 0.2 --bed steps --seed 3 --lidar-per-m2 1"
@@ -363,7 +352,7 @@ def pdal_table() -> dict[str, str]:
     more = {
         "options": {"max_angle": 30, "connected": True, "summary": "summary.json", "jobs": 1},
         "consistent": {"method": "consistent", "camera_set": "all", "dimensions": "minimal"},
-        "keep": {"max_cameras": 4, "uncorrected": "keep", "index": "sea", "sigma_waves": 1},
+        "sea": {"index": "sea", "sigma_waves": 1},
         "wrong": {"method": "magic"},
         "unknown": {"kamera": 1},
     }

@@ -293,7 +293,6 @@ def test_may_be_depths(tmp_path):
         ("output.suffix", (SCENE / "cloud.laz", "out.tif"), {}),
         ("option.needs", (SCENE / "cloud.laz", "out.laz"), {"depth": "d.tif"}),
         ("option.needs", (SCENE / "cloud.laz", "out.laz"), {"band": 2}),
-        ("option.conflict", ("dsm.tif", "out.tif"), {"uncorrected": "drop"}),
         ("output.is_input", ("dsm.tif", "dsm.tif"), {}),
         ("output.is_input", ("dsm.tif", "out.tif"), {"depth": "out.tif"}),
         ("cloud.not_copc", ("dsm.tif", "out.tif"), {"read_resolution": 1.0}),

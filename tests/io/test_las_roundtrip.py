@@ -15,7 +15,7 @@ from laspy.vlrs.vlrlist import VLRList
 import pcfix
 from pcfix import PcfixError
 from pcfix.flow.plausibility import CloudSample
-from pcfix.io.las.columns import COLUMNS, UNSURE, UPGRADE
+from pcfix.io.las.columns import COLUMNS, UPGRADE
 from tests.utils.beyond_frames import BEYOND_FRAMES, DEEP
 from tests.utils.clouds import (
     EAST_M,
@@ -397,16 +397,15 @@ class TestUncorrectedPoints:
         assert set(fields(before)["withheld"][stuck]) == {0, 1}
         return stuck, rays
 
-    def run(self, source: Path, why: str, uncorrected: str) -> tuple[Trip, pcfix.Summary]:
+    def run(self, source: Path, why: str) -> Trip:
         trip = Trip(source, source.with_stem("output"), source.with_stem("back"))
         cameras, choices, _ = MISSED[why]
-        summary = correct(source, trip.output, cameras=cameras, uncorrected=uncorrected, **choices)
+        correct(source, trip.output, cameras=cameras, **choices)
         pcfix.restore_file(trip.output, trip.back)
-        return trip, summary
+        return trip
 
-    @pytest.mark.parametrize("uncorrected", ["keep", "withhold"])
-    def test_they_stay(self, source: Path, why: str, uncorrected: str) -> None:
-        trip, _ = self.run(source, why, uncorrected)
+    def test_they_stay(self, source: Path, why: str) -> None:
+        trip = self.run(source, why)
         stuck, rays = self.expected(trip.before, why)
         old, new, more = fields(trip.before), fields(trip.after), added(trip.before, trip.after)
         for name in old.keys() - {"angle", "extra", "withheld"}:
@@ -417,26 +416,8 @@ class TestUncorrectedPoints:
         for axis in "XYZ":
             assert not more[f"Shift{axis}"][stuck].any()
 
-        flag = old["withheld"] | stuck if uncorrected == "withhold" else old["withheld"]
-        np.testing.assert_array_equal(new["withheld"], flag)
+        np.testing.assert_array_equal(new["withheld"], old["withheld"] | stuck)
         assert trip.back.read_bytes() == trip.source.read_bytes()
-
-    def test_dropped(self, source: Path, why: str) -> None:
-        trip, summary = self.run(source, why, "drop")
-        stuck, rays = self.expected(trip.before, why)
-        keep = correct(source, source.with_stem("keep"), cameras=MISSED[why][0],
-                       uncorrected="keep", **MISSED[why][1])  # fmt: skip
-        whole = read_raw(source.with_stem("keep"))
-        assert keep.dropped == 0
-        np.testing.assert_array_equal(trip.after.points, whole.points[~stuck])
-        np.testing.assert_array_equal(trip.restored.points, trip.before.points[~stuck])
-        # by the angle alone: without a limit all cameras see all points
-        few = [(stuck & (rays == count)).sum() for count in (0, 1)]
-        counts = [0, 0, 0, stuck.sum()] if why == "angle" else [*few, 0, 0]
-        assert sorted(summary.uncorrected.values()) == sorted(counts)
-        assert summary.dropped == stuck.sum()
-        assert summary.submerged == submerged(trip.before).sum()
-        assert summary.corrected == summary.submerged - stuck.sum()
 
 
 @pytest.mark.parametrize("number", [2, 7])
@@ -554,7 +535,7 @@ def test_documented_dimensions() -> None:
     head = "| extra dimension | type | unit | |\n|---|---|---|---|\n"
     rows = [
         re.escape(f"| `{c.name}` | {c.dtype} | {units[c.scale]} |".replace("  ", " "))
-        for c in (*COLUMNS, UNSURE)
+        for c in COLUMNS
     ]
     table = re.compile(re.escape(head) + "".join(f"{row} .+ \\|\n" for row in rows) + "\n")
     root = Path(__file__).parents[2]
