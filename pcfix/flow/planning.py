@@ -23,7 +23,7 @@ from pcfix.label.labelling import Labelling
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, Views, WaterPlane
 from pcfix.options.correct import CorrectOptions
 from pcfix.refract import learning
-from pcfix.refract.batch import UNLISTED, Batch, Learned, Survey, require_orientation, stacked
+from pcfix.refract.batch import Batch, Learned, Survey, require_orientation, stacked
 from pcfix.refract.occlusion import Occluder, OccluderBuilder, wants_occlusion
 from pcfix.refract.patches import PATCH_WIDTH, Squares
 from pcfix.refract.reconstructions import hint_of
@@ -251,7 +251,7 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
         unlisted, verdicts = learning.learn_of_sample(
             replace(sample, survey=bare), ties, hint, near
         )
-        survey = replace(survey, parts={UNLISTED: unlisted})
+        survey = replace(survey, unlisted=unlisted)
         words = ["Points missing in the view list are corrected without it.", *map(str, verdicts)]
         notes.append(PcfixWarning("views.unlisted", " ".join(words)))
     return replace(plan, survey=survey, notes=tuple(notes))

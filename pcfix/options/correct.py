@@ -131,8 +131,6 @@ class BudgetOptions(OptionSet, panel=Panel.BUDGET):
     """Standard deviation of an image coordinate. [px]"""
     sigma_level: float | None = option(None, least=0)
     """Standard deviation of the water level. [m] [default: that of its fit, else 0.02]"""
-    sigma_tilt: float = option(0.0, least=0)
-    """Standard deviation of the tilt of the water surface, about each axis. [deg]"""
     sigma_index: float = option(0.002, least=0)
     """Standard deviation of the refractive index."""
     sigma_waves: float = option(0.0, least=0)

@@ -34,9 +34,6 @@ MAX_ANGLE_WITHOUT_FRAMES_DEG = 80.0
 """Cameras without a lens have no frame to leave; nobody matches images as flat as this, and a
 block in another CRS is recognised by it."""
 
-"""More rays than a point can have; a view list may name a camera twice."""
-
-
 REACH = 0.03
 """Largest distance of the image of a true point from that of its apparent point, by the longer side
 of the frame: the residuals of refraction, which straight rays cannot fit."""

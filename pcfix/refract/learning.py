@@ -12,7 +12,7 @@ from pcfix.model import Cameras, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import ALIKE, FLAT_DEG, Batch, Survey, require_orientation
 from pcfix.refract.methods import batches, on_land, with_rays
-from pcfix.refract.patches import FEWEST_WITHOUT_LIST, gsd_m
+from pcfix.refract.patches import gsd_m
 from pcfix.refract.reconstructions import (
     IN_FRAME,
     LIMITS,
@@ -133,10 +133,6 @@ def learn_of_sample(
     survey without ``auto`` and the verdicts.
     """
     survey = batch.survey
-    if survey.settings.method == "auto":
-        found = _learn_of_sources(batch, ties, hint, near)
-        if found is not None:
-            return found
     if _wants_matcher(survey):
         survey = with_matcher(batch, ties)
     sample = replace(submerged_of(batch), survey=survey)
@@ -162,40 +158,6 @@ def learn_of_sample(
 def submerged_of(batch: Batch) -> Batch:
     """Return the submerged points of a batch."""
     return batch.take(np.flatnonzero(is_submerged(batch.xyz[:, 2], batch.surface)))
-
-
-MOST_SOURCES = 8
-"""More point sources are strips or images, and not clouds that were merged."""
-
-
-def _learn_of_sources(
-    batch: Batch, ties: TiePoints | None, hint: Hint | None, near: Batch | None
-) -> tuple[Survey, tuple[Verdict, ...]] | None:
-    """Learn from each point source separately; None if all have one reconstruction type."""
-    if batch.source is None:
-        return None
-    submerged = is_submerged(batch.xyz[:, 2], batch.surface)
-    source, count = np.unique(batch.source[submerged], return_counts=True)
-    large = source[count >= FEWEST_WITHOUT_LIST][np.argsort(count[count >= FEWEST_WITHOUT_LIST])]
-    if not 2 <= len(large) <= MOST_SOURCES:
-        return None
-    surveys, verdicts = dict[int, Survey](), list[Verdict]()
-    for one in large.tolist():
-        part = _of_source(batch, one)
-        own = None if near is None else _of_source(near, one)
-        surveys[one], found = learn_of_sample(part, ties, hint, own)
-        of = f"point source {one} ({100.0 * len(part) / len(batch):.0f} % of the points)"
-        verdicts += [verdict._replace(of=of) for verdict in found]
-    if len({verdict.chosen.words for verdict in verdicts if verdict.is_sure}) < 2:
-        return None
-    most = int(large[-1])
-    others = {one: survey for one, survey in surveys.items() if one != most}
-    return replace(surveys[most], parts=others), tuple(verdicts)
-
-
-def _of_source(batch: Batch, source: int) -> Batch:
-    """Return the points of one point source."""
-    return replace(batch.take(np.flatnonzero(batch.source == source)), source=None)
 
 
 def _weighed(sample: Batch, hint: Hint | None) -> tuple[Survey, tuple[Verdict, ...]]:

@@ -140,7 +140,7 @@ def on_land(survey: Survey) -> Survey:
         settings=replace(survey.settings, index=1.0, dimensions="none"),
         level_offset_m=None,
         learned=survey.learned._replace(bed=None),
-        parts={},
+        unlisted=None,
         own_water=None,
     )
 

@@ -5,7 +5,7 @@ first: SfM software intersects straight rays by least squares in the images, so 
 
     Cov P = K^-1 R K^-1,   K = sum J'J,   R = sum J' Cov(image) J.
 
-The correction moves P to Q. Errors common to all rays (level, index and tilt of the water) enter
+The correction moves P to Q. Errors common to all rays (level and index of the water) enter
 only there, each with a column g of its own:
 
     Cov Q = dQ/dP Cov P dQ/dP' + sum over the common ones of sigma^2 g g'.
@@ -24,8 +24,6 @@ P across, p            D p = (1 - m) p + beta (d.p) d,  beta = -y r (1 - r^2) / 
 P up                   -D d / H
 h                      (1 / H - r / kappa) d
 n                      y r^2 L^2 / kappa^3 d
-slope, N + tau         -y (1 - r H / kappa) tau + (gamma + m r / kappa) (d.tau) d,
-                       gamma = y r^3 H / kappa^3 - h / H^2 (about the place above P)
 =====================  ========================================================================
 
 What a delta of each ray does to Q depends on what Q is the least of.
@@ -77,7 +75,6 @@ from pcfix.lens.algebra import (
     beyond,
     dot,
     minus,
-    plus,
     plus_square,
     product,
     row_of,
@@ -103,7 +100,7 @@ _XZ, _YZ, _ZZ = 2, 4, 5
 
 
 class Budget(NamedTuple):
-    """Standard deviations, angles in radians; the place about which the water tilts.
+    """Standard deviations, angles in radians.
 
     `in_images` says which residuals the correction makes least, `by_ray` whether rays have errors
     other than the noise of image coordinates.
@@ -111,12 +108,9 @@ class Budget(NamedTuple):
 
     image_px: float
     refractive_index: float
-    tilt: float
     waves: float
     centre_m: float
     attitude: float
-    pivot_x: float
-    pivot_y: float
     in_images: bool
     by_ray: bool
 
@@ -125,8 +119,7 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
     """Return the covariance of each corrected point: xx, xy, xz, yy, yz, zz, shape (m, 6), m^2.
 
     Zeros if fewer than two rays meet, or nearly parallel ones. `shift_m`, shape (m, 3), is true
-    minus apparent, by any method. A mesh or raster is taken as its plane above the point. A tilt
-    turns the water about the middle of the projection centres.
+    minus apparent, by any method. A mesh or raster is taken as its plane above the point.
 
     It is an approximation for methods that move points along the vertical only (they get that of
     `snell`), and where `consistent` inverts a dense matcher, which gets that of one adjustment of
@@ -219,27 +212,20 @@ def _own_sigma(span: Span, points: Chosen, sigma: Field, found: FloatArray) -> N
 def budget_of(survey: Survey) -> Budget:
     """Return the error budget for kernels."""
     settings = survey.settings
-    x, y = survey.cameras.centres[:, :2].mean(axis=0).tolist()
     return Budget(
         image_px=settings.sigma_image,
         refractive_index=settings.sigma_index,
-        tilt=math.radians(settings.sigma_tilt),
         waves=math.radians(settings.sigma_waves),
         centre_m=settings.sigma_centre,
         attitude=math.radians(settings.sigma_attitude),
-        pivot_x=x,
-        pivot_y=y,
         in_images=settings.method == "consistent",
         by_ray=max(settings.sigma_waves, settings.sigma_centre, settings.sigma_attitude) > 0.0,
     )
 
 
 # Runs of `TILE` numbers for the points of a tile: how far above the true point P is, along N; the
-# number of rays; what level (3) and n (3) add to S delta; W (6); S T (9); M D (9); what slopes add,
-# to be multiplied by tau (9); noise (6).
-_ABOVE, RAYS, BY_LEVEL, BY_N, SIGHT, BY_Q, BY_P, BY_TILT, NOISE, ROOM = slots(
-    1, 1, 3, 3, 6, 9, 9, 9, 6
-)
+# number of rays; what level (3) and n (3) add to S delta; W (6); S T (9); M D (9); noise (6).
+_ABOVE, RAYS, BY_LEVEL, BY_N, SIGHT, BY_Q, BY_P, NOISE, ROOM = slots(1, 1, 3, 3, 6, 9, 9, 6)
 
 
 class Sight(NamedTuple):
@@ -393,23 +379,6 @@ def _add_common(
 
 
 @device
-def _add_tilt(
-    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, in_images: bool
-) -> None:
-    """Add how the slope of the water moves each of one camera's rays: S delta by tau.
-
-    delta = turn tau + along (d.tau) d, along = gamma + m r / kappa.
-    """
-    for j in range(marks.size):
-        ray = _ray_of(room, tile, marks, j, sight)
-        a, g, c, b, _ = _effect(ray, _weight(ray, sight), in_images)
-        turn, inv_k = -ray.y * (1.0 - ray.height * ray.lean), 1.0 / ray.kappa
-        along = ray.y * ray.bend * ray.bend * ray.lean * ray.height * inv_k * inv_k
-        along += (ray.h * ray.inv_h - ray.y * ray.lean) * ray.lean - ray.h * ray.inv_h * ray.inv_h
-        _add_nine(room, BY_TILT * TILE + j, turn * c, a, g, scaled(turn * b + along, ray.d))
-
-
-@device
 def _add_noise(
     room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, budget: Budget
 ) -> None:
@@ -470,8 +439,6 @@ def add_errors(
             row_of(rig.centres, c), rig.offset[c], row_of(rig.axes, c), rig.focal_px[c] ** 2, bend
         )
         _add_common(room, tile, marks[k], sight, budget.in_images)
-        if budget.tilt > 0.0:
-            _add_tilt(room, tile, marks[k], sight, budget.in_images)
         if budget.by_ray:
             _add_noise(room, tile, marks[k], sight, budget)
 
@@ -483,9 +450,8 @@ def finish_tile(
 ) -> None:  # fmt: skip
     """Turn the sums of a tile into covariances: B R B' of the noise, and that of common errors.
 
-    Each common error is one standard deviation times a column: of level, index and both tilts. A
-    tilt also raises the water above the point, in proportion to its distance from the pivot. LLVM
-    inlines what the loop calls; otherwise it would not be vectorised.
+    Each common error, of level and index, is one standard deviation times a column. LLVM inlines
+    what the loop calls; otherwise it would not be vectorised.
     """
     out, sigma, sums = np.empty(6 * TILE), level_sigma[rows], room
     # R = sigma^2 K if all rays have the same image noise
@@ -509,21 +475,11 @@ def finish_tile(
             dot(noise[0:3], x), dot(noise[0:3], y), dot(noise[0:3], z),
             dot(noise[3:6], y), dot(noise[3:6], z), dot(noise[6:9], z),
         )  # fmt: skip
-        nx, ny, nz = three(tile, 4 * TILE + j)
-        # two horizontal directions of slope: u towards x, v across it
-        scale = 1.0 / np.sqrt(nx * nx + nz * nz)
-        ux, uz = nz * scale, -nx * scale
-        by_tilt = nine(sums, BY_TILT * TILE + j)
         # the level rises along the vertical, h is along N
-        level, index = scaled(nz, three(sums, BY_LEVEL * TILE + j)), three(sums, BY_N * TILE + j)
-        away_u, away_v = tile[j] - budget.pivot_x, tile[TILE + j] - budget.pivot_y
-        # the normal leans away from where the slope rises
-        u = plus(product_of(by_tilt, (-ux, 0.0, -uz)), scaled(away_u, level))
-        v = plus(product_of(by_tilt, (-ny * uz, nx * uz - nz * ux, ny * ux)), scaled(away_v, level))
+        level = scaled(tile[6 * TILE + j], three(sums, BY_LEVEL * TILE + j))
+        index = three(sums, BY_N * TILE + j)
         cov = plus_square(cov, scaled(sigma[j], product_of(b, level)))
         cov = plus_square(cov, scaled(budget.refractive_index, product_of(b, index)))
-        cov = plus_square(cov, scaled(budget.tilt, product_of(b, u)))
-        cov = plus_square(cov, scaled(budget.tilt, product_of(b, v)))
         put(out, j, cov[0:3])
         put(out, 3 * TILE + j, cov[3:6])
         sums[RAYS * TILE + j] = 1.0 if solved else 0.0

@@ -1,9 +1,9 @@
 """The covariance of corrected points against repeated simulations with errors that are known.
 
-The truth: light is traced from points on the bed through a water surface that lies elsewhere,
-leans, is of another index or has waves, into cameras that stand elsewhere and are turned; noise
-is added to the images, and straight rays are intersected there with the poses that are believed.
-None of it is shared with the correction.
+The truth: light is traced from points on the bed through a water surface at another level, of
+another index or with waves, into cameras that are elsewhere and turned; noise is added to the
+images, and straight rays are intersected there with the nominal poses. None of it is shared with
+the correction.
 """
 
 from dataclasses import replace
@@ -26,7 +26,6 @@ NONE = BudgetOptions(sigma_image=0.0, sigma_level=0.0, sigma_index=0.0)
 SOURCES = {
     "image": replace(NONE, sigma_image=0.7),
     "level": replace(NONE, sigma_level=0.05),
-    "tilt": replace(NONE, sigma_tilt=0.1),
     "index": replace(NONE, sigma_index=0.004),
     "waves": replace(NONE, sigma_waves=0.5),
     "centre": replace(NONE, sigma_centre=0.02),
@@ -34,7 +33,6 @@ SOURCES = {
     "all": BudgetOptions(
         sigma_image=0.5,
         sigma_level=0.03,
-        sigma_tilt=0.05,
         sigma_index=0.003,
         sigma_waves=0.3,
         sigma_centre=0.01,
