@@ -20,7 +20,7 @@ from pcfix.lens.algebra import Vector, dot, minus, normal_of, row_of, times, tra
 from pcfix.lens.imaging import direction_of, image_of, lens_table
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Outcome, Views, WaterSurface
 from pcfix.options.correct import ScienceOptions
-from pcfix.water.surface import OwnWater, SurfaceAbove
+from pcfix.water.surface import Field, SurfaceAbove
 
 if TYPE_CHECKING:
     from pcfix.refract.matcher import Bed, Matcher
@@ -98,7 +98,7 @@ class Survey:
     level_offset_m: FloatArray | None = None  # (k,), how much higher the water stood per image
     learned: Learned = field(default_factory=Learned)
     unlisted: Survey | None = None
-    own_water: OwnWater | None = None
+    own_water: Field | None = None
 
     @property
     def limit_deg(self) -> float | None:

@@ -84,7 +84,7 @@ def shapes_of(survey: Survey) -> tuple[Tin | None, Field | None]:
     """Return a mesh, or the rasters of the images, for kernels; neither for a plane."""
     water, k = survey.water, len(survey.cameras)
     if survey.own_water is not None:
-        return None, survey.own_water.heights
+        return None, survey.own_water
     return (
         build_tin(water) if isinstance(water, WaterMesh) else None,
         build_fields({}, k, water) if isinstance(water, WaterRaster) else None,

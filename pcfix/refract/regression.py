@@ -61,7 +61,8 @@ class DepthRegression:
         again = "" if self.cv_rmse_m is None else f", cross-validated {self.cv_rmse_m:.3f} m"
         return (
             f"Regression: depth = {self.intercept_m:.3f} m + {self.slope:.3f} x apparent depth"
-            f" ({self.count} check depths, r2 {self.r2:.3f}); standard errors"
+            f" ({self.count} check depths at {self.shallowest_m:.2f} to {self.deepest_m:.2f} m,"
+            f" extrapolated beyond; r2 {self.r2:.3f}); standard errors"
             f" {self.intercept_se_m:.3f} m and {self.slope_se:.3f}, RMSE {self.rmse_m:.3f} m"
             f"{again}."
         )

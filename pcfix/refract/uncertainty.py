@@ -87,7 +87,6 @@ from pcfix.refract.batch import Batch, Chosen, Intersection, Survey
 from pcfix.refract.choice import Rig, rig_of
 from pcfix.refract.rays import MIN_DETERMINANT, refracted
 from pcfix.refract.tiling import TILE, add_three, inverse_of, nine, product_of, put, slots, three
-from pcfix.water.surface import Field, height_at
 
 MODEL_GSD = 0.8
 """Standard error of the model of depth maps, common to a block: the bias of blocks with known truth
@@ -174,39 +173,13 @@ def with_uncertainty(found: Intersection, batch: Batch) -> Intersection:
 def level_sigma_of(batch: Batch) -> FloatArray:
     """Return the standard deviation of the water above each point, metres, shape (m,).
 
-    That of the settings, else of the fit, else `LEVEL_M`. Errors of the water of single images
-    are added as the error of the mean over the rays.
+    That of the settings, else of the fit, else `LEVEL_M`.
     """
     stated, fitted = batch.survey.settings.sigma_level, batch.level_sigma_m
     known = stated if stated is not None else LEVEL_M if fitted is None else fitted
     full = np.array(np.broadcast_to(known, len(batch)), np.float64)
     full[np.isnan(full)] = LEVEL_M
-    own, views = batch.survey.own_water, batch.views
-    if own is None or views is None:
-        return full
-    of_own = np.zeros(len(batch))
-    in_tiles(_own_sigma, len(batch), batch.chosen(), own.sigma, of_own)
-    return np.hypot(full, of_own)
-
-
-@kernel
-def _own_sigma(span: Span, points: Chosen, sigma: Field, found: FloatArray) -> None:
-    """Set the standard error of the mean of the images' own water over the rays of a point.
-
-    Errors are independent from image to image. The water is taken as level above the point.
-    """
-    start, camera = points.start, points.camera
-    for i in range(*span):
-        total = 0.0
-        for at in range(start[i], start[i + 1]):
-            c = camera[at]
-            e = minus(row_of(points.centres, c), row_of(points.xyz, i))
-            # where the straight ray pierces it
-            f = (points.height[i] + points.offset[c] - points.xyz[i, 2]) / e[2]
-            x, y = points.xyz[i, 0] + f * e[0], points.xyz[i, 1] + f * e[1]
-            error = height_at(Field(sigma.heights, sigma.shape, sigma.frame, c), x, y)[0]
-            total += error * error if error > 0.0 else 0.0
-        found[i] = np.sqrt(total) / max(start[i + 1] - start[i], 1)
+    return full
 
 
 def budget_of(survey: Survey) -> Budget:

@@ -164,13 +164,6 @@ def height_at(field: Field, x: float, y: float) -> tuple[float, float, float]:
     return height, (east + t * twist) / frame[k, 2], -(south + s * twist) / frame[k, 3]
 
 
-class OwnWater(NamedTuple):
-    """Separate water surfaces of images, and their standard errors."""
-
-    heights: Field
-    sigma: Field
-
-
 EDGE_TOLERANCE = 1e-9  # of a barycentric coordinate: a point on an edge belongs to both sides
 MIN_FACET_AREA_M2 = 1e-12  # in plan; below this a facet is vertical or a sliver, and has no height
 FARTHEST_M = 1e9  # no coordinate on Earth is as large

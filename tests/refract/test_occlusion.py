@@ -97,25 +97,6 @@ def test_wall_face(walled):
     assert found[:, 1].all()
 
 
-def deck_scene(deck_m=5.0):
-    """Return a river bed 1 m deep under a deck from x = -3 to 3, and their surface."""
-    rng = np.random.default_rng(5)
-    bed = plain(rng, noise_m=0.02) + np.array([0.0, 0.0, 4.0])
-    deck = np.column_stack([rng.uniform([-3, -10], [3, 10], (20_000, 2)), np.full(20_000, deck_m)])
-    deck[:, 2] += rng.normal(0.0, 0.02, len(deck))
-    return bed, occluder_of(np.vstack([bed, deck]))
-
-
-def test_under_deck():
-    bed, occluder = deck_scene()
-    under = bed[(np.abs(bed[:, 0] - 2.0) < 0.2) & (np.abs(bed[:, 1]) < 8.0)]
-    above, steep, flat = [2.0, 0.0, 80.0], [12.0, 0.0, 80.0], [102.0, 0.0, 50.0]
-    found = hidden_of(under, np.array([above, steep, flat]), occluder)
-    # the steep rays rise 8 a metre and pierce the deck, 6 m up, 0.75 m on, before its edge 1 m on;
-    # the flat ones rise 0.5 a metre
-    assert found[:, 0].all() and found[:, 1].all() and not found[:, 2].any()
-
-
 def hidden_by_small_steps(point, centre, occluder):
     """Return whether the ray is below some cell's height at the last of the steps within it."""
     origin = np.array([occluder.left_m, occluder.bottom_m])

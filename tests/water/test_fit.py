@@ -232,15 +232,6 @@ def test_beyond_the_ends():
     assert fit.as_dict()["drop_m"] == pytest.approx(ends[0] - ends[1])
 
 
-def test_rising_water():
-    rng = np.random.default_rng(0)
-    x = rng.uniform(0, 300, 120)
-    z = 1.0 + 0.5 * np.sin(x / 300 * 2 * np.pi) + rng.normal(0, 0.01, 120)
-    points = np.column_stack([x, rng.choice([0.0, 15.0], 120), z])
-    fit = fit_river(points, (0.0, 0.0, 300.0, 15.0))
-    assert not fit.profile.falls
-
-
 @pytest.mark.parametrize(
     ("points", "bounds", "code"),
     [
