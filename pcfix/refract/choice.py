@@ -152,15 +152,6 @@ def near_borders(batch: Batch, shift_m: FloatArray) -> IntArray:
     return np.flatnonzero(found)
 
 
-def cameras_of_pairs(pairs: Views) -> Views:
-    """Return the cameras in each point's pairs, each once, in the order of the list."""
-    camera = np.asarray(pairs.camera, np.int64)
-    owner = np.repeat(np.arange(len(pairs.start) - 1), np.diff(pairs.start))
-    _, first = np.unique(owner * (camera.max(initial=0) + 1) + camera, return_index=True)
-    kept = np.sort(first)
-    return Views(np.searchsorted(owner[kept], np.arange(len(pairs.start))), camera[kept])
-
-
 @kernel(allocates=True)
 def _make_room(
     span: Span, given: tuple[IntArray, Chosen], rig: Rig, frames: Frames, first: IntArray

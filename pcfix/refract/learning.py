@@ -74,7 +74,7 @@ def wants_sample(survey: Survey, views: ViewKind | None) -> bool:
         return True
     if views is None:
         return _wants_matcher(survey) or _wants_limit(settings)
-    return views in ("depth-maps", "pair-images") and settings.method == "consistent"
+    return views in ("depth-maps", "pairs") and settings.method == "consistent"
 
 
 def with_factor(batch: Batch) -> tuple[Batch, StereoFactor | None]:

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.model import FloatArray, IntArray, Outcome, Views, WaterPlane
+from pcfix.model import FloatArray, IntArray, Outcome, WaterPlane
 from pcfix.refract.batch import Batch, Intersection, Survey
-from pcfix.refract.choice import cameras_of_pairs, chosen_views, is_bent, near_borders
+from pcfix.refract.choice import chosen_views, is_bent, near_borders
 from pcfix.refract.tiling import spatial_order
 from pcfix.refract.uncertainty import with_uncertainty
 from pcfix.water.surface import SurfaceAbove
@@ -65,8 +65,6 @@ def _without_limit(found: Intersection, batch: Batch) -> Intersection:
     part = replace(batch.take(few), survey=free)
     if survey.settings.limit_deg is None:
         return found.with_rows(few, _corrected(part))
-    if part.views is not None and part.views.kind == "pairs":
-        part = replace(part, views=cameras_of_pairs(part.views))
     flat = few[with_rays(part).counts >= 2]
     outcome = found.outcome.copy()
     outcome[flat] = Outcome.FLAT_RAYS
@@ -75,25 +73,19 @@ def _without_limit(found: Intersection, batch: Batch) -> Intersection:
 
 def _corrected(batch: Batch) -> Intersection:
     """Correct points of one reconstruction type."""
-    survey, views, pairs = batch.survey, batch.views, None
     name = _method(batch)
     module, function = name.split(".")
     method = getattr(import_module(f"pcfix.refract.{module}"), function)
-    if views is not None and views.kind == "pairs":
-        pairs, batch = views, replace(batch, views=cameras_of_pairs(views))
 
-    def solved(part: Batch, *listed: Views) -> Intersection:
-        return with_uncertainty(method(part, *listed), part)
+    def solved(part: Batch) -> Intersection:
+        return with_uncertainty(method(part), part)
 
     if name in _IN_FRAME and _takes_all_in_frame(batch):
         found = solved(batch)
     else:
         order = spatial_order(batch.xyz)
-        parts = []
-        for rows in batches(order):
-            listed = () if name != _PAIRS or pairs is None else (pairs.take(rows),)
-            parts.append(solved(with_rays(batch.take(rows)), *listed))
-        found = joined(parts, order, len(survey.cameras))
+        parts = [solved(with_rays(batch.take(rows))) for rows in batches(order)]
+        found = joined(parts, order, len(batch.survey.cameras))
     if name != METHODS["consistent"] or batch.views is not None:
         return found
     # an image shows the true point, near its border sometimes without the apparent one
@@ -154,7 +146,7 @@ def _method(batch: Batch) -> str:
     kind = modelled if views is None else views.kind
     if kind in ("depth-maps", "single-map", "nearest-map"):
         return _MAPS
-    return _PAIRS if kind in ("pairs", "pair-images") else METHODS["consistent"]
+    return _PAIRS if kind == "pairs" else METHODS["consistent"]
 
 
 def with_rays(batch: Batch, shift_m: FloatArray | None = None) -> Batch:

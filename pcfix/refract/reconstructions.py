@@ -96,7 +96,7 @@ IN_FRAME = (
 LISTED = (
     Reconstruction(_TRACKS, {"method": "consistent"}, "tracks"),
     Reconstruction(_MAPS, {"method": "consistent"}, "depth-maps"),
-    Reconstruction(_PAIRS, {"method": "consistent"}, "pair-images"),
+    Reconstruction(_PAIRS, {"method": "consistent"}, "pairs"),
 )
 LIMITS = (
     Reconstruction("all rays", {"method": "snell"}),
@@ -227,8 +227,6 @@ def reconstructions_of(batch: Batch) -> tuple[Reconstruction, ...]:
         return tuple(
             one for one in IN_FRAME if not auto or given in ("auto", one.changes["camera_set"])
         )
-    if views.kind == "pairs":
-        return (LISTED[2]._replace(kind="pairs"), LISTED[0])
     return LISTED if batch.survey.learned.matcher is not None else LISTED[:1]
 
 

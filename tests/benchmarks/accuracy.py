@@ -7,10 +7,10 @@ clouds that COLMAP and OpenMVS made of rendered images (`REAL`). All numbers are
 points of a scene, those under more than 0.2 m of water, in ground sampling distances. Points that
 a method left uncorrected are not in its row; "done" is the share of the others.
 
-Cameras: "views" is the view list of the software; "pairs" the stereo pairs, which for all methods
-but `consistent` are the same cameras; "mvs" a model of dense matching, which tracks and pairs are
-not; "all" every camera whose frame holds the point; "auto" what pcfix detects without any option.
-"In 95 %" is the share of points whose error in Z is within 1.96 SigmaZ.
+Cameras: "views" is the view list of the software; "pairs" the same images as those of stereo pairs;
+"mvs" a model of dense matching, which tracks and pairs are not; "all" every camera whose frame
+holds the point; "auto" what pcfix detects without any option. "In 95 %" is the share of points
+whose error in Z is within 1.96 SigmaZ.
 
 "floor" is the least-squares triangulation through the water from the listed images, with new
 noise of the same size, of 1000 points. Depth maps are matched anew for each map, so that there it
@@ -18,11 +18,10 @@ is no limit.
 
 ``--sensitivity`` compares the effect of wrong inputs on Z with the predicted budget instead. The
 method is `consistent` with known tracks, one input is wrong at a time, and the budget has only that
-one. Level, index and tilt are common to the scene: measured is the mean change of Z if the
-correction is given a value that is off by one standard deviation (of the tilt about each axis in
-turn, added in quadrature), predicted the mean sigma. The others are random: the scene is simulated
-with them, with several seeds, as a block has few poses; measured is the RMS error of Z, predicted
-the RMS of sigma.
+one. Level and index are common to the scene: measured is the mean change of Z if the correction is
+given a value that is off by one standard deviation, predicted the mean sigma. The others are
+random: the scene is simulated with them, with several seeds, as a block has few poses; measured is
+the RMS error of Z, predicted the RMS of sigma.
 """
 
 import argparse
@@ -41,7 +40,6 @@ import pcfix
 from pcfix.flow.check_depths import fit_check_depths
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.label.labelling import Part
-from pcfix.model import Views
 from pcfix.options.correct import BudgetOptions
 from pcfix.simulate.tracing import piercing_points_of_planes, project
 from pcfix.water.surface import surface_above
@@ -118,9 +116,9 @@ def simulated(name: str, points: int, seed: int) -> Case:
     kind = "depth-maps" if name == "depth-maps" else "tracks"
     known: dict[str, dict[str, Any]] = {"views": {"views": replace(scene.views, kind=kind)}}
     mvs = {"camera_set": "mvs"}
-    if scene.pairs is not None:
-        pairs = Views(2 * scene.pairs_start, scene.pairs.ravel(), kind="pairs")
-        known["pairs"], mvs["matcher"] = {"views": pairs}, "pairs"
+    if name == "pairs":
+        known["pairs"] = {"views": replace(scene.views, kind="pairs")}
+        mvs["matcher"] = "pairs"
     measured, floor = measured_of(scene), None
     if kind == "tracks":
         rng = np.random.default_rng([seed, 99])
