@@ -54,19 +54,12 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
         match = ViewMatch(blocks.views, blocks.listed, points=view.points, step_m=view.step_m)
         listed = blocks.views.listed
     if inputs.port is not None:
-        cameras, method = blocks.cameras, options.method
+        cameras = blocks.cameras
         require_orientation(cameras, "A port")
-        how = replace(options, method="consistent" if method == "auto" else method)
-        survey = Survey(WaterPlane(np.inf), cameras, how)
-        words = (
-            "Method snell ignores that the refracted rays of the apparent points miss each other"
-            " behind the port. Use --method consistent, best with --views."
-        )
-        notes = coded("port.ray_distance", [words] if method == "snell" else [])
+        survey = Survey(WaterPlane(np.inf), cameras, replace(options, method="consistent"))
         return Plan(
             options, inputs, view, survey, FoundSurface(survey.water), labelling_of(options, view),
             match, None if listed is None else listed.kind, input_notes=cameras.notes,
-            notes=tuple(notes),
         )  # fmt: skip
     found = inputs.surface(view)
     if match is None and not isinstance(options.cameras, Cameras):
@@ -127,13 +120,13 @@ def _check_port(options: CorrectOptions) -> None:
     excluded = {
         "camera_set": options.camera_set == "mvs",
         "occlusion": options.occlusion == "on",
-        "method": options.method not in ("auto", "snell", "consistent"),
+        "method": options.method not in ("auto", "consistent"),
     }
     for name in compress(excluded, excluded.values()):
         raise SettingError(
             "port.excludes",
             f"{name.replace('_', '-')} {getattr(options, name)} has no effect with a port."
-            " Omit it; the methods are snell and consistent.",
+            " Omit it; the method is consistent.",
             option=name,
         )
 

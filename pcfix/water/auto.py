@@ -2,9 +2,8 @@
 
 Slope: refraction lifts the bed towards the surface, so that its slopes below the waterline are
 about 1/1.34 of the true ones (less under oblique rays), and a beach has a break of known size.
-Colour: water absorbs red light first (brown water with peat, blue), so that the ratio to green is
-constant on land and falls with depth: logarithms of light fall linearly with depth (Lyzenga 1978,
-Applied Optics 17: 379-383).
+Colour: water absorbs red light first, so that its ratio to green is constant on land and falls with
+depth: logarithms of light fall linearly with depth (Lyzenga 1978, Applied Optics 17: 379-383).
 
 A broken line is tested against an unbroken one, tile by tile, for every height of the break: y =
 (smooth within each tile) + trend * height + amplitude * f(depth), where f(d) = D (1 - exp(-d / D))
@@ -125,7 +124,7 @@ DRAWS = 120
 class Scan(NamedTuple):
     """The sums of all cues of a cloud."""
 
-    cues: list[Moments]  # of the slope and of the stronger colour, if they show anything
+    cues: list[Moments]  # of the slope and of the colour, if they show anything
     samples: Samples
     heights_m: FloatArray  # (h,), above the origin of the samples
 
@@ -146,13 +145,9 @@ def _scanned(samples: Samples) -> Scan:
 
 def _scan_at(samples: Samples, heights_m: FloatArray) -> Scan:
     """Sum all cues at the given heights."""
-    slope, *light = (
-        cue_moments(samples, cue, heights_m)
-        for cue in ((SLOPE, RED, BLUE) if len(samples.colour) else (SLOPE,))
-    )
-    known = [sums for sums in light if sums is not None]
-    stronger = sorted(known, key=lambda sums: -float(gain_of(sums)[0].max()))[:1]
-    return Scan([*([slope] if slope else []), *stronger], samples, heights_m)
+    cues = (SLOPE, RED) if len(samples.redness) else (SLOPE,)
+    found = (cue_moments(samples, cue, heights_m) for cue in cues)
+    return Scan([sums for sums in found if sums is not None], samples, heights_m)
 
 
 def _gains(scan: Scan, rng: np.random.Generator | None = None) -> FloatArray:
@@ -283,17 +278,16 @@ class Cue(NamedTuple):
 
     name: str
     meaning: str
-    colour: int | None  # column of the colours, whose ratio to green it is; None for the slope
+    is_colour: bool
     tile_cells: float  # side of a tile
     window_m: float  # observations weigh less towards this distance above and below
     scale_m: float = math.inf  # D; infinite for a straight line below
     amplitude: float | None = None  # given by physics, or negative and free
 
 
-SLOPE = Cue("slope", "the ground is flatter below the surface", None, 12.0, 0.6, amplitude=LIFT)
-RED = Cue("red/green", "red fades faster than green below the surface", 0, 24.0, 0.8, scale_m=0.7)
-BLUE = RED._replace(
-    name="blue/green", meaning="blue fades faster than green below the surface", colour=2
+SLOPE = Cue("slope", "the ground is flatter below the surface", False, 12.0, 0.6, amplitude=LIFT)
+RED = Cue(
+    "red/green", "red fades faster than green below the surface", True, 24.0, 0.8, scale_m=0.7
 )
 
 
@@ -369,7 +363,7 @@ def tile_moments(
     rows, weight, p = reached[enough], weight[enough], smooth.shape[1]
     below = np.maximum(depth[enough], 0.0)
     f = below if np.isinf(cue.scale_m) else -cue.scale_m * np.expm1(-below / cue.scale_m)
-    x = (at_m - at_m.mean()) * float(cue.colour is not None)
+    x = (at_m - at_m.mean()) * float(cue.is_colour)
     # the products of all columns, f last, at each height
     fixed = np.column_stack([smooth, y, x])
     products = (fixed[:, :, None] * fixed[:, None, :]).reshape(len(y), -1)
@@ -401,9 +395,9 @@ def cue_moments(samples: Samples, cue: Cue, heights_m: FloatArray) -> Moments | 
     for rows in np.split(order, np.flatnonzero(np.diff(tile[order])) + 1):
         if len(rows) < LEAST_TILE_CELLS:
             continue
-        if cue.colour is not None:
+        if cue.is_colour:
             smooth = np.ones((len(rows), 1))
-            y = samples.colour[rows, cue.colour] - samples.colour[rows, 1]
+            y = samples.redness[rows]
             at = samples.smooth_m[rows]
         else:
             place = xy[rows] - xy[rows].mean(axis=0)
@@ -437,7 +431,7 @@ class Samples(NamedTuple):
 
     xyz: FloatArray  # (m, 3), mean x and y, median z, metres from `origin`
     smooth_m: FloatArray  # (m,), height at x, y of a plane through the cells around it
-    colour: FloatArray  # (m, 3), mean natural logarithms of red, green, blue; (0, 3) for none
+    redness: FloatArray  # (m,), mean natural logarithm of red by green; empty without colours
     cell_m: float  # side of a cell
     origin: FloatArray  # (3,), world frame
 
@@ -463,13 +457,14 @@ def sample_cloud(xyz: FloatArray, rgb: npt.NDArray[Any] | None) -> Samples:
     mean = [np.bincount(of_point, local[:, i]) / count for i in (0, 1)]
     median = ndimage.median(local[:, 2], of_point, np.arange(len(count)))
     ground = np.column_stack([*mean, median])
-    colour = np.empty((0, 3))
+    redness = np.zeros(0)
     if rgb is not None and (rgb != rgb[:1]).any():
         light = rgb.astype(np.float64)
         white = max(float(np.percentile(light, 99.0)), 1e-9)
         logs = np.log(light + 0.004 * white)  # a small part of white keeps black finite
-        colour = np.column_stack([np.bincount(of_point, column) / count for column in logs.T])
-    return Samples(ground, _smoothed(ground), colour, cell_m, origin)
+        red, green = (np.bincount(of_point, logs[:, i]) / count for i in (0, 1))
+        redness = red - green
+    return Samples(ground, _smoothed(ground), redness, cell_m, origin)
 
 
 def square_tiles(local: FloatArray, side_m: float) -> IntArray:

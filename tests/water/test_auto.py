@@ -95,7 +95,7 @@ def test_refused():
 def test_amplitude_of_break():
     rng = np.random.default_rng(5)
     heights = np.array([0.0, 0.1])
-    cue = Cue("a colour", "", 0, 1.0, 1e6)
+    cue = Cue("a colour", "", True, 1.0, 1e6)
     parts = []
     everything = []
     for tile in range(3):
