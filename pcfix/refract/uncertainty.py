@@ -26,35 +26,21 @@ h                      (1 / H - r / kappa) d
 n                      y r^2 L^2 / kappa^3 d
 =====================  ========================================================================
 
-What a delta of each ray does to Q depends on what Q is the least of.
-
-*In space* (`snell` and most others) that is the squared distances from the refracted rays, eq 11 of
-Skarlatos & Agrafiotis 2018. With S = M = I - t t'
-
-    dQ = (sum M)^-1 sum M delta,    M d = (kappa^2 d - r kappa rho^2 N) / L^2.
-
-*In images* (`consistent`) the residuals are those at P: sum J' (x(Q) - pi(P)) = 0. A Q that is off
+Q has the least squared residuals in the images at P: sum J' (x(Q) - pi(P)) = 0. A Q that is off
 its ray, by T Q = Q - (N.Q) (N + (r / kappa) d) at its own depth, is seen where P would be after a
 move of D^-1 T Q. With W = J'J and S = W D^-1, D^-1 across as in the table,
 
     dQ = (sum S T)^-1 sum S delta,    S d = -H W N / (1 - m + beta rho^2)
 
-as W e = 0. Q depends on P only through pi(P): dQ / dP = (sum S T)^-1 sum W, and K cancels out. Up
-to 45 degrees the two differ by less than 2 %; of rays at 73 degrees the first is twice as large.
+as W e = 0. Q depends on P only through pi(P): dQ / dP = (sum S T)^-1 sum W, and K cancels out.
 
-In both cases S delta = c A delta + b (d.delta) g, with a symmetric A, g = S d, and S N = -v g:
+With g = S d it is S delta = c W delta + b (d.delta) g and S N = -v g, where
 
-==========  ===  ==========  ===============  ==========================
-residuals   A    c           b                v
-==========  ===  ==========  ===============  ==========================
-in space    M    1           0                r / kappa
-in images   W    1 / (1-m)   -beta / (1-m)    (1 - b rho^2) / H
-==========  ===  ==========  ===============  ==========================
+    c = 1 / (1 - m),    b = -beta / (1 - m),    v = (1 - b rho^2) / H,
+    S T = c W + g (b d + (v - r / kappa) N)'
 
-With D p = D (p - (N.p) e / H) for any p, as P may also move up, the sums have the terms
-
-    S T = c A + g (b d + (v - r / kappa) N)'
-    S D = (1 - m) c A + g (((1 - m) b + beta) d - ((1 - m) (1 - H v) + beta rho^2) N / H)'
+That is `consistent`. `snell` has the least distances from the rays instead (eq 11 of Skarlatos &
+Agrafiotis 2018); up to 45 degrees its standard errors are the same to 2 %.
 
 Neglected is the turn of M, and of J, times the residual, which is of second order.
 """
@@ -85,7 +71,7 @@ from pcfix.options.correct import LEVEL_M
 from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Chosen, Intersection, Survey
 from pcfix.refract.choice import Rig, rig_of
-from pcfix.refract.rays import MIN_DETERMINANT, refracted
+from pcfix.refract.rays import MIN_DETERMINANT
 from pcfix.refract.tiling import TILE, add_three, inverse_of, nine, product_of, put, slots, three
 
 MODEL_GSD = 0.8
@@ -101,8 +87,7 @@ _XZ, _YZ, _ZZ = 2, 4, 5
 class Budget(NamedTuple):
     """Standard deviations, angles in radians.
 
-    `in_images` says which residuals the correction makes least, `by_ray` whether rays have errors
-    other than the noise of image coordinates.
+    `by_ray` says whether rays have errors other than the noise of image coordinates.
     """
 
     image_px: float
@@ -110,7 +95,6 @@ class Budget(NamedTuple):
     waves: float
     centre_m: float
     attitude: float
-    in_images: bool
     by_ray: bool
 
 
@@ -120,9 +104,8 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
     Zeros if fewer than two rays meet, or nearly parallel ones. `shift_m`, shape (m, 3), is true
     minus apparent, by any method. A mesh or raster is taken as its plane above the point.
 
-    It is an approximation for methods that move points along the vertical only (they get that of
-    `snell`), and where `consistent` inverts a dense matcher, which gets that of one adjustment of
-    all its images.
+    It is that of `consistent` with tracks: an approximation for the other methods, and where
+    `consistent` inverts a dense matcher, which gets that of one adjustment of all its images.
     """
     survey, result = batch.survey, np.zeros((len(batch), 6))
     if not len(survey.cameras):
@@ -191,14 +174,13 @@ def budget_of(survey: Survey) -> Budget:
         waves=math.radians(settings.sigma_waves),
         centre_m=settings.sigma_centre,
         attitude=math.radians(settings.sigma_attitude),
-        in_images=settings.method == "consistent",
         by_ray=max(settings.sigma_waves, settings.sigma_centre, settings.sigma_attitude) > 0.0,
     )
 
 
 # Runs of `TILE` numbers for the points of a tile: how far above the true point P is, along N; the
-# number of rays; what level (3) and n (3) add to S delta; W (6); S T (9); M D (9); noise (6).
-_ABOVE, RAYS, BY_LEVEL, BY_N, SIGHT, BY_Q, BY_P, NOISE, ROOM = slots(1, 1, 3, 3, 6, 9, 9, 6)
+# number of rays; what level (3) and n (3) add to S delta; W (6); S T (9); noise (6).
+_ABOVE, RAYS, BY_LEVEL, BY_N, SIGHT, BY_Q, NOISE, ROOM = slots(1, 1, 3, 3, 6, 9, 6)
 
 
 class Sight(NamedTuple):
@@ -231,8 +213,8 @@ class Ray(NamedTuple):
     beta: float
 
 
-Effect: TypeAlias = tuple[Symmetric, Vector, float, float, float]
-"""A, g, c, b and v: how a displacement of a ray goes into the sums."""
+Effect: TypeAlias = tuple[Vector, float, float, float]
+"""g, c, b and v: how a displacement of a ray goes into the sums."""
 
 
 @device(allocates=True)
@@ -291,24 +273,14 @@ def _weight(ray: Ray, sight: Sight) -> Symmetric:
 
 
 @device(forceinline=True)
-def _effect(ray: Ray, w: Symmetric, in_images: bool) -> Effect:
-    """Return the effect of a displacement of a ray, on residuals in images or in space."""
-    if in_images:
-        # one division for two: c, and S d = W d / (1 - m + beta rho^2), where W d = -H W N
-        outer = ray.away + ray.beta * ray.rho2
-        share = 1.0 / (ray.away * outer)
-        c, b = share * outer, -ray.beta * share * outer
-        g = scaled(-ray.height * share * ray.away, product(w, ray.normal))
-        return w, g, c, b, (1.0 - b * ray.rho2) * ray.inv_h
-    t = refracted(ray.e, ray.length2, ray.normal, ray.height, ray.bend)
-    # M = I - t t', with the refracted ray of the length L
-    one, per = ray.times, ray.times / ray.length2
-    xx, xy, xz, yy, yz, zz = plus_square(NO_SQUARES, t)
-    m = one - per * xx, -per * xy, -per * xz, one - per * yy, -per * yz, one - per * zz
-    # M d = (kappa^2 d - r kappa rho^2 N) / L^2
-    up = per * ray.bend * ray.kappa * ray.rho2
-    g = beyond(scaled(per * ray.kappa * ray.kappa, ray.d), -up, ray.normal)
-    return m, g, 1.0, 0.0, ray.lean
+def _effect(ray: Ray, w: Symmetric) -> Effect:
+    """Return the effect of a displacement of a ray on the residuals in the images."""
+    # one division for two: c, and S d = W d / (1 - m + beta rho^2), where W d = -H W N
+    outer = ray.away + ray.beta * ray.rho2
+    share = 1.0 / (ray.away * outer)
+    c, b = share * outer, -ray.beta * share * outer
+    g = scaled(-ray.height * share * ray.away, product(w, ray.normal))
+    return g, c, b, (1.0 - b * ray.rho2) * ray.inv_h
 
 
 @device(forceinline=True)
@@ -327,21 +299,14 @@ def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: V
 
 
 @device
-def _add_common(
-    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, in_images: bool
-) -> None:
-    """Add one camera's rays to the sums of a tile's points: what moves Q, P, level and index."""
+def _add_common(room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight) -> None:
+    """Add one camera's rays to the sums of a tile's points: what moves Q, level and index."""
     for j in range(marks.size):
         ray = _ray_of(room, tile, marks, j, sight)
-        w, normal, lean, away = _weight(ray, sight), ray.normal, ray.lean, ray.away
-        a, g, c, b, v = _effect(ray, w, in_images)
+        w, lean = _weight(ray, sight), ray.lean
+        g, c, b, v = _effect(ray, w)
         # S T
-        _add_nine(room, BY_Q * TILE + j, c, a, g, beyond(scaled(b, ray.d), v - lean, normal))
-        if not in_images:
-            # S D; in images it is W
-            up = (away * (1.0 - ray.height * v) + ray.beta * ray.rho2) * ray.inv_h
-            q = beyond(scaled(away * b + ray.beta, ray.d), -up, normal)
-            _add_nine(room, BY_P * TILE + j, away * c, a, g, q)
+        _add_nine(room, BY_Q * TILE + j, c, w, g, beyond(scaled(b, ray.d), v - lean, ray.normal))
         # delta by n over d: y r^2 L^2 / kappa^3
         inv_k2 = 1.0 / (ray.kappa * ray.kappa)
         by_n = ray.y * lean * ray.bend * ray.length2 * inv_k2 if ray.bend < 1.0 else 0.0
@@ -365,7 +330,7 @@ def _add_noise(
     for j in range(marks.size):
         ray = _ray_of(room, tile, marks, j, sight)
         w = _weight(ray, sight)
-        _, g, c, b, v = _effect(ray, w, True)
+        g, c, b, v = _effect(ray, w)
         # S delta = across (c W tau + along (d.tau) g), with tau across N, where c W N = -v g
         across = budget.waves * ray.y * (1.0 - ray.height * ray.lean)
         along = b + ray.lean * ray.lean
@@ -411,7 +376,7 @@ def add_errors(
         sight = Sight(
             row_of(rig.centres, c), rig.offset[c], row_of(rig.axes, c), rig.focal_px[c] ** 2, bend
         )
-        _add_common(room, tile, marks[k], sight, budget.in_images)
+        _add_common(room, tile, marks[k], sight)
         if budget.by_ray:
             _add_noise(room, tile, marks[k], sight, budget)
 
@@ -436,14 +401,8 @@ def finish_tile(
         # half the trace: k for k rays in space, as in `nearest_point`
         half = 0.5 * (m[0] + m[4] + m[8])
         solved = (k >= 2.0) & (det >= MIN_DETERMINANT * half * half * half)
-        by_noise = b
-        if not budget.in_images:
-            # Q moves with P by (sum M)^-1 (sum M D), and P by (sum W)^-1
-            full, by_sight = inverse_of(_symmetric(sums, SIGHT * TILE + j))
-            by_noise = _product(_product(b, nine(sums, BY_P * TILE + j)), by_sight)
-            solved &= full > 0.0
-        noise = _product(by_noise, _symmetric(sums, NOISE * TILE + j))
-        x, y, z = by_noise[0:3], by_noise[3:6], by_noise[6:9]
+        noise = _product(b, _symmetric(sums, NOISE * TILE + j))
+        x, y, z = b[0:3], b[3:6], b[6:9]
         cov = (
             dot(noise[0:3], x), dot(noise[0:3], y), dot(noise[0:3], z),
             dot(noise[3:6], y), dot(noise[3:6], z), dot(noise[6:9], z),
