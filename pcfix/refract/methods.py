@@ -152,26 +152,21 @@ def _method(batch: Batch) -> str:
 def with_rays(batch: Batch, shift_m: FloatArray | None = None) -> Batch:
     """Return the batch with its cameras chosen, without occluded ones.
 
-    They are those of its view list, of the model of a matcher, or all in frame. With the model,
-    `consistent` takes all images that may have a depth of the point, and weights them; the other
-    methods get the steepest image and those it was matched with. With `shift_m`, shape (m, 3), the
-    frames hold the images of the true points instead of the apparent points.
+    They are those of its view list, or all in frame; with the model of a matcher, all images that
+    may have a depth of the point. With `shift_m`, shape (m, 3), the frames hold the images of the
+    true points instead of the apparent points.
     """
-    from pcfix.refract.matcher import steepest_and_partners, without_border
+    from pcfix.refract.matcher import without_border
     from pcfix.refract.occlusion import visible_cameras
 
     survey, centres = batch.survey, batch.survey.cameras.centres
     occluder = survey.learned.occluder
-    matcher = survey.learned.matcher if batch.views is None else None
-    seeds = None if survey.settings.method == "consistent" else matcher
     inner = survey
-    if matcher is not None:
+    if survey.learned.matcher is not None and batch.views is None:
         inner = replace(survey, cameras=without_border(survey.cameras))
     views = chosen_views(replace(batch, survey=inner), shift_m)
     if occluder is not None:
         views = visible_cameras(batch.xyz, centres, views, occluder)
-    if seeds is not None:
-        views = steepest_and_partners(batch.xyz, centres, views, seeds)
     return replace(batch, views=views)
 
 

@@ -231,7 +231,7 @@ def rows_of(case: Case, seed: int) -> list[dict[str, Any]]:
         (method, name, {**options, "max_angle": None})
         for method in METHODS
         for name, options in case.known.items()
-        if name != "pairs" or method == "consistent"
+        if name not in ("pairs", "mvs") or method == "consistent"
     ]
     return rows + [row_of(case, *one) for one in runs]
 
