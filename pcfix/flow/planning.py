@@ -225,13 +225,6 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
     notes = [*plan.notes, *coded("cloud.depth_factor", [] if factor is None else [factor])]
     if factor is not None:
         survey, given = sample.survey, replace(given, depth_factor=factor.factor)
-    ratio = None if ties is None else learning.depth_ratio(learning.submerged_of(sample), ties)
-    if ratio is not None and ratio > learning.CORRECTED_RATIO:
-        sentence = (
-            f"The cloud is {ratio:.2f} times as deep as the tie points of its cameras, as if it"
-            " had been corrected before. Give the cloud as the matcher wrote it."
-        )
-        notes.append(PcfixWarning("cloud.corrected_before", sentence, ratio=ratio))
     hint = hint_of(plan.options.software or view.software)
     if plan.kind is None:
         survey, verdicts = learning.learn_of_sample(sample, ties, hint, near)

@@ -238,32 +238,6 @@ def _learn_bed(batch: Batch) -> Bed | None:
     return bed_of(batch.xyz[order], table, gsd_m(batch)) if np.isfinite(table).any() else None
 
 
-LEAST_TIES, LEAST_DEPTH_M = 50, 0.3
-CORRECTED_RATIO = 1.2
-"""Ratio of the depth of a cloud to that of its tie points, above which the cloud was probably
-corrected before: uncorrected it is near 1, corrected 1.34 and more."""
-
-
-def depth_ratio(batch: Batch, ties: TiePoints) -> float | None:
-    """Return the median ratio of the depth of submerged points to that of tie points near them.
-
-    None for few tie points.
-    """
-    from scipy.spatial import cKDTree
-
-    xyz = ties.xyz[np.isfinite(ties.xyz).all(axis=1)]
-    if len(batch) < LEAST_TIES or len(xyz) < LEAST_TIES:
-        return None
-    near_m = 3.0 * float(np.sqrt(np.ptp(batch.xyz[:, :2], axis=0).prod() / len(batch)))
-    apart_m, near = cKDTree(batch.xyz[:, :2]).query(xyz[:, :2])
-    found = np.asarray(apart_m) < near_m
-    row = np.asarray(near)[found]
-    level = batch.surface.height_m[row]
-    depth, tie_depth = level - batch.xyz[row, 2], level - xyz[found, 2]
-    deep = tie_depth > LEAST_DEPTH_M
-    return float(np.median(depth[deep] / tie_depth[deep])) if deep.sum() >= LEAST_TIES else None
-
-
 def weigh_lists(batch: Batch, *, is_open: bool) -> Verdict | None:
     """Decide what the view lists of submerged points contain, or test the type set by the user.
 

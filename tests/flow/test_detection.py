@@ -10,11 +10,10 @@ from scipy.spatial import cKDTree
 
 import pcfix
 from pcfix.flow import planning
-from pcfix.model import TiePoints
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract import patches
 from pcfix.refract.batch import Batch, Survey
-from pcfix.refract.learning import CORRECTED_RATIO, depth_ratio, learn_of_sample
+from pcfix.refract.learning import learn_of_sample
 from pcfix.refract.patches import grid_m
 from pcfix.refract.reconstructions import IN_FRAME, hint_of
 from pcfix.water.surface import surface_above
@@ -127,19 +126,6 @@ def test_mesh():
     for points, is_mesh in ((scene.apparent_xyz, False), (xyz, True)):
         (verdict,) = told(points, scene)
         assert any("mesh or a filtered cloud" in one for one in verdict.remarks) is is_mesh
-
-
-def test_depth_ratio():
-    scene = scene_of()
-    above = surface_above(scene.water, scene.apparent_xyz)
-    rows = np.flatnonzero(wet(scene))
-    survey = Survey(scene.water, scene.cameras, ScienceOptions())
-    views = scene.views.take(rows[::20])
-    ties = TiePoints(scene.apparent_xyz[rows[::20]], views, np.zeros((len(views.camera), 2)))
-    came = Batch(scene.apparent_xyz, above, survey).take(rows)
-    done = replace(came, xyz=scene.true_xyz[rows])
-    assert depth_ratio(came, ties) == pytest.approx(1.0, abs=0.05)
-    assert depth_ratio(done, ties) > CORRECTED_RATIO + 0.1
 
 
 @pytest.mark.filterwarnings("ignore::pcfix.PcfixWarning")
