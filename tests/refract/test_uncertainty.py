@@ -118,29 +118,6 @@ def test_no_bias():
     assert np.abs(ratio.mean(axis=(0, 1))).max() < 0.1
 
 
-def test_positive():
-    bed, cameras, _ = scene(35.0, points=200)
-    found = in_frame(bed, flat(200), LEVEL, cameras, ScienceOptions())
-    cov = covariances(
-        bed, found.shift_m, flat(200), cameras, ScienceOptions(**vars(SOURCES["all"]))
-    )
-    full = cov[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-    assert (np.linalg.eigvalsh(full) > 0.0).all()
-
-
-def test_sources_add_up():
-    bed, cameras, _ = scene(35.0, points=50)
-    found = in_frame(bed, flat(50), LEVEL, cameras, ScienceOptions())
-    all_of_them = SOURCES["all"]
-
-    def cov(errors):
-        return covariances(bed, found.shift_m, flat(50), cameras, ScienceOptions(**vars(errors)))
-
-    parts = [cov(replace(NONE, **{name: getattr(all_of_them, name)})) for name in vars(all_of_them)]
-    # rounding only, of single precision, relative to the variance in z
-    np.testing.assert_allclose(sum(parts), cov(all_of_them), rtol=0, atol=3e-6 * parts[0].max())
-
-
 def test_other_points():
     bed, cameras, _ = scene(35.0, points=700)
     found = in_frame(bed, flat(700), LEVEL, cameras, ScienceOptions())

@@ -122,17 +122,6 @@ def test_rounded_heights():
     assert fit_water(np.column_stack([xy, z])).accepted.all()
 
 
-def test_notes():
-    rng = np.random.default_rng(2)
-    xy = rng.uniform(0, 100, (40, 2))
-    scattered = fit_water(np.column_stack([xy, rng.uniform(0, 3, 40)]), model="level")
-    assert scattered.notes
-    step = np.column_stack([xy, np.where(np.arange(40) < 22, 0.0, 1.0) + rng.normal(0, 0.01, 40)])
-    found = fit_water(step, model="level")
-    assert found.accepted.sum() == 22
-    assert found.notes
-
-
 @pytest.mark.parametrize(
     ("points", "model", "code"),
     [
