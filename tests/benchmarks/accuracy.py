@@ -7,10 +7,9 @@ clouds that COLMAP and OpenMVS made of rendered images (`REAL`). All numbers are
 points of a scene, those under more than 0.2 m of water, in ground sampling distances. Points that
 a method left uncorrected are not in its row; "done" is the share of the others.
 
-Cameras: "views" is the view list of the software; "pairs" the same images as those of stereo pairs;
-"mvs" a model of dense matching, which tracks and pairs are not; "all" every camera whose frame
-holds the point; "auto" what pcfix detects without any option. "In 95 %" is the share of points
-whose error in Z is within 1.96 SigmaZ.
+Cameras: "views" is the view list of the software; "mvs" a model of dense matching, which tracks are
+not; "all" every camera whose frame holds the point; "auto" what pcfix detects without any option.
+"In 95 %" is the share of points whose error in Z is within 1.96 SigmaZ.
 
 "floor" is the least-squares triangulation through the water from the listed images, with new
 noise of the same size, of 1000 points. Depth maps are matched anew for each map, so that there it
@@ -117,7 +116,6 @@ def simulated(name: str, points: int, seed: int) -> Case:
     known: dict[str, dict[str, Any]] = {"views": {"views": replace(scene.views, kind=kind)}}
     mvs = {"camera_set": "mvs"}
     if name == "pairs":
-        known["pairs"] = {"views": replace(scene.views, kind="pairs")}
         mvs["matcher"] = "pairs"
     measured, floor = measured_of(scene), None
     if kind == "tracks":
@@ -231,7 +229,7 @@ def rows_of(case: Case, seed: int) -> list[dict[str, Any]]:
         (method, name, {**options, "max_angle": None})
         for method in METHODS
         for name, options in case.known.items()
-        if name not in ("pairs", "mvs") or method == "consistent"
+        if name != "mvs" or method == "consistent"
     ]
     return rows + [row_of(case, *one) for one in runs]
 
