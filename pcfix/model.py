@@ -27,7 +27,7 @@ NOISE_CLASSES = LOW_NOISE, HIGH_NOISE = 7, 18
 Projection = Literal[
     "perspective", "equidistant", "equisolid", "polynomial", "fov", "dual", "division", "eucm"
 ]
-ViewKind = Literal["tracks", "depth-maps", "pairs", "pair-images"]
+ViewKind = Literal["tracks", "depth-maps", "pairs"]
 
 NOMINAL_WIDTH_PX = 5472.0
 """Width of the image of a lens in millimetres whose pixel size is unknown: that of a survey drone's
@@ -313,9 +313,8 @@ class Views:
 
     - `tracks`: the images whose rays were intersected;
     - `depth-maps`: the images whose depth maps were averaged, each matched with other images;
-    - `pairs`: entries 2i and 2i + 1 are the images of stereo pair i; the point is the median over
-      the pairs;
-    - `pair-images`: the images of such pairs; any two of them may have been matched.
+    - `pairs`: the images of stereo pairs, over which the point is the median; any two of them may
+      have been matched.
     """
 
     start: IntArray

@@ -203,11 +203,10 @@ def _chunks(
         heights = None
         if isinstance(water, WaterDimension):
             heights = cloud.dimension(water.name)[rows]
-        sources = ins["PointSourceId"][rows] if "PointSourceId" in ins else None
         has_colours = all(name in ins for name in COLOURS)
         rgb = np.column_stack([ins[name][rows] for name in COLOURS]) if has_colours else None
         yield rows, Points(
-            xyz, heights, cloud.classes[rows], sources, rgb, cloud.withheld[rows],
+            xyz, heights, cloud.classes[rows], rgb, cloud.withheld[rows],
             dimensions={name: values[rows] for name, values in known.items()},
         )  # fmt: skip
 

@@ -36,6 +36,7 @@ def test_declared(kind):
         ({"max_angle": "wide"}, "option.type", {"option": "max_angle", "value": "wide"}),
         ({"jobs": 2.5}, "option.type", {"option": "jobs"}),
         ({"jobs": "two"}, "option.type", {"option": "jobs"}),
+        ({"method": "snell", "camera_set": "mvs"}, "option.needs", {"option": "camera_set"}),
         ({"method": "snel"}, "option.choice", {"option": "method", "value": "snel"}),
         ({"index": 1.7}, "option.range", {"option": "index"}),
         ({"sigma_image": float("nan")}, "option.range", {"option": "sigma_image"}),

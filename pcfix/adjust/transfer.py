@@ -153,8 +153,6 @@ def renumbered(views: Views, row: IntArray) -> tuple[Views, IntArray]:
     """Return views with other camera numbers, without negative ones, and the entries that stay."""
     camera = row[np.asarray(views.camera)]
     stays = camera >= 0
-    if views.kind == "pairs":
-        stays = np.repeat(stays[::2] & stays[1::2], 2)
     entry = np.flatnonzero(stays)
     start = np.concatenate([[0], np.cumsum(stays)])[views.start]
     weight = None if views.weight is None else views.weight[entry]

@@ -28,7 +28,7 @@ def fit_check_depths(path: File, parts: Iterable[Part]) -> DepthRegression:
     -----
     The apparent depth at a check depth is the median of the nearest submerged points, 3 to 16,
     within four times the distance between neighbouring points there. Check depths with fewer are
-    excluded, with a note; an outlier is noted too, but used.
+    excluded, with a note.
     """
     checks, notes = read_check_depths(path), list[str]()
     apparent, level, nearest_m, radius = apparent_depths(checks.xy, parts)
@@ -71,10 +71,4 @@ def fit_check_depths(path: File, parts: Iterable[Part]) -> DepthRegression:
             least=LEAST_R2,
         )
     notes += found.notes
-    if found.outliers:
-        lines = ", ".join(str(checks.line[rows[i]]) for i in found.outliers[:5])
-        notes.append(
-            f"{checks.where(int(rows[found.outliers[0]]))}: {len(found.outliers)} check depths are"
-            f" outliers (lines {lines}) and were used. Correct or remove them."
-        )
     return replace(found, notes=tuple(notes))

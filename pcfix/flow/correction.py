@@ -169,7 +169,7 @@ def batch_of(points: Points, survey: Survey, original: Cameras | None) -> Batch:
     if original is not None and points.original_xyz is not None:
         model = OriginalModel(points.original_xyz, original)
     above = surface_above(survey.water, points.xyz, points.heights)
-    return Batch(points.xyz, above, survey, original_model=model, source=points.sources)
+    return Batch(points.xyz, above, survey, original_model=model)
 
 
 def correct_chunk(

@@ -26,7 +26,7 @@ from pcfix.io.tides import level_offsets, read_image_times, read_tide
 from pcfix.io.vectors import LAYER_MARK, read_water_polygons
 from pcfix.io.views import ViewList, read_views, track_views
 from pcfix.label.labelling import Labelling, WaterMask
-from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints, ViewKind
+from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints
 from pcfix.options.correct import LabelRules
 from pcfix.options.declare import File, OptionSet, options_of
 from pcfix.options.shared import InputOptions, MaskOption
@@ -113,8 +113,7 @@ class Inputs(MaskOption, InputOptions):
             views = read_views(self.views, cameras, to_cloud=to_cloud)
         if self.views_are == "auto":
             return cameras, views
-        kind: ViewKind = "pair-images" if self.views_are == "pairs" else self.views_are
-        return cameras, replace(views, listed=replace(views.listed, kind=kind))
+        return cameras, replace(views, listed=replace(views.listed, kind=self.views_are))
 
     def _georeferenced(self, read: Cameras, cloud_crs: str | CRS | None) -> Georeference:
         """Return the transformation from the frame of the camera file to the cloud's CRS."""

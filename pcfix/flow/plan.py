@@ -42,7 +42,7 @@ MOST_BASES, MOST_SPACINGS = 8, 4
 """Limits of the simulated block: farther inside, the geometry repeats."""
 FEWEST_SEEN = 50
 PARTS = {
-    "image": ("sigma_image",), "level": ("sigma_level", "sigma_tilt"), "waves": ("sigma_waves",),
+    "image": ("sigma_image",), "level": ("sigma_level",), "waves": ("sigma_waves",),
     "index": ("sigma_index",), "poses": ("sigma_centre", "sigma_attitude"),
 }  # fmt: skip
 """Parts of the error budget, and their options."""

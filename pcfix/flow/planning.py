@@ -23,7 +23,7 @@ from pcfix.label.labelling import Labelling
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, Views, WaterPlane
 from pcfix.options.correct import CorrectOptions
 from pcfix.refract import learning
-from pcfix.refract.batch import UNLISTED, Batch, Learned, Survey, require_orientation, stacked
+from pcfix.refract.batch import Batch, Learned, Survey, require_orientation, stacked
 from pcfix.refract.occlusion import Occluder, OccluderBuilder, wants_occlusion
 from pcfix.refract.patches import PATCH_WIDTH, Squares
 from pcfix.refract.reconstructions import hint_of
@@ -54,19 +54,12 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
         match = ViewMatch(blocks.views, blocks.listed, points=view.points, step_m=view.step_m)
         listed = blocks.views.listed
     if inputs.port is not None:
-        cameras, method = blocks.cameras, options.method
+        cameras = blocks.cameras
         require_orientation(cameras, "A port")
-        how = replace(options, method="consistent" if method == "auto" else method)
-        survey = Survey(WaterPlane(np.inf), cameras, how)
-        words = (
-            "Method snell ignores that the refracted rays of the apparent points miss each other"
-            " behind the port. Use --method consistent, best with --views."
-        )
-        notes = coded("port.ray_distance", [words] if method == "snell" else [])
+        survey = Survey(WaterPlane(np.inf), cameras, replace(options, method="consistent"))
         return Plan(
             options, inputs, view, survey, FoundSurface(survey.water), labelling_of(options, view),
             match, None if listed is None else listed.kind, input_notes=cameras.notes,
-            notes=tuple(notes),
         )  # fmt: skip
     found = inputs.surface(view)
     if match is None and not isinstance(options.cameras, Cameras):
@@ -127,13 +120,13 @@ def _check_port(options: CorrectOptions) -> None:
     excluded = {
         "camera_set": options.camera_set == "mvs",
         "occlusion": options.occlusion == "on",
-        "method": options.method not in ("auto", "snell", "consistent"),
+        "method": options.method not in ("auto", "consistent"),
     }
     for name in compress(excluded, excluded.values()):
         raise SettingError(
             "port.excludes",
             f"{name.replace('_', '-')} {getattr(options, name)} has no effect with a port."
-            " Omit it; the methods are snell and consistent.",
+            " Omit it; the method is consistent.",
             option=name,
         )
 
@@ -232,13 +225,6 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
     notes = [*plan.notes, *coded("cloud.depth_factor", [] if factor is None else [factor])]
     if factor is not None:
         survey, given = sample.survey, replace(given, depth_factor=factor.factor)
-    ratio = None if ties is None else learning.depth_ratio(learning.submerged_of(sample), ties)
-    if ratio is not None and ratio > learning.CORRECTED_RATIO:
-        sentence = (
-            f"The cloud is {ratio:.2f} times as deep as the tie points of its cameras, as if it"
-            " had been corrected before. Give the cloud as the matcher wrote it."
-        )
-        notes.append(PcfixWarning("cloud.corrected_before", sentence, ratio=ratio))
     hint = hint_of(plan.options.software or view.software)
     if plan.kind is None:
         survey, verdicts = learning.learn_of_sample(sample, ties, hint, near)
@@ -251,7 +237,7 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
         unlisted, verdicts = learning.learn_of_sample(
             replace(sample, survey=bare), ties, hint, near
         )
-        survey = replace(survey, parts={UNLISTED: unlisted})
+        survey = replace(survey, unlisted=unlisted)
         words = ["Points missing in the view list are corrected without it.", *map(str, verdicts)]
         notes.append(PcfixWarning("views.unlisted", " ".join(words)))
     return replace(plan, survey=survey, notes=tuple(notes))

@@ -105,7 +105,7 @@ def variances(
         step = replace(transfer, adjusted=survey.cameras).step(sample.xyz, sample.views)
         above = surface_above(survey.water, step.xyz, sample.heights)
         original = OriginalModel(sample.xyz, transfer.original)
-        found = correct(Batch(step.xyz, above, survey, step.views, original, source=sample.sources))
+        found = correct(Batch(step.xyz, above, survey, step.views, original))
         known = step.moved & (found.outcome == Outcome.CORRECTED)
         return np.where(known, step.xyz[:, 2] + found.shift_m[:, 2], np.nan)
 
@@ -118,19 +118,19 @@ def variances(
 
 
 def _survey_of(survey: Survey, members: Members, member: int) -> Survey:
-    """Return a survey with cameras and water of a member, in all its parts."""
-    parts = {key: _survey_of(one, members, member) for key, one in survey.parts.items()}
+    """Return a survey with cameras and water of a member, for points without a view list too."""
+    bare = survey.unlisted
     index = survey.settings.refractive_index + float(members.water[member, 3])
     return replace(
         survey,
         cameras=members.cameras(member, survey.cameras),
         water=members.surface(member, survey.water, survey.cameras),
         settings=replace(survey.settings, index=index),
-        parts=parts,
+        unlisted=None if bare is None else _survey_of(bare, members, member),
     )
 
 
 def with_poses(survey: Survey, poses: PoseErrors | None) -> Survey:
-    """Return a survey with the errors of its poses, in all its parts."""
-    parts = {key: with_poses(one, poses) for key, one in survey.parts.items()}
-    return replace(survey, learned=survey.learned._replace(poses=poses), parts=parts)
+    """Return a survey with the errors of its poses, for points without a view list too."""
+    bare = None if survey.unlisted is None else with_poses(survey.unlisted, poses)
+    return replace(survey, learned=survey.learned._replace(poses=poses), unlisted=bare)

@@ -34,7 +34,7 @@ from pcfix.model import (
 )
 from pcfix.options.declare import File
 from pcfix.options.shared import WaterOptions
-from pcfix.water.surface import FoundSurface, OwnWater, build_fields, surface_above
+from pcfix.water.surface import Field, FoundSurface, build_fields, surface_above
 
 if TYPE_CHECKING:
     from pcfix.io.views import ViewMatch
@@ -177,12 +177,11 @@ def own_water_of(
     water: WaterSurface,
     view: CloudView,
     level_offset_m: FloatArray | None = None,
-) -> tuple[OwnWater | None, tuple[str, ...]]:
+) -> tuple[Field | None, tuple[str, ...]]:
     """Return the separate water surfaces of images, and notes on them.
 
-    The folder has rasters named after the images, and their standard errors in a folder ``sigma``.
-    `water` is that of the other images, and `level_offset_m`, shape (k,), how much higher the water
-    stood at each image.
+    The folder has rasters named after the images. `water` is that of the other images, and
+    `level_offset_m`, shape (k,), how much higher the water stood at each image.
     """
     if folder is None:
         return None, ()
@@ -196,15 +195,12 @@ def own_water_of(
     west, south, east, north = view.bounds
     paths, notes = rasters_of_images(folder, cameras.labels)
     offset = np.zeros(len(cameras)) if level_offset_m is None else level_offset_m
-    heights, sigma = dict[int, WaterRaster](), dict[int, WaterRaster]()
+    heights = dict[int, WaterRaster]()
     overlaps, differs = [], list[float]()
     with warnings.catch_warnings():  # those of the first raster are enough
         for image, path in paths.items():
             heights[image] = raster = read_water_raster(path, view.crs)
             warnings.simplefilter("ignore", PcfixWarning)
-            error = path.parent / "sigma" / path.name
-            if error.is_file():
-                sigma[image] = read_water_raster(error, view.crs)
             # the rasters must overlap the cloud, and have the vertical datum of the common water
             rows, columns = np.nonzero(np.isfinite(raster.height_m))
             x = raster.left_m + (columns + 0.5) * raster.cell_m[0]
@@ -215,9 +211,6 @@ def own_water_of(
                 off = raster.height_m[rows, columns] - common
                 if np.isfinite(off).any():
                     differs.append(float(np.nanmedian(off)))
-    if len(sigma) < len(heights):
-        lost = len(heights) - len(sigma)
-        notes += (f"{folder}: {lost} rasters have no standard errors in the folder sigma.",)
     if np.isfinite(west) and not any(overlaps):
         text = f"{folder}: none of its rasters overlaps the cloud. Check their CRS."
         raise InputError("water.no_overlap", text, path=folder)
@@ -230,7 +223,7 @@ def own_water_of(
             path=folder, difference_m=off_m,
         )  # fmt: skip
     k, rest = len(cameras), water if isinstance(water, WaterRaster) else None
-    return OwnWater(build_fields(heights, k, rest), build_fields(sigma, k)), notes
+    return build_fields(heights, k, rest), notes
 
 
 def _found(view: CloudView | None) -> FoundSurface:

@@ -45,7 +45,6 @@ class Points(NamedTuple):
     xyz: FloatArray  # (n, 3), world frame, metres
     heights: FloatArray | None  # (n,), of the water above each, if a dimension has it
     classes: npt.NDArray[np.uint8]  # (n,)
-    sources: IntArray | None = None  # (n,), point source IDs
     rgb: npt.NDArray[Any] | None = None  # (n, 3)
     withheld: BoolArray | None = None  # (n,)
     original_xyz: FloatArray | None = None  # (n, 3), before the transfer to adjusted cameras
@@ -100,7 +99,6 @@ def points_of(
         coordinates(chunk),
         heights,
         np.asarray(chunk["classification"]),
-        np.asarray(chunk["point_source_id"]),
         np.column_stack([chunk.array[one] for one in RGB]) if has_colours else None,
         np.asarray(chunk["withheld"]).astype(np.bool_),
         dimensions={name: source.dimension(chunk, name) for name in names},

@@ -7,9 +7,9 @@ place beyond the image of the fold no direction. Both are NaN.
 For the kernels a lens is a flat array of numbers, see `coefficients`; several lenses, padded with
 zeros, are the rows of a table.
 
-In Brown's formula, places are relative to the centre of distortion. It is used inside the largest
-disc in which the symmetric part of its Jacobian is positive definite: on a disc that is enough for
-no two places to have the same image. Without tangential terms it is the disc up to the fold, where
+In Brown's formula, places are relative to the centre of distortion. It is used inside a disc in
+which the symmetric part of its Jacobian is positive definite: on a disc that is enough for no two
+places to have the same image. Without tangential terms it is the disc up to the fold, where
 d r' / d r = 0.
 """
 
@@ -108,7 +108,7 @@ def coefficients(lens: Lens) -> FloatArray:
     c = np.concatenate([c, radial, lens.denominator, shape])
     c[LARGEST_ANGLE] = largest_angle(lens)
     c[LARGEST_RADIUS] = largest_radius(c)
-    c[DISC] = largest_disc(lens, c)
+    c[DISC] = largest_disc(lens)
     return c
 
 
@@ -520,47 +520,24 @@ def undistorted(c: FloatArray, u: float, v: float) -> tuple[float, float]:
     return np.nan, np.nan
 
 
-def largest_disc(lens: Lens, c: FloatArray) -> float:
-    """Return the radius of the disc where Brown's formula is one to one; may be infinite."""
-    # the radial fold: the smallest r with d r' / d r = 0, or at which r' is infinite
+def largest_disc(lens: Lens) -> float:
+    """Return the radius of a disc where Brown's formula is one to one; may be infinite.
+
+    The symmetric part of its Jacobian has the eigenvalues g and g + 2 q g' of the radial terms,
+    q = r^2, less at most the `bound` of the tangential and thin prism terms.
+    """
+    r, q = Polynomial((0.0, 1.0)), Polynomial((0.0, 0.0, 1.0))
     above, below = Polynomial((1.0, *lens.radial)), Polynomial((1.0, *lens.denominator))
-    twice_q = Polynomial((0.0, 2.0))
-    slope = (above + twice_q * above.deriv()) * below - twice_q * above * below.deriv()
-    fold = float(np.sqrt(min(first_root(slope), first_root(below))))
-    if any(lens.tangential) or any(lens.thin_prism):
-        return float(_first_bend(c, fold))
-    return fold
-
-
-_DIRECTIONS, _RADII_PER_DECADE = 72, 40
-
-
-@device
-def _bends(c: FloatArray, r: float) -> bool:
-    """Whether the symmetric part of the Jacobian is anywhere not positive definite on a circle."""
-    for i in range(_DIRECTIONS):
-        turn = 2.0 * np.pi * i / _DIRECTIONS
-        _, _, (a, b, d, e) = distorted(c, r * np.cos(turn), r * np.sin(turn))
-        if not (a + e > 0.0 and a * e > 0.25 * (b + d) * (b + d)):
-            return True
-    return False
-
-
-@kernel
-def _first_bend(c: FloatArray, fold: float) -> float:
-    """Return the smallest radius that bends: a fine series of radii, then bisection."""
-    low = 0.0
-    for step in range(-3 * _RADII_PER_DECADE, 6 * _RADII_PER_DECADE):
-        high = min(10.0 ** (step / _RADII_PER_DECADE), fold)
-        if _bends(c, high):
-            for _ in range(50):
-                middle = 0.5 * (low + high)
-                if _bends(c, middle):
-                    high = middle
-                else:
-                    low = middle
-            return low
-        if high == fold:
-            return fold
-        low = high
-    return fold
+    # g = above / below; the slope of r' is this over below^2, all by q
+    slope = (above + 2.0 * r * above.deriv()) * below - 2.0 * r * above * below.deriv()
+    above, below, slope = above(q), below(q), slope(q)
+    p1, p2, p3, p4 = np.abs((*lens.tangential, 0.0, 0.0, 0.0, 0.0)[:4])
+    s1, s2, s3, s4 = (*lens.thin_prism, 0.0, 0.0, 0.0, 0.0)[:4]
+    p = np.hypot(p1, p2)
+    bound = r * (6.0 * p + 2.0 * np.hypot(s1, s3) + q * (12.0 * p * p3 + 4.0 * np.hypot(s2, s4)))
+    bound += 18.0 * p * p4 * r**5
+    if lens.in_turn:  # these terms are those of the place after the radial terms, r' = r g
+        most = first_root(1.0 - bound)
+        return min(first_root(slope), first_root(below), first_root(below - r * above / most))
+    left = (slope - bound * below**2, above - bound * below, below)
+    return min(first_root(one) for one in left)

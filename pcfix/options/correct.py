@@ -50,8 +50,8 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     method: Method = option("auto", basic=True)
     """Correction method. auto: consistent if the cameras have angles and lenses, else snell."""
     camera_set: Literal["auto", "mvs", "all"] = option("auto", with_cameras=True)
-    """Cameras used when there is no view list: every visible camera (all), or those that a dense
-    matcher would use (mvs); auto: mvs with --method consistent, else all."""
+    """Cameras used when there is no view list: every visible camera (all) or, with --method
+    consistent only, those that a dense matcher would use (mvs); auto: mvs with consistent."""
     matcher: Literal["depth-maps", "single-map", "nearest-map", "pairs"] = option(
         "depth-maps", with_cameras=True
     )
@@ -82,6 +82,17 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     [default: the refractive index]"""
     index_from: str = ""
     """The water of the index, if it was not given as a number; not an option."""
+
+    def check(self) -> None:
+        """Check that a matcher is modelled for `consistent` only."""
+        if self.camera_set == "mvs" and self.method not in ("auto", "consistent"):
+            raise SettingError(
+                "option.needs",
+                f"camera-set mvs needs method consistent, not {self.method}. For the other methods"
+                " it is worse than all cameras.",
+                option="camera_set",
+                needs="method consistent",
+            )
 
     @property
     def needs_cameras(self) -> bool:
@@ -115,8 +126,7 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     @property
     def models_matcher(self) -> bool:
         """Whether a model of dense matching replaces a view list."""
-        automatic = self.camera_set == "auto" and self.method in ("auto", "consistent")
-        return automatic or self.camera_set == "mvs"
+        return self.camera_set != "all" and self.method in ("auto", "consistent")
 
     @property
     def chooses_maps(self) -> bool:
@@ -131,8 +141,6 @@ class BudgetOptions(OptionSet, panel=Panel.BUDGET):
     """Standard deviation of an image coordinate. [px]"""
     sigma_level: float | None = option(None, least=0)
     """Standard deviation of the water level. [m] [default: that of its fit, else 0.02]"""
-    sigma_tilt: float = option(0.0, least=0)
-    """Standard deviation of the tilt of the water surface, about each axis. [deg]"""
     sigma_index: float = option(0.002, least=0)
     """Standard deviation of the refractive index."""
     sigma_waves: float = option(0.0, least=0)

@@ -6,9 +6,9 @@ There is no water surface between camera and point, and the direction of up does
 
 A dense cloud has no image places, but its points stand for them: software without a port model puts
 the point P where straight lines from the projection centres meet best. So the line from a centre C
-to P has the direction of the image place, except for the residual of that adjustment. `snell`
-ignores it. Through a flat port it is large, a hundred pixels and more if many images of a camera
-calibrated in air see a point. `consistent` uses it, as `pcfix.refract.tracks` at a water surface:
+to P has the direction of the image place, except for the residual of that adjustment. Through a
+flat port it is large, a hundred pixels and more if many images of a camera calibrated in air see a
+point. So the intersection of the refracted rays is only the start, as in `pcfix.refract.tracks`:
 the software reconstructs from the image points x_i of a true point Q the point P with the least
 squared residuals in the images, over straight rays. There the derivative by P is zero,
 
@@ -102,13 +102,6 @@ class Rig(NamedTuple):
     n: float  # refractive index of the water
 
 
-class Rule(NamedTuple):
-    """Which rays count, and what is computed of them."""
-
-    least_cosine: float  # of the largest incidence angle, in air at the inner face
-    is_consistent: bool
-
-
 class Sigmas(NamedTuple):
     """Standard deviations: of an image place of each camera in the unit of its lens, and others."""
 
@@ -128,15 +121,15 @@ def correct_through_port(
     """Correct points reconstructed with straight rays under water, with their uncertainty.
 
     Snell's law at each face (Skarlatos & Agrafiotis 2018, eq 10), then the point nearest to all
-    rays (eq 11), and with the method consistent the point that has the images of the apparent one.
+    rays (eq 11), and from there the point that has the images of the apparent one.
 
     The apparent points, shape (m, 3), world frame, are all under water. Poses are correct, and all
     cameras have the same port; a lens that absorbed it needs `pcfix adjust` first. Without view
-    lists a point has every camera whose frame holds the image of the true point (method consistent)
-    or of the apparent one. The incidence angle is that in air at the inner face.
+    lists a point has every camera whose frame holds the image of the true point. The incidence
+    angle is that in air at the inner face.
 
     The ray distance is that of the rays through the apparent point; a ray that does not meet the
-    port is ignored. Points without a solution of `consistent` get that of `snell`, with a warning.
+    port is ignored. Points without a solution get the intersection of these rays, with a warning.
     Covariances are zero if fewer than two rays meet. Raises SettingError without angles or lenses.
     """
     require_orientation(cameras, "A port")
@@ -153,10 +146,7 @@ def correct_through_port(
         settings.refractive_index,
     )
     limit = settings.limit_deg
-    rule = Rule(
-        least_cosine=0.0 if limit is None else float(np.cos(np.radians(limit))),
-        is_consistent=settings.method == "consistent",
-    )
+    least_cosine = 0.0 if limit is None else float(np.cos(np.radians(limit)))
     sigmas = Sigmas(
         settings.sigma_image * np.array([lens.pixel_size for lens in lenses]),
         settings.sigma_index,
@@ -168,13 +158,11 @@ def correct_through_port(
     used = np.zeros(len(cameras), np.bool_)
     in_tiles(
         _correct, -(-m // TILE), spatial_order(xyz), np.ascontiguousarray(xyz), lists, rig, frames,
-        rule, sigmas, (result, covariance, used),
+        least_cosine, sigmas, (result, covariance, used),
     )  # fmt: skip
     outcome = result[:, _OUTCOME].astype(np.uint8)
     moved = outcome == CORRECTED
-    warn_of_unsolved(
-        "method consistent found no solution behind the port", result[moved, _FOUND] > 0.0
-    )
+    warn_of_unsolved("no solution was found behind the port", result[moved, _FOUND] > 0.0)
     return Intersection(
         shift_m=result[:, :3],
         outcome=outcome,
@@ -190,7 +178,8 @@ def correct_through_port(
 @kernel(allocates=True)
 def _correct(
     span: Span, order: IntArray, xyz: FloatArray, lists: tuple[IntArray, IntArray], rig: Rig,
-    frames: Frames, rule: Rule, sigmas: Sigmas, found: tuple[FloatArray, FloatArray, BoolArray],
+    frames: Frames, least_cosine: float, sigmas: Sigmas,
+    found: tuple[FloatArray, FloatArray, BoolArray],
 ) -> None:  # fmt: skip
     """Correct the points of each tile, by the cameras of their lists or, if empty, in the frame."""
     (start, camera), (result, covariance, used) = lists, found
@@ -202,10 +191,10 @@ def _correct(
         for i in rows:
             point, row = row_of(xyz, i), result[i]
             some = camera[start[i] : start[i + 1]] if start.size else near
-            chosen = _usable(some, point, rig, frames, rule, False)
-            _solve(row, point, chosen, rig, rule.is_consistent)
+            chosen = _usable(some, point, rig, frames, least_cosine, False)
+            _solve(row, point, chosen, rig)
             # without a list: the cameras that image the true point, which depends on them
-            for _ in range(ROUNDS if rule.is_consistent and not start.size else 0):
+            for _ in range(0 if start.size else ROUNDS):
                 shift = vector(row)
                 # the straight line to a true point may miss a frame that its refracted light
                 # reaches, by at most the shift
@@ -213,11 +202,11 @@ def _correct(
                 if reach > wide:
                     wide = 2.0 * reach
                     near = near_cameras(every, frames, rig.centres, low - wide, high + wide)
-                imaging = _usable(near, plus(point, shift), rig, frames, rule, True)
+                imaging = _usable(near, plus(point, shift), rig, frames, least_cosine, True)
                 if are_same(imaging, chosen):
                     break
                 chosen = imaging
-                _solve(row, point, chosen, rig, rule.is_consistent)
+                _solve(row, point, chosen, rig)
             if row[_OUTCOME] == CORRECTED:
                 row[_COUNT] = chosen.size
                 _set_covariance(covariance[i], plus(point, vector(row)), chosen, rig, sigmas)
@@ -227,8 +216,9 @@ def _correct(
 
 @device(allocates=True)
 def _usable(
-    candidates: IntArray, point: Vector, rig: Rig, frames: Frames, rule: Rule, through: bool
-) -> IntArray:
+    candidates: IntArray, point: Vector, rig: Rig, frames: Frames, least_cosine: float,
+    through: bool,
+) -> IntArray:  # fmt: skip
     """Return the cameras that give a ray, in their order.
 
     The point is imaged along a straight line, or `through` the port.
@@ -242,14 +232,14 @@ def _usable(
             w = light_through(rig.port, rig.n, *w)
             x = transposed_times(r, w)
         steep = cosine_at_port(window, w)
-        if steep > 0.0 and steep >= rule.least_cosine and holds(frames, c, scaled(-1.0, x)):
+        if steep > 0.0 and steep >= least_cosine and holds(frames, c, scaled(-1.0, x)):
             usable[k] = c
             k += 1
     return usable[:k]
 
 
 @device(allocates=True)
-def _solve(row: FloatArray, point: Vector, chosen: IntArray, rig: Rig, is_consistent: bool) -> None:
+def _solve(row: FloatArray, point: Vector, chosen: IntArray, rig: Rig) -> None:
     """Intersect the rays of a point and search the true point; fill in a row of the result."""
     window, sums, least, k = window_of(rig.port), np.zeros(9), 1.0, 0
     for c in chosen:
@@ -272,8 +262,7 @@ def _solve(row: FloatArray, point: Vector, chosen: IntArray, rig: Rig, is_consis
     elif not solved:
         row[_OUTCOME] = PARALLEL
     else:
-        q, row[_FOUND] = _search(q, point, chosen, rig) if is_consistent else (q, True)
-        row[0], row[1], row[2] = q
+        (row[0], row[1], row[2]), row[_FOUND] = _search(q, point, chosen, rig)
         row[_DISTANCE], row[_COSINE], row[_OUTCOME] = distance, least, CORRECTED
 
 

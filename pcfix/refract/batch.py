@@ -8,7 +8,6 @@ cameras by its place in the image (`OriginalModel`, `Images`).
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -21,7 +20,7 @@ from pcfix.lens.algebra import Vector, dot, minus, normal_of, row_of, times, tra
 from pcfix.lens.imaging import direction_of, image_of, lens_table
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Outcome, Views, WaterSurface
 from pcfix.options.correct import ScienceOptions
-from pcfix.water.surface import OwnWater, SurfaceAbove
+from pcfix.water.surface import Field, SurfaceAbove
 
 if TYPE_CHECKING:
     from pcfix.refract.matcher import Bed, Matcher
@@ -37,9 +36,6 @@ FLAT_DEG = 35.0
 
 ALIKE = ("snell", "shan", "butler", "murase", "dietrich")
 """Methods that give all rays of a point the same weight."""
-
-UNLISTED, MAIN = -1, -2
-"""Points in no view list, and points of all other sources; see `Survey.parts`."""
 
 
 class Learned(NamedTuple):
@@ -91,9 +87,9 @@ class OriginalModel(NamedTuple):
 class Survey:
     """What all points of a cloud have in common.
 
-    `parts` are surveys of points with another reconstruction type than most, by their source, and
-    `UNLISTED` for those without a view list. `own_water` is the water of single images as rasters,
-    for ``snell`` and ``consistent``; beyond their edges the rays are refracted at `water`.
+    `unlisted` is the survey of points without an entry in the view list, if there are any.
+    `own_water` is the water of single images as rasters, for ``snell`` and ``consistent``; beyond
+    their edges the rays are refracted at `water`.
     """
 
     water: WaterSurface
@@ -101,8 +97,8 @@ class Survey:
     settings: ScienceOptions
     level_offset_m: FloatArray | None = None  # (k,), how much higher the water stood per image
     learned: Learned = field(default_factory=Learned)
-    parts: Mapping[int, Survey] = field(default_factory=dict)
-    own_water: OwnWater | None = None
+    unlisted: Survey | None = None
+    own_water: Field | None = None
 
     @property
     def limit_deg(self) -> float | None:
@@ -133,7 +129,6 @@ class Batch:
     views: Views | None = None
     original_model: OriginalModel | None = None
     level_sigma_m: FloatArray | None = None  # (m,), of the surface above each point, from its fit
-    source: IntArray | None = None  # (m,), point source IDs
 
     def take(self, rows: IntArray) -> Batch:
         """Return some of the points, in the order of `rows`."""
@@ -147,27 +142,20 @@ class Batch:
             views=None if self.views is None else self.views.take(rows),
             original_model=None if model is None else model._replace(xyz=model.xyz[rows]),
             level_sigma_m=None if sigma is None else sigma[rows],
-            source=None if self.source is None else self.source[rows],
         )
 
     def __len__(self) -> int:
         return len(self.xyz)
 
     def parts(self) -> list[tuple[IntArray, Batch]]:
-        """Return the rows and the batch of each of the `Survey.parts`."""
-        surveys = self.survey.parts
-        if not surveys:
+        """Return the points with a view list and those without: the rows and the batch of each."""
+        if self.survey.unlisted is None or self.views is None:
             return [(np.arange(len(self)), self)]
-        key = np.full(len(self), MAIN) if self.source is None else self.source.astype(np.int64)
-        key[~np.isin(key, list(surveys))] = MAIN
-        if self.views is not None and UNLISTED in surveys:
-            key[np.diff(self.views.start) == 0] = UNLISTED
-        parts = []
-        for one in np.unique(key):
-            rows = np.flatnonzero(key == one)
-            part = replace(self.take(rows), survey=surveys.get(int(one), self.survey))
-            parts.append((rows, replace(part, views=None) if one == UNLISTED else part))
-        return parts or [(np.arange(0), self)]
+        is_listed = np.diff(self.views.start) > 0
+        listed, others = np.flatnonzero(is_listed), np.flatnonzero(~is_listed)
+        bare = replace(self.take(others), survey=self.survey.unlisted, views=None)
+        parts = [(listed, self.take(listed)), (others, bare)]
+        return [part for part in parts if len(part[0])] or parts[:1]
 
     @property
     def rays(self) -> Views:
@@ -228,7 +216,6 @@ class Batch:
 def stacked(batches: list[Batch]) -> Batch:
     """Join batches of one survey, without views; at least one."""
     models = [batch.original_model for batch in batches if batch.original_model is not None]
-    source = [batch.source for batch in batches if batch.source is not None]
     model = None
     if models:
         model = OriginalModel(np.vstack([one.xyz for one in models]), models[0].cameras)
@@ -240,7 +227,6 @@ def stacked(batches: list[Batch]) -> Batch:
             np.vstack([batch.surface.slope for batch in batches]),
         ),
         original_model=model,
-        source=np.concatenate(source) if source else None,
     )
 
 

@@ -34,9 +34,6 @@ MAX_ANGLE_WITHOUT_FRAMES_DEG = 80.0
 """Cameras without a lens have no frame to leave; nobody matches images as flat as this, and a
 block in another CRS is recognised by it."""
 
-"""More rays than a point can have; a view list may name a camera twice."""
-
-
 REACH = 0.03
 """Largest distance of the image of a true point from that of its apparent point, by the longer side
 of the frame: the residuals of refraction, which straight rays cannot fit."""
@@ -87,7 +84,7 @@ def shapes_of(survey: Survey) -> tuple[Tin | None, Field | None]:
     """Return a mesh, or the rasters of the images, for kernels; neither for a plane."""
     water, k = survey.water, len(survey.cameras)
     if survey.own_water is not None:
-        return None, survey.own_water.heights
+        return None, survey.own_water
     return (
         build_tin(water) if isinstance(water, WaterMesh) else None,
         build_fields({}, k, water) if isinstance(water, WaterRaster) else None,
@@ -153,15 +150,6 @@ def near_borders(batch: Batch, shift_m: FloatArray) -> IntArray:
         rig_of(survey), *frames, shift_m, found, points=len(batch),
     )  # fmt: skip
     return np.flatnonzero(found)
-
-
-def cameras_of_pairs(pairs: Views) -> Views:
-    """Return the cameras in each point's pairs, each once, in the order of the list."""
-    camera = np.asarray(pairs.camera, np.int64)
-    owner = np.repeat(np.arange(len(pairs.start) - 1), np.diff(pairs.start))
-    _, first = np.unique(owner * (camera.max(initial=0) + 1) + camera, return_index=True)
-    kept = np.sort(first)
-    return Views(np.searchsorted(owner[kept], np.arange(len(pairs.start))), camera[kept])
 
 
 @kernel(allocates=True)

@@ -18,6 +18,8 @@ own, see `Survey.own_water`.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
@@ -46,6 +48,17 @@ from pcfix.water.surface import Field, Tin
 
 # Columns of the result: a row is one cache line, as points are written in scattered order.
 _DISTANCE, _INCIDENCE, _COUNT, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6, 7, 8
+
+
+class RayInputs(NamedTuple):
+    """All points and cameras, which rays count, and the water if it is no plane, for kernels."""
+
+    points: Chosen
+    rig: Rig
+    frames: Frames
+    rule: Rule
+    tin: Tin | None
+    fields: Field | None
 
 
 def intersect(batch: Batch) -> Intersection:
@@ -80,10 +93,10 @@ def _intersected(batch: Batch, optics: Optics | None) -> Intersection:
         rule, frames = rule._replace(least_cosine2=0.0), no_frames(len(survey.cameras))
     covariance = np.zeros((len(batch) if survey.settings.dimensions == "all" else 0, 6))
     errors = uncertainty.budget_of(survey), uncertainty.level_sigma_of(batch)
+    given = RayInputs(batch.chosen(), rig_of(survey), frames, rule, *shapes_of(survey))
     in_tiles(
-        _intersect, tiles_of(batch), spatial_order(batch.xyz), batch.chosen(), rig_of(survey),
-        frames, rule, optics, *shapes_of(survey), *errors, (result, used, covariance),
-        points=len(batch),
+        _intersect, tiles_of(batch), spatial_order(batch.xyz), given, optics, *errors,
+        (result, used, covariance), points=len(batch),
     )  # fmt: skip
     outcome = result[:, _OUTCOME].astype(np.uint8)
     moved = outcome == CORRECTED
@@ -102,11 +115,11 @@ def _intersected(batch: Batch, optics: Optics | None) -> Intersection:
 
 @kernel(allocates=True)
 def _intersect(
-    span: Span, order: IntArray, points: Chosen, rig: Rig, frames: Frames, rule: Rule,
-    optics: Optics | None, tin: Tin | None, fields: Field | None, budget: Budget,
+    span: Span, order: IntArray, given: RayInputs, optics: Optics | None, budget: Budget,
     level_sigma: FloatArray, found: tuple[FloatArray, BoolArray, FloatArray],
 ) -> None:  # fmt: skip
     """Intersect the rays of the points of each tile, of listed cameras or of those in frame."""
+    points, rig, frames = given.points, given.rig, given.frames
     centres, start, camera = rig.centres, points.start, points.camera
     result, used, covariance = found
     if optics is not None:  # of all cameras; the system provides what is used
@@ -126,9 +139,7 @@ def _intersect(
         else:
             near = tiling.near_cameras(around, frames, centres, low, high)
             marks = np.empty((near.size, rows.size))
-        seeing = _add_cameras(
-            sums, tile, marks, near, start.size > 0, rig, frames, rule, tin, fields, low, high
-        )
+        seeing = _add_cameras(sums, tile, marks, near, start.size > 0, given)
         _solve(result, used, rows, sums, marks[:seeing], near)
         if optics is not None:
             # tracks: search from the intersection, where there is one
@@ -137,8 +148,8 @@ def _intersect(
                 search[STATE * TILE + j] = SEARCHED if row[_OUTCOME] == CORRECTED else LOST
                 put(search, Q * TILE + j, vector(row))
             search_tile(
-                search, rays, tile, marks[:seeing], near[:seeing], rig, optics, points.n, tin,
-                fields,
+                search, rays, tile, marks[:seeing], near[:seeing], rig, optics, points.n,
+                given.tin, given.fields,
             )  # fmt: skip
             for j in range(rows.size):
                 row = result[rows[j]]
@@ -149,7 +160,7 @@ def _intersect(
                     row[_DISTANCE] = ray_distance(sums[9 * TILE + j], nine(sums, j), vector(row))
         if len(covariance):
             room = room_of(tile, result, rows)
-            uncertainty.add_errors(room, tile, marks[:seeing], near, rig, rule.bend, budget)
+            uncertainty.add_errors(room, tile, marks[:seeing], near, rig, given.rule.bend, budget)
             uncertainty.finish_tile(covariance, rows, room, tile, level_sigma, budget)
 
 
@@ -159,15 +170,14 @@ def _intersect(
 
 @device
 def _add_cameras(
-    sums: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray, listed: bool, rig: Rig,
-    frames: Frames, rule: Rule, tin: Tin | None, fields: Field | None, low: FloatArray,
-    high: FloatArray,
+    sums: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray, listed: bool,
+    given: RayInputs,
 ) -> int:  # fmt: skip
-    """Add the rays of the cameras `near` a tile, whose box is `low` to `high`.
+    """Add the rays of the cameras `near` a tile.
 
     The cameras that give a ray, and their marks, are moved to the front; returns how many they are.
     """
-    seeing = 0
+    rig, seeing = given.rig, 0
     for k in range(near.size):
         # the row of a camera that gives no ray is used again by the next one
         c, on, some = near[k], marks[seeing], True
@@ -175,8 +185,8 @@ def _add_cameras(
             for j in range(on.size):
                 on[j] = marks[k, j]
         else:
-            some = mark(on, tile, TILE, frames, c, rig.centres[c])
-        if some and add_camera(sums, tile, on, rig, c, rule, tin, fields):
+            some = mark(on, tile, TILE, given.frames, c, rig.centres[c])
+        if some and add_camera(sums, tile, on, rig, c, given.rule, given.tin, given.fields):
             near[seeing] = c
             seeing += 1
     return seeing

@@ -12,7 +12,7 @@ from pcfix.model import Cameras, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import ALIKE, FLAT_DEG, Batch, Survey, require_orientation
 from pcfix.refract.methods import batches, on_land, with_rays
-from pcfix.refract.patches import FEWEST_WITHOUT_LIST, gsd_m
+from pcfix.refract.patches import gsd_m
 from pcfix.refract.reconstructions import (
     IN_FRAME,
     LIMITS,
@@ -74,7 +74,7 @@ def wants_sample(survey: Survey, views: ViewKind | None) -> bool:
         return True
     if views is None:
         return _wants_matcher(survey) or _wants_limit(settings)
-    return views in ("depth-maps", "pair-images") and settings.method == "consistent"
+    return views in ("depth-maps", "pairs") and settings.method == "consistent"
 
 
 def with_factor(batch: Batch) -> tuple[Batch, StereoFactor | None]:
@@ -133,10 +133,6 @@ def learn_of_sample(
     survey without ``auto`` and the verdicts.
     """
     survey = batch.survey
-    if survey.settings.method == "auto":
-        found = _learn_of_sources(batch, ties, hint, near)
-        if found is not None:
-            return found
     if _wants_matcher(survey):
         survey = with_matcher(batch, ties)
     sample = replace(submerged_of(batch), survey=survey)
@@ -162,40 +158,6 @@ def learn_of_sample(
 def submerged_of(batch: Batch) -> Batch:
     """Return the submerged points of a batch."""
     return batch.take(np.flatnonzero(is_submerged(batch.xyz[:, 2], batch.surface)))
-
-
-MOST_SOURCES = 8
-"""More point sources are strips or images, and not clouds that were merged."""
-
-
-def _learn_of_sources(
-    batch: Batch, ties: TiePoints | None, hint: Hint | None, near: Batch | None
-) -> tuple[Survey, tuple[Verdict, ...]] | None:
-    """Learn from each point source separately; None if all have one reconstruction type."""
-    if batch.source is None:
-        return None
-    submerged = is_submerged(batch.xyz[:, 2], batch.surface)
-    source, count = np.unique(batch.source[submerged], return_counts=True)
-    large = source[count >= FEWEST_WITHOUT_LIST][np.argsort(count[count >= FEWEST_WITHOUT_LIST])]
-    if not 2 <= len(large) <= MOST_SOURCES:
-        return None
-    surveys, verdicts = dict[int, Survey](), list[Verdict]()
-    for one in large.tolist():
-        part = _of_source(batch, one)
-        own = None if near is None else _of_source(near, one)
-        surveys[one], found = learn_of_sample(part, ties, hint, own)
-        of = f"point source {one} ({100.0 * len(part) / len(batch):.0f} % of the points)"
-        verdicts += [verdict._replace(of=of) for verdict in found]
-    if len({verdict.chosen.words for verdict in verdicts if verdict.is_sure}) < 2:
-        return None
-    most = int(large[-1])
-    others = {one: survey for one, survey in surveys.items() if one != most}
-    return replace(surveys[most], parts=others), tuple(verdicts)
-
-
-def _of_source(batch: Batch, source: int) -> Batch:
-    """Return the points of one point source."""
-    return replace(batch.take(np.flatnonzero(batch.source == source)), source=None)
 
 
 def _weighed(sample: Batch, hint: Hint | None) -> tuple[Survey, tuple[Verdict, ...]]:
@@ -274,32 +236,6 @@ def _learn_bed(batch: Batch) -> Bed | None:
     for rows, part in zip(batches(np.arange(len(batch))), likely, strict=True):
         table[rows, : part.shape[1]] = part
     return bed_of(batch.xyz[order], table, gsd_m(batch)) if np.isfinite(table).any() else None
-
-
-LEAST_TIES, LEAST_DEPTH_M = 50, 0.3
-CORRECTED_RATIO = 1.2
-"""Ratio of the depth of a cloud to that of its tie points, above which the cloud was probably
-corrected before: uncorrected it is near 1, corrected 1.34 and more."""
-
-
-def depth_ratio(batch: Batch, ties: TiePoints) -> float | None:
-    """Return the median ratio of the depth of submerged points to that of tie points near them.
-
-    None for few tie points.
-    """
-    from scipy.spatial import cKDTree
-
-    xyz = ties.xyz[np.isfinite(ties.xyz).all(axis=1)]
-    if len(batch) < LEAST_TIES or len(xyz) < LEAST_TIES:
-        return None
-    near_m = 3.0 * float(np.sqrt(np.ptp(batch.xyz[:, :2], axis=0).prod() / len(batch)))
-    apart_m, near = cKDTree(batch.xyz[:, :2]).query(xyz[:, :2])
-    found = np.asarray(apart_m) < near_m
-    row = np.asarray(near)[found]
-    level = batch.surface.height_m[row]
-    depth, tie_depth = level - batch.xyz[row, 2], level - xyz[found, 2]
-    deep = tie_depth > LEAST_DEPTH_M
-    return float(np.median(depth[deep] / tie_depth[deep])) if deep.sum() >= LEAST_TIES else None
 
 
 def weigh_lists(batch: Batch, *, is_open: bool) -> Verdict | None:

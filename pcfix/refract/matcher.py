@@ -23,7 +23,7 @@ from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot, minus, row_of
 from pcfix.lens.frames import Frames, frames_of, with_border
 from pcfix.lens.imaging import project
-from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, Views
+from pcfix.model import Cameras, FloatArray, IntArray, TiePoints
 
 MATCHED, AVERAGED, NEIGHBOURS = 5, 8, 12
 NEAR, BASE_TO_HEIGHT, AXES_WITHIN_DEG, LEAST_NEAR = 12, (0.1, 0.5), 30.0, 3
@@ -235,27 +235,6 @@ def _score(sums: FloatArray, covered: int) -> float:
     if not SCALE_RANGE[0] <= sums[SCALES] / common <= SCALE_RANGE[1]:
         return 0.0
     return float(sums[TOTAL] * area)
-
-
-def steepest_and_partners(
-    xyz: FloatArray, centres: FloatArray, views: Views, matcher: Matcher
-) -> Views:
-    """Return the steepest of the images that see each point, and those that it was matched with.
-
-    Points, shape (m, 3), and centres, shape (k, 3), in the world frame.
-    """
-    owner = np.repeat(np.arange(len(xyz)), np.diff(views.start))
-    up = centres[views.camera] - xyz[owner]
-    steep = up[:, 2] / np.linalg.norm(up, axis=1)
-    best = np.full(len(xyz), -np.inf)
-    np.maximum.at(best, owner, steep)
-    reference = np.full(len(xyz), -1)
-    reference[owner[steep == best[owner]]] = views.camera[steep == best[owner]]
-    seed = reference[owner]
-    partner = (matcher.matched[seed] == np.asarray(views.camera)[:, None]).any(axis=1)
-    kept = partner | (views.camera == seed)
-    start = np.concatenate([[0], np.cumsum(np.bincount(owner[kept], minlength=len(xyz)))])
-    return Views(start, np.asarray(views.camera)[kept])
 
 
 POINTS_A_CELL = 12.0

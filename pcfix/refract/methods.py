@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.model import FloatArray, IntArray, Outcome, Views, WaterPlane
+from pcfix.model import FloatArray, IntArray, Outcome, WaterPlane
 from pcfix.refract.batch import Batch, Intersection, Survey
-from pcfix.refract.choice import cameras_of_pairs, chosen_views, is_bent, near_borders
+from pcfix.refract.choice import chosen_views, is_bent, near_borders
 from pcfix.refract.tiling import spatial_order
 from pcfix.refract.uncertainty import with_uncertainty
 from pcfix.water.surface import SurfaceAbove
@@ -65,8 +65,6 @@ def _without_limit(found: Intersection, batch: Batch) -> Intersection:
     part = replace(batch.take(few), survey=free)
     if survey.settings.limit_deg is None:
         return found.with_rows(few, _corrected(part))
-    if part.views is not None and part.views.kind == "pairs":
-        part = replace(part, views=cameras_of_pairs(part.views))
     flat = few[with_rays(part).counts >= 2]
     outcome = found.outcome.copy()
     outcome[flat] = Outcome.FLAT_RAYS
@@ -75,25 +73,19 @@ def _without_limit(found: Intersection, batch: Batch) -> Intersection:
 
 def _corrected(batch: Batch) -> Intersection:
     """Correct points of one reconstruction type."""
-    survey, views, pairs = batch.survey, batch.views, None
     name = _method(batch)
     module, function = name.split(".")
     method = getattr(import_module(f"pcfix.refract.{module}"), function)
-    if views is not None and views.kind == "pairs":
-        pairs, batch = views, replace(batch, views=cameras_of_pairs(views))
 
-    def solved(part: Batch, *listed: Views) -> Intersection:
-        return with_uncertainty(method(part, *listed), part)
+    def solved(part: Batch) -> Intersection:
+        return with_uncertainty(method(part), part)
 
     if name in _IN_FRAME and _takes_all_in_frame(batch):
         found = solved(batch)
     else:
         order = spatial_order(batch.xyz)
-        parts = []
-        for rows in batches(order):
-            listed = () if name != _PAIRS or pairs is None else (pairs.take(rows),)
-            parts.append(solved(with_rays(batch.take(rows)), *listed))
-        found = joined(parts, order, len(survey.cameras))
+        parts = [solved(with_rays(batch.take(rows))) for rows in batches(order)]
+        found = joined(parts, order, len(batch.survey.cameras))
     if name != METHODS["consistent"] or batch.views is not None:
         return found
     # an image shows the true point, near its border sometimes without the apparent one
@@ -140,7 +132,7 @@ def on_land(survey: Survey) -> Survey:
         settings=replace(survey.settings, index=1.0, dimensions="none"),
         level_offset_m=None,
         learned=survey.learned._replace(bed=None),
-        parts={},
+        unlisted=None,
         own_water=None,
     )
 
@@ -154,32 +146,27 @@ def _method(batch: Batch) -> str:
     kind = modelled if views is None else views.kind
     if kind in ("depth-maps", "single-map", "nearest-map"):
         return _MAPS
-    return _PAIRS if kind in ("pairs", "pair-images") else METHODS["consistent"]
+    return _PAIRS if kind == "pairs" else METHODS["consistent"]
 
 
 def with_rays(batch: Batch, shift_m: FloatArray | None = None) -> Batch:
     """Return the batch with its cameras chosen, without occluded ones.
 
-    They are those of its view list, of the model of a matcher, or all in frame. With the model,
-    `consistent` takes all images that may have a depth of the point, and weights them; the other
-    methods get the steepest image and those it was matched with. With `shift_m`, shape (m, 3), the
-    frames hold the images of the true points instead of the apparent points.
+    They are those of its view list, or all in frame; with the model of a matcher, all images that
+    may have a depth of the point. With `shift_m`, shape (m, 3), the frames hold the images of the
+    true points instead of the apparent points.
     """
-    from pcfix.refract.matcher import steepest_and_partners, without_border
+    from pcfix.refract.matcher import without_border
     from pcfix.refract.occlusion import visible_cameras
 
     survey, centres = batch.survey, batch.survey.cameras.centres
     occluder = survey.learned.occluder
-    matcher = survey.learned.matcher if batch.views is None else None
-    seeds = None if survey.settings.method == "consistent" else matcher
     inner = survey
-    if matcher is not None:
+    if survey.learned.matcher is not None and batch.views is None:
         inner = replace(survey, cameras=without_border(survey.cameras))
     views = chosen_views(replace(batch, survey=inner), shift_m)
     if occluder is not None:
         views = visible_cameras(batch.xyz, centres, views, occluder)
-    if seeds is not None:
-        views = steepest_and_partners(batch.xyz, centres, views, seeds)
     return replace(batch, views=views)
 
 

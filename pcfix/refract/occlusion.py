@@ -7,8 +7,7 @@ that ignores water puts every submerged object on the straight ray on which an i
 points of several images this is an approximation, as their straight rays pass each other.
 
 Everything below the surface counts as solid. Within `NEAR_CELLS` of P nothing is tested: a cell has
-one height, which on a cliff is the upper edge. Only under a roof, where all cells around P are
-higher, it matters whether the ray goes through it.
+one height, which on a cliff is the upper edge.
 
 A cell has the height of its second highest point, and at most that of the highest of its eight
 neighbours, so that neither a single flying point nor a single cell counts.
@@ -33,8 +32,6 @@ BLOCK, LARGE_BLOCK = 8, 64
 """Cells along the side of the blocks whose highest cell is known, to pass them at once. Without
 the larger ones rays take half as long again."""
 MARGIN_BLOCK = 16
-ROOF_MARGINS = 2.0
-"""Least height of a roof over the point, in margins; else it may be a low point of an even bed."""
 _ONWARD = 1e-6  # step past the edge of a cell into the next one, in cells
 
 CELLS_A_POINT = 16
@@ -60,7 +57,6 @@ class Occluder(NamedTuple):
     margin: Heights  # of each `BLOCK`: a ray must pass below the surface by more (noise)
     block_top: Heights  # the highest of each `BLOCK`; minus infinity where none is known
     large_block_top: Heights
-    roof: Heights  # the lowest within `NEAR_CELLS`; minus infinity where one is not known
 
 
 def occluded(xyz: FloatArray, centres: FloatArray, views: Views, occluder: Occluder) -> BoolArray:
@@ -109,20 +105,16 @@ def _occlude(
         # nothing in the cloud is higher
         if z + slack >= o.highest_m:
             continue
-        roofed = o.roof[int(v), int(u)] > z + ROOF_MARGINS * slack
         for entry in range(start[i], start[i + 1]):
             c = camera[entry]
             du, dv = (centres[c, 0] - xyz[i, 0]) / o.cell_m, (centres[c, 1] - xyz[i, 1]) / o.cell_m
             up, run = centres[c, 2] - z, np.sqrt(du * du + dv * dv)
-            if up <= 0.0:
-                continue
-            # straight above: only a roof can occlude it
-            if run < _ONWARD:
-                found[entry] = roofed
+            # below the point, or straight above it
+            if up <= 0.0 or run < _ONWARD:
                 continue
             # unit steps in plan, and the rise of the ray for each
             du, dv, rise = du / run, dv / run, up / run
-            found[entry] = _meets(o, u, v, z, du, dv, rise, run, slack, roofed)
+            found[entry] = _meets(o, u, v, z, du, dv, rise, run, slack)
 
 
 @device
@@ -142,38 +134,25 @@ def _to_edge(x: float, dx: float, side: int) -> float:
 @device
 def _meets(
     o: Occluder, u: float, v: float, z: float, du: float, dv: float, rise: float, run: float,
-    slack: float, roofed: bool,
+    slack: float,
 ) -> bool:  # fmt: skip
-    """Whether the ray pierces the roof over its point, or later leaves a cell below its height.
-
-    It pierces the roof where it rises above the surface within a cell, or where the surface falls
-    below the ray from one cell to the next by less than the margin `slack`; at the edge of the
-    roof it falls by more.
-    """
-    t = 0.0 if roofed else NEAR_CELLS
+    """Whether the ray leaves a cell below its height, by more than the margin `slack`."""
+    t = NEAR_CELLS
     while t < run:
         x, y, low = u + t * du, v + t * dv, z + t * rise
         if not _inside(o.height, x, y):
             return False
+        if low + slack >= o.highest_m:
+            return False
         row, column, side = int(y), int(x), 1
-        top = o.height[row, column]
-        # the roof ends between two cells
-        if roofed and top <= low:
-            if low - top < slack:
-                return True
-            roofed = False
-        if not roofed:
-            if low + slack >= o.highest_m:
-                return False
-            # pass a block whose highest cell is below the ray
-            if low + slack >= o.large_block_top[row // LARGE_BLOCK, column // LARGE_BLOCK]:
-                side = LARGE_BLOCK
-            elif low + slack >= o.block_top[row // BLOCK, column // BLOCK]:
-                side = BLOCK
+        # pass a block whose highest cell is below the ray
+        if low + slack >= o.large_block_top[row // LARGE_BLOCK, column // LARGE_BLOCK]:
+            side = LARGE_BLOCK
+        elif low + slack >= o.block_top[row // BLOCK, column // BLOCK]:
+            side = BLOCK
         # on to the edge of the cell or block
         t = min(t + min(_to_edge(x, du, side), _to_edge(y, dv, side)), run)
-        low = z + t * rise
-        if (roofed and top <= low) or (not roofed and side == 1 and low + slack < top):
+        if side == 1 and z + t * rise + slack < o.height[row, column]:
             return True
         t += _ONWARD
     return False
@@ -208,7 +187,7 @@ class OccluderBuilder:
 
     def build(self) -> Occluder | None:
         """Return the surface; None without points."""
-        from scipy.ndimage import maximum_filter, minimum_filter
+        from scipy.ndimage import maximum_filter
 
         cells = self._cells
         if not self._points:
@@ -229,7 +208,6 @@ class OccluderBuilder:
             margin=_margins(highest, second),
             block_top=_tops(known, BLOCK),
             large_block_top=_tops(known, LARGE_BLOCK),
-            roof=minimum_filter(known, 2 * int(NEAR_CELLS) + 1, mode="constant", cval=-np.inf),
         )
 
 

@@ -98,7 +98,7 @@ IN_FRAME = (
 LISTED = (
     Reconstruction(_TRACKS, {"method": "consistent"}, "tracks"),
     Reconstruction(_MAPS, {"method": "consistent"}, "depth-maps"),
-    Reconstruction(_PAIRS, {"method": "consistent"}, "pair-images"),
+    Reconstruction(_PAIRS, {"method": "consistent"}, "pairs"),
 )
 LIMITS = (
     Reconstruction("all rays", {"method": "snell"}),
@@ -158,7 +158,6 @@ class Verdict(NamedTuple):
     by: str = ""  # other evidence that decided; empty if the discontinuities did
     is_given: bool = False  # whether the user set the type
     remarks: tuple[str, ...] = ()  # what makes the evidence weak
-    of: str = ""  # the points it is about; empty for all
     straight: tuple[float, float] | None = None
 
     @property
@@ -204,14 +203,13 @@ class Verdict(NamedTuple):
 
     def __str__(self) -> str:
         way, other = "lower" if self.deeper_m >= 0.0 else "higher", self.runner_up.words
-        points = self.of[:1].upper() + self.of[1:] or "Cloud"
         how = "set by the user"
         if not self.is_given:
             by = f" by {self.by}" if self.by else ""
             how = f"detected{by}, confidence {100.0 * self.confidence:.0f} %"
         fit = ", which fits better" if self.is_given and self.is_against else ""
         text = (
-            f"{points}: {self.chosen.words} ({how}). Next best: {other}{fit}; the bed would be"
+            f"Cloud: {self.chosen.words} ({how}). Next best: {other}{fit}; the bed would be"
             f" {abs(self.deeper_m):.3f} m {way}."
         )
         if not self.patches or self.share > 0.5:
@@ -231,8 +229,6 @@ def reconstructions_of(batch: Batch) -> tuple[Reconstruction, ...]:
         return tuple(
             one for one in IN_FRAME if not auto or given in ("auto", one.changes["camera_set"])
         )
-    if views.kind == "pairs":
-        return (LISTED[2]._replace(kind="pairs"), LISTED[0])
     return LISTED if batch.survey.learned.matcher is not None else LISTED[:1]
 
 

@@ -9,14 +9,13 @@ import numpy as np
 
 from pcfix.errors import GeometryError
 from pcfix.label.labelling import Part
-from pcfix.model import NOISE_CLASSES, FloatArray, IntArray
+from pcfix.model import NOISE_CLASSES, FloatArray
 from pcfix.water.fit import NearestPoints
 from pcfix.water.surface import is_submerged
 
 LEAST_COUNT, FEW = 3, 10
 """A line through two check depths fits whatever they are; a third is the first that can disagree.
 Below ten the standard errors are themselves only known to a quarter or worse."""
-OUTLIER_CHANCE = 0.05  # that a set of good check depths is said to hold an outlier
 _SAME_M = 1e-3
 
 
@@ -35,7 +34,6 @@ class DepthRegression:
     shallowest_m: float  # of their apparent depths; the line is extrapolated beyond
     deepest_m: float
     covariance_m: float = 0.0  # of intercept and slope
-    outliers: tuple[int, ...] = ()  # which check depths, from 0, are too far off the line
     notes: tuple[str, ...] = ()
 
     def depth_m(self, apparent_m: FloatArray) -> FloatArray:
@@ -61,7 +59,8 @@ class DepthRegression:
         again = "" if self.cv_rmse_m is None else f", cross-validated {self.cv_rmse_m:.3f} m"
         return (
             f"Regression: depth = {self.intercept_m:.3f} m + {self.slope:.3f} x apparent depth"
-            f" ({self.count} check depths, r2 {self.r2:.3f}); standard errors"
+            f" ({self.count} check depths at {self.shallowest_m:.2f} to {self.deepest_m:.2f} m,"
+            f" extrapolated beyond; r2 {self.r2:.3f}); standard errors"
             f" {self.intercept_se_m:.3f} m and {self.slope_se:.3f}, RMSE {self.rmse_m:.3f} m"
             f"{again}."
         )
@@ -117,28 +116,8 @@ def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
         shallowest_m=float(x.min()),
         deepest_m=float(x.max()),
         covariance_m=float(-x.mean() * line.stderr**2),
-        outliers=tuple(int(i) for i in outliers(residual, leverage)),
         notes=notes_of(len(x), float(line.slope)),
     )
-
-
-def outliers(residual: FloatArray, leverage: FloatArray) -> IntArray:
-    """Return which residuals are too large to be of one set with the rest.
-
-    By externally studentised residuals, each with the standard error from the other values, and
-    the limit of Student's distribution for the largest of all m (Bonferroni).
-    """
-    from scipy.stats import t
-
-    m = len(residual)
-    if m < LEAST_COUNT + 1:
-        return np.zeros(0, np.int64)
-    free = np.maximum(1.0 - leverage, 1e-9)
-    others = np.maximum((residual**2).sum() - residual**2 / free, 0.0) / (m - 3)
-    limit = t.isf(OUTLIER_CHANCE / (2 * m), m - 3)
-    # a residual below a tenth of a millimetre is none, however well the others fit
-    far = residual**2 > np.maximum(limit**2 * others * free, 1e-8)
-    return np.flatnonzero(far & (leverage < 1.0 - 1e-9))
 
 
 def notes_of(count: int, slope: float) -> tuple[str, ...]:

@@ -97,9 +97,7 @@ class Block(NamedTuple):
     rule: Rule
     search: FloatArray  # (m, `_WIDTH_OF_SEARCH`)
     derivative: FloatArray  # (m, 3, 3), B: of Q by the median
-    listed_start: IntArray  # the pairs of each point, if there are lists
-    listed_camera: IntArray
-    partners: IntArray  # (k, ...), otherwise the partners of each image, each pair once
+    partners: IntArray  # (k, ...), the partners of each image, each pair once
 
 
 class Pairs(NamedTuple):
@@ -111,31 +109,25 @@ class Pairs(NamedTuple):
     narrow: IntArray  # (m,), and how many more without a base
 
 
-def invert_pairs(batch: Batch, pairs: Views | None = None) -> Intersection:
+def invert_pairs(batch: Batch) -> Intersection:
     """Return the true points from which the median of stereo pairs would be the apparent ones.
 
-    The views of the batch are the cameras that may be in a pair. `pairs` are view lists of the kind
-    pairs; by default the pairs are those of images that the matcher matched, each once. The surface
-    above each point is taken as a plane.
+    The views of the batch are the cameras that may be in a pair; the pairs are those of images that
+    the matcher matched, each once. The surface above each point is taken as a plane.
 
     `ray_count` and `incidence_deg` are of the cameras that are in a pair; `ray_miss_m` is the
     distance from their refracted rays through the apparent point, as for `snell`. A point with
     cameras but without a pair is `ONE_CAMERA`, one with narrow pairs only `PARALLEL_RAYS`. Points
     without a solution get that of `snell`, with a warning.
     """
-    survey, matcher, none = batch.survey, batch.survey.learned.matcher, np.zeros(0, np.int64)
-    start, camera, partners = none, none, np.zeros((0, 0), np.int64)
-    if pairs is not None:
-        start, camera = np.asarray(pairs.start, np.int64), np.asarray(pairs.camera, np.int64)
-    elif matcher is not None:
-        partners = _each_once(matcher.matched)
-    else:
-        raise ValueError("pairs or a model of the matcher are needed")
+    survey, matcher = batch.survey, batch.survey.learned.matcher
+    if matcher is None:
+        raise ValueError("a model of the matcher is needed")
     images, rule = images_of(batch.original_model, survey.cameras), rule_of(survey)
     search, derivative = np.zeros((len(batch), _WIDTH_OF_SEARCH)), np.zeros((len(batch), 3, 3))
     block = Block(
         batch.chosen(), images, rig_of(survey), rule._replace(least_cosine2=0.0), search,
-        derivative, start, camera, partners,
+        derivative, _each_once(matcher.matched),
     )  # fmt: skip
     used, result = np.zeros(len(batch.rays.camera), np.bool_), np.zeros((len(batch), _WIDTH))
     rows = tiling.spatial_order(batch.xyz)
@@ -211,45 +203,33 @@ def _pairs_of(
     `marks`, a row for each of the images near the tile, say which cameras each point has; `row`,
     which row is that of a camera.
     """
-    points, listed, k, step = block.points, block.listed_start, len(marks), block.partners.shape[1]
-    # the number of candidates of each point
-    candidates = np.empty(rows.size, np.int64)
-    for j in range(rows.size):
-        i = rows[j]
-        candidates[j] = (points.start[i + 1] - points.start[i]) * step
-        if listed.size:
-            candidates[j] = (listed[i + 1] - listed[i]) // 2
+    points, k, step = block.points, len(marks), block.partners.shape[1]
+    most = 0
+    for i in rows:
+        most = max(most, (points.start[i + 1] - points.start[i]) * step)
     # the number of each pair of rays, in the order in which the points have them
-    number, total, most = np.full((k, k), ABSENT), 0, candidates.max()
+    number, total = np.full((k, k), ABSENT), 0
     rays = np.empty((min(k * k, rows.size * most), 2), np.int64)
     own = np.empty((3, rows.size, most), np.int64)
     count, narrow = np.zeros(rows.size, np.int64), np.zeros(rows.size, np.int64)
     in_pair = np.zeros(marks.shape)
     for j in range(rows.size):
-        i = rows[j]
-        for one in range(candidates[j]):
-            if listed.size:
-                at = listed[i] + 2 * one
-                a, b = block.listed_camera[at], block.listed_camera[at + 1]
-            else:
-                a = points.camera[points.start[i] + one // step]
-                b = block.partners[a, one % step]
-            if a < 0 or b < 0 or a == b or row[a] < 0 or row[b] < 0:
-                continue
-            ray_a, ray_b = row[a], row[b]
-            # both cameras must be among those of the point
-            if not (marks[ray_a, j] > 0.0 and marks[ray_b, j] > 0.0):
-                continue
-            if not _is_wide(a, b, j, tile, points):
-                narrow[j] += 1
-                continue
-            if number[ray_a, ray_b] < 0:
-                number[ray_a, ray_b], rays[total, 0], rays[total, 1] = total, ray_a, ray_b
-                total += 1
-            for axis in range(3):
-                own[axis, j, count[j]] = number[ray_a, ray_b]
-            count[j] += 1
-            in_pair[ray_a, j], in_pair[ray_b, j] = 1.0, 1.0
+        for a in points.camera[points.start[rows[j]] : points.start[rows[j] + 1]]:
+            for b in block.partners[a]:
+                # both cameras must be among those of the point
+                if b < 0 or row[b] < 0 or not marks[row[b], j] > 0.0:
+                    continue
+                if not _is_wide(a, b, j, tile, points):
+                    narrow[j] += 1
+                    continue
+                ray_a, ray_b = row[a], row[b]
+                if number[ray_a, ray_b] < 0:
+                    number[ray_a, ray_b], rays[total, 0], rays[total, 1] = total, ray_a, ray_b
+                    total += 1
+                for axis in range(3):
+                    own[axis, j, count[j]] = number[ray_a, ray_b]
+                count[j] += 1
+                in_pair[ray_a, j], in_pair[ray_b, j] = 1.0, 1.0
     marks[:] = in_pair
     return Pairs(rays[:total], own, count, narrow)
 

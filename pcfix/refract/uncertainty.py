@@ -5,7 +5,7 @@ first: SfM software intersects straight rays by least squares in the images, so 
 
     Cov P = K^-1 R K^-1,   K = sum J'J,   R = sum J' Cov(image) J.
 
-The correction moves P to Q. Errors common to all rays (level, index and tilt of the water) enter
+The correction moves P to Q. Errors common to all rays (level and index of the water) enter
 only there, each with a column g of its own:
 
     Cov Q = dQ/dP Cov P dQ/dP' + sum over the common ones of sigma^2 g g'.
@@ -24,39 +24,23 @@ P across, p            D p = (1 - m) p + beta (d.p) d,  beta = -y r (1 - r^2) / 
 P up                   -D d / H
 h                      (1 / H - r / kappa) d
 n                      y r^2 L^2 / kappa^3 d
-slope, N + tau         -y (1 - r H / kappa) tau + (gamma + m r / kappa) (d.tau) d,
-                       gamma = y r^3 H / kappa^3 - h / H^2 (about the place above P)
 =====================  ========================================================================
 
-What a delta of each ray does to Q depends on what Q is the least of.
-
-*In space* (`snell` and most others) that is the squared distances from the refracted rays, eq 11 of
-Skarlatos & Agrafiotis 2018. With S = M = I - t t'
-
-    dQ = (sum M)^-1 sum M delta,    M d = (kappa^2 d - r kappa rho^2 N) / L^2.
-
-*In images* (`consistent`) the residuals are those at P: sum J' (x(Q) - pi(P)) = 0. A Q that is off
+Q has the least squared residuals in the images at P: sum J' (x(Q) - pi(P)) = 0. A Q that is off
 its ray, by T Q = Q - (N.Q) (N + (r / kappa) d) at its own depth, is seen where P would be after a
 move of D^-1 T Q. With W = J'J and S = W D^-1, D^-1 across as in the table,
 
     dQ = (sum S T)^-1 sum S delta,    S d = -H W N / (1 - m + beta rho^2)
 
-as W e = 0. Q depends on P only through pi(P): dQ / dP = (sum S T)^-1 sum W, and K cancels out. Up
-to 45 degrees the two differ by less than 2 %; of rays at 73 degrees the first is twice as large.
+as W e = 0. Q depends on P only through pi(P): dQ / dP = (sum S T)^-1 sum W, and K cancels out.
 
-In both cases S delta = c A delta + b (d.delta) g, with a symmetric A, g = S d, and S N = -v g:
+With g = S d it is S delta = c W delta + b (d.delta) g and S N = -v g, where
 
-==========  ===  ==========  ===============  ==========================
-residuals   A    c           b                v
-==========  ===  ==========  ===============  ==========================
-in space    M    1           0                r / kappa
-in images   W    1 / (1-m)   -beta / (1-m)    (1 - b rho^2) / H
-==========  ===  ==========  ===============  ==========================
+    c = 1 / (1 - m),    b = -beta / (1 - m),    v = (1 - b rho^2) / H,
+    S T = c W + g (b d + (v - r / kappa) N)'
 
-With D p = D (p - (N.p) e / H) for any p, as P may also move up, the sums have the terms
-
-    S T = c A + g (b d + (v - r / kappa) N)'
-    S D = (1 - m) c A + g (((1 - m) b + beta) d - ((1 - m) (1 - H v) + beta rho^2) N / H)'
+That is `consistent`. `snell` has the least distances from the rays instead (eq 11 of Skarlatos &
+Agrafiotis 2018); up to 45 degrees its standard errors are the same to 2 %.
 
 Neglected is the turn of M, and of J, times the residual, which is of second order.
 """
@@ -77,7 +61,6 @@ from pcfix.lens.algebra import (
     beyond,
     dot,
     minus,
-    plus,
     plus_square,
     product,
     row_of,
@@ -88,9 +71,8 @@ from pcfix.options.correct import LEVEL_M
 from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Chosen, Intersection, Survey
 from pcfix.refract.choice import Rig, rig_of
-from pcfix.refract.rays import MIN_DETERMINANT, refracted
+from pcfix.refract.rays import MIN_DETERMINANT
 from pcfix.refract.tiling import TILE, add_three, inverse_of, nine, product_of, put, slots, three
-from pcfix.water.surface import Field, height_at
 
 MODEL_GSD = 0.8
 """Standard error of the model of depth maps, common to a block: the bias of blocks with known truth
@@ -103,21 +85,16 @@ _XZ, _YZ, _ZZ = 2, 4, 5
 
 
 class Budget(NamedTuple):
-    """Standard deviations, angles in radians; the place about which the water tilts.
+    """Standard deviations, angles in radians.
 
-    `in_images` says which residuals the correction makes least, `by_ray` whether rays have errors
-    other than the noise of image coordinates.
+    `by_ray` says whether rays have errors other than the noise of image coordinates.
     """
 
     image_px: float
     refractive_index: float
-    tilt: float
     waves: float
     centre_m: float
     attitude: float
-    pivot_x: float
-    pivot_y: float
-    in_images: bool
     by_ray: bool
 
 
@@ -125,12 +102,10 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
     """Return the covariance of each corrected point: xx, xy, xz, yy, yz, zz, shape (m, 6), m^2.
 
     Zeros if fewer than two rays meet, or nearly parallel ones. `shift_m`, shape (m, 3), is true
-    minus apparent, by any method. A mesh or raster is taken as its plane above the point. A tilt
-    turns the water about the middle of the projection centres.
+    minus apparent, by any method. A mesh or raster is taken as its plane above the point.
 
-    It is an approximation for methods that move points along the vertical only (they get that of
-    `snell`), and where `consistent` inverts a dense matcher, which gets that of one adjustment of
-    all its images.
+    It is that of `consistent` with tracks: an approximation for the other methods, and where
+    `consistent` inverts a dense matcher, which gets that of one adjustment of all its images.
     """
     survey, result = batch.survey, np.zeros((len(batch), 6))
     if not len(survey.cameras):
@@ -181,65 +156,31 @@ def with_uncertainty(found: Intersection, batch: Batch) -> Intersection:
 def level_sigma_of(batch: Batch) -> FloatArray:
     """Return the standard deviation of the water above each point, metres, shape (m,).
 
-    That of the settings, else of the fit, else `LEVEL_M`. Errors of the water of single images
-    are added as the error of the mean over the rays.
+    That of the settings, else of the fit, else `LEVEL_M`.
     """
     stated, fitted = batch.survey.settings.sigma_level, batch.level_sigma_m
     known = stated if stated is not None else LEVEL_M if fitted is None else fitted
     full = np.array(np.broadcast_to(known, len(batch)), np.float64)
     full[np.isnan(full)] = LEVEL_M
-    own, views = batch.survey.own_water, batch.views
-    if own is None or views is None:
-        return full
-    of_own = np.zeros(len(batch))
-    in_tiles(_own_sigma, len(batch), batch.chosen(), own.sigma, of_own)
-    return np.hypot(full, of_own)
-
-
-@kernel
-def _own_sigma(span: Span, points: Chosen, sigma: Field, found: FloatArray) -> None:
-    """Set the standard error of the mean of the images' own water over the rays of a point.
-
-    Errors are independent from image to image. The water is taken as level above the point.
-    """
-    start, camera = points.start, points.camera
-    for i in range(*span):
-        total = 0.0
-        for at in range(start[i], start[i + 1]):
-            c = camera[at]
-            e = minus(row_of(points.centres, c), row_of(points.xyz, i))
-            # where the straight ray pierces it
-            f = (points.height[i] + points.offset[c] - points.xyz[i, 2]) / e[2]
-            x, y = points.xyz[i, 0] + f * e[0], points.xyz[i, 1] + f * e[1]
-            error = height_at(Field(sigma.heights, sigma.shape, sigma.frame, c), x, y)[0]
-            total += error * error if error > 0.0 else 0.0
-        found[i] = np.sqrt(total) / max(start[i + 1] - start[i], 1)
+    return full
 
 
 def budget_of(survey: Survey) -> Budget:
     """Return the error budget for kernels."""
     settings = survey.settings
-    x, y = survey.cameras.centres[:, :2].mean(axis=0).tolist()
     return Budget(
         image_px=settings.sigma_image,
         refractive_index=settings.sigma_index,
-        tilt=math.radians(settings.sigma_tilt),
         waves=math.radians(settings.sigma_waves),
         centre_m=settings.sigma_centre,
         attitude=math.radians(settings.sigma_attitude),
-        pivot_x=x,
-        pivot_y=y,
-        in_images=settings.method == "consistent",
         by_ray=max(settings.sigma_waves, settings.sigma_centre, settings.sigma_attitude) > 0.0,
     )
 
 
 # Runs of `TILE` numbers for the points of a tile: how far above the true point P is, along N; the
-# number of rays; what level (3) and n (3) add to S delta; W (6); S T (9); M D (9); what slopes add,
-# to be multiplied by tau (9); noise (6).
-_ABOVE, RAYS, BY_LEVEL, BY_N, SIGHT, BY_Q, BY_P, BY_TILT, NOISE, ROOM = slots(
-    1, 1, 3, 3, 6, 9, 9, 9, 6
-)
+# number of rays; what level (3) and n (3) add to S delta; W (6); S T (9); noise (6).
+_ABOVE, RAYS, BY_LEVEL, BY_N, SIGHT, BY_Q, NOISE, ROOM = slots(1, 1, 3, 3, 6, 9, 6)
 
 
 class Sight(NamedTuple):
@@ -272,8 +213,8 @@ class Ray(NamedTuple):
     beta: float
 
 
-Effect: TypeAlias = tuple[Symmetric, Vector, float, float, float]
-"""A, g, c, b and v: how a displacement of a ray goes into the sums."""
+Effect: TypeAlias = tuple[Vector, float, float, float]
+"""g, c, b and v: how a displacement of a ray goes into the sums."""
 
 
 @device(allocates=True)
@@ -332,24 +273,14 @@ def _weight(ray: Ray, sight: Sight) -> Symmetric:
 
 
 @device(forceinline=True)
-def _effect(ray: Ray, w: Symmetric, in_images: bool) -> Effect:
-    """Return the effect of a displacement of a ray, on residuals in images or in space."""
-    if in_images:
-        # one division for two: c, and S d = W d / (1 - m + beta rho^2), where W d = -H W N
-        outer = ray.away + ray.beta * ray.rho2
-        share = 1.0 / (ray.away * outer)
-        c, b = share * outer, -ray.beta * share * outer
-        g = scaled(-ray.height * share * ray.away, product(w, ray.normal))
-        return w, g, c, b, (1.0 - b * ray.rho2) * ray.inv_h
-    t = refracted(ray.e, ray.length2, ray.normal, ray.height, ray.bend)
-    # M = I - t t', with the refracted ray of the length L
-    one, per = ray.times, ray.times / ray.length2
-    xx, xy, xz, yy, yz, zz = plus_square(NO_SQUARES, t)
-    m = one - per * xx, -per * xy, -per * xz, one - per * yy, -per * yz, one - per * zz
-    # M d = (kappa^2 d - r kappa rho^2 N) / L^2
-    up = per * ray.bend * ray.kappa * ray.rho2
-    g = beyond(scaled(per * ray.kappa * ray.kappa, ray.d), -up, ray.normal)
-    return m, g, 1.0, 0.0, ray.lean
+def _effect(ray: Ray, w: Symmetric) -> Effect:
+    """Return the effect of a displacement of a ray on the residuals in the images."""
+    # one division for two: c, and S d = W d / (1 - m + beta rho^2), where W d = -H W N
+    outer = ray.away + ray.beta * ray.rho2
+    share = 1.0 / (ray.away * outer)
+    c, b = share * outer, -ray.beta * share * outer
+    g = scaled(-ray.height * share * ray.away, product(w, ray.normal))
+    return g, c, b, (1.0 - b * ray.rho2) * ray.inv_h
 
 
 @device(forceinline=True)
@@ -368,21 +299,14 @@ def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: V
 
 
 @device
-def _add_common(
-    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, in_images: bool
-) -> None:
-    """Add one camera's rays to the sums of a tile's points: what moves Q, P, level and index."""
+def _add_common(room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight) -> None:
+    """Add one camera's rays to the sums of a tile's points: what moves Q, level and index."""
     for j in range(marks.size):
         ray = _ray_of(room, tile, marks, j, sight)
-        w, normal, lean, away = _weight(ray, sight), ray.normal, ray.lean, ray.away
-        a, g, c, b, v = _effect(ray, w, in_images)
+        w, lean = _weight(ray, sight), ray.lean
+        g, c, b, v = _effect(ray, w)
         # S T
-        _add_nine(room, BY_Q * TILE + j, c, a, g, beyond(scaled(b, ray.d), v - lean, normal))
-        if not in_images:
-            # S D; in images it is W
-            up = (away * (1.0 - ray.height * v) + ray.beta * ray.rho2) * ray.inv_h
-            q = beyond(scaled(away * b + ray.beta, ray.d), -up, normal)
-            _add_nine(room, BY_P * TILE + j, away * c, a, g, q)
+        _add_nine(room, BY_Q * TILE + j, c, w, g, beyond(scaled(b, ray.d), v - lean, ray.normal))
         # delta by n over d: y r^2 L^2 / kappa^3
         inv_k2 = 1.0 / (ray.kappa * ray.kappa)
         by_n = ray.y * lean * ray.bend * ray.length2 * inv_k2 if ray.bend < 1.0 else 0.0
@@ -390,23 +314,6 @@ def _add_common(
         add_three(room, BY_LEVEL * TILE + j, ray.inv_h - lean, g)
         add_three(room, BY_N * TILE + j, by_n, g)
         _add_six(room, SIGHT * TILE + j, 1.0, w)
-
-
-@device
-def _add_tilt(
-    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, in_images: bool
-) -> None:
-    """Add how the slope of the water moves each of one camera's rays: S delta by tau.
-
-    delta = turn tau + along (d.tau) d, along = gamma + m r / kappa.
-    """
-    for j in range(marks.size):
-        ray = _ray_of(room, tile, marks, j, sight)
-        a, g, c, b, _ = _effect(ray, _weight(ray, sight), in_images)
-        turn, inv_k = -ray.y * (1.0 - ray.height * ray.lean), 1.0 / ray.kappa
-        along = ray.y * ray.bend * ray.bend * ray.lean * ray.height * inv_k * inv_k
-        along += (ray.h * ray.inv_h - ray.y * ray.lean) * ray.lean - ray.h * ray.inv_h * ray.inv_h
-        _add_nine(room, BY_TILT * TILE + j, turn * c, a, g, scaled(turn * b + along, ray.d))
 
 
 @device
@@ -423,7 +330,7 @@ def _add_noise(
     for j in range(marks.size):
         ray = _ray_of(room, tile, marks, j, sight)
         w = _weight(ray, sight)
-        _, g, c, b, v = _effect(ray, w, True)
+        g, c, b, v = _effect(ray, w)
         # S delta = across (c W tau + along (d.tau) g), with tau across N, where c W N = -v g
         across = budget.waves * ray.y * (1.0 - ray.height * ray.lean)
         along = b + ray.lean * ray.lean
@@ -469,9 +376,7 @@ def add_errors(
         sight = Sight(
             row_of(rig.centres, c), rig.offset[c], row_of(rig.axes, c), rig.focal_px[c] ** 2, bend
         )
-        _add_common(room, tile, marks[k], sight, budget.in_images)
-        if budget.tilt > 0.0:
-            _add_tilt(room, tile, marks[k], sight, budget.in_images)
+        _add_common(room, tile, marks[k], sight)
         if budget.by_ray:
             _add_noise(room, tile, marks[k], sight, budget)
 
@@ -483,9 +388,8 @@ def finish_tile(
 ) -> None:  # fmt: skip
     """Turn the sums of a tile into covariances: B R B' of the noise, and that of common errors.
 
-    Each common error is one standard deviation times a column: of level, index and both tilts. A
-    tilt also raises the water above the point, in proportion to its distance from the pivot. LLVM
-    inlines what the loop calls; otherwise it would not be vectorised.
+    Each common error, of level and index, is one standard deviation times a column. LLVM inlines
+    what the loop calls; otherwise it would not be vectorised.
     """
     out, sigma, sums = np.empty(6 * TILE), level_sigma[rows], room
     # R = sigma^2 K if all rays have the same image noise
@@ -497,33 +401,17 @@ def finish_tile(
         # half the trace: k for k rays in space, as in `nearest_point`
         half = 0.5 * (m[0] + m[4] + m[8])
         solved = (k >= 2.0) & (det >= MIN_DETERMINANT * half * half * half)
-        by_noise = b
-        if not budget.in_images:
-            # Q moves with P by (sum M)^-1 (sum M D), and P by (sum W)^-1
-            full, by_sight = inverse_of(_symmetric(sums, SIGHT * TILE + j))
-            by_noise = _product(_product(b, nine(sums, BY_P * TILE + j)), by_sight)
-            solved &= full > 0.0
-        noise = _product(by_noise, _symmetric(sums, NOISE * TILE + j))
-        x, y, z = by_noise[0:3], by_noise[3:6], by_noise[6:9]
+        noise = _product(b, _symmetric(sums, NOISE * TILE + j))
+        x, y, z = b[0:3], b[3:6], b[6:9]
         cov = (
             dot(noise[0:3], x), dot(noise[0:3], y), dot(noise[0:3], z),
             dot(noise[3:6], y), dot(noise[3:6], z), dot(noise[6:9], z),
         )  # fmt: skip
-        nx, ny, nz = three(tile, 4 * TILE + j)
-        # two horizontal directions of slope: u towards x, v across it
-        scale = 1.0 / np.sqrt(nx * nx + nz * nz)
-        ux, uz = nz * scale, -nx * scale
-        by_tilt = nine(sums, BY_TILT * TILE + j)
         # the level rises along the vertical, h is along N
-        level, index = scaled(nz, three(sums, BY_LEVEL * TILE + j)), three(sums, BY_N * TILE + j)
-        away_u, away_v = tile[j] - budget.pivot_x, tile[TILE + j] - budget.pivot_y
-        # the normal leans away from where the slope rises
-        u = plus(product_of(by_tilt, (-ux, 0.0, -uz)), scaled(away_u, level))
-        v = plus(product_of(by_tilt, (-ny * uz, nx * uz - nz * ux, ny * ux)), scaled(away_v, level))
+        level = scaled(tile[6 * TILE + j], three(sums, BY_LEVEL * TILE + j))
+        index = three(sums, BY_N * TILE + j)
         cov = plus_square(cov, scaled(sigma[j], product_of(b, level)))
         cov = plus_square(cov, scaled(budget.refractive_index, product_of(b, index)))
-        cov = plus_square(cov, scaled(budget.tilt, product_of(b, u)))
-        cov = plus_square(cov, scaled(budget.tilt, product_of(b, v)))
         put(out, j, cov[0:3])
         put(out, 3 * TILE + j, cov[3:6])
         sums[RAYS * TILE + j] = 1.0 if solved else 0.0

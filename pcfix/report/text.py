@@ -316,7 +316,6 @@ _BUDGET: RowTable = (
     ("image", "{sigma_image:g} px", ""),
     ("level", "{level:.3f} m{source}", ""),
     ("index", "{sigma_index:g}", ""),
-    ("tilt", "{sigma_tilt:g} deg", "sigma_tilt"),
     ("waves", "{sigma_waves:g} deg", "sigma_waves"),
     ("camera positions", "{sigma_centre:g} m", "sigma_centre"),
     ("attitude", "{sigma_attitude:g} deg", "sigma_attitude"),

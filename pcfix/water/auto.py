@@ -1,17 +1,15 @@
-"""Find the water surface in the cloud itself: the level, or plane, that the cues agree on best.
+"""Find the water level in the cloud itself: the one that the cues agree on best.
 
 Slope: refraction lifts the bed towards the surface, so that its slopes below the waterline are
 about 1/1.34 of the true ones (less under oblique rays), and a beach has a break of known size.
-Colour: water absorbs red light first (brown water with peat, blue), so that the ratio to green is
-constant on land and falls with depth: logarithms of light fall linearly with depth (Lyzenga 1978,
-Applied Optics 17: 379-383).
+Colour: water absorbs red light first, so that its ratio to green is constant on land and falls with
+depth: logarithms of light fall linearly with depth (Lyzenga 1978, Applied Optics 17: 379-383).
 
 A broken line is tested against an unbroken one, tile by tile, for every height of the break: y =
 (smooth within each tile) + trend * height + amplitude * f(depth), where f(d) = D (1 - exp(-d / D))
 below that height and 0 above it; trend and amplitude are common to all tiles. A free amplitude must
 exceed the trend: what fades under water is constant on land. Each tile has its sums of squares and
-products, so that adding tiles, at their own heights under a tilted surface, or resampling them is
-cheap.
+products, so that adding or resampling tiles is cheap.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import GeometryError
-from pcfix.model import BoolArray, FloatArray, IntArray, WaterPlane
+from pcfix.model import FloatArray, IntArray, WaterPlane
 from pcfix.water.surface import FoundSurface
 
 LEAST_POINTS = 2_000
@@ -37,15 +35,13 @@ INSTEAD = "Give the water surface: a level, shoreline points, plane:a,b,c or a m
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WaterProposal(FoundSurface):
-    """A water surface found in a cloud; its points are where the ground crosses it."""
+    """A water level found in a cloud; its points are where the ground crosses it."""
 
     points: FloatArray  # (n, 3), metres, world frame
     sigma_level_m: float
-    """Standard error of its height at `centre_xy`, by resampling tiles of the cloud. It does not
-    include errors that all of the shore shares, such as a bank that stops at the water."""
-    centre_xy: FloatArray  # (2,), centre of the shoreline, metres, world frame
-    level_m: float  # height of the surface there
-    tilt: FloatArray  # (2,), dz/dx and dz/dy
+    """Standard error of its height, by resampling tiles of the cloud. It does not include errors
+    that all of the shore shares, such as a bank that stops at the water."""
+    level_m: float
     confidence: float  # 0 to 1, by how much the evidence exceeds what is refused
     evidence: dict[str, float]  # figures by name
     reasons: tuple[str, ...]  # the same in sentences
@@ -61,8 +57,6 @@ class WaterProposal(FoundSurface):
             "model": "auto",
             "level_m": self.level_m,
             "sigma_level_m": self.sigma_level_m,
-            "at_xy": self.centre_xy.tolist(),
-            "tilt_percent": 100.0 * float(np.hypot(*self.tilt)),
             "confidence": self.confidence,
             "evidence": self.evidence,
             "notes": list(self.reasons),
@@ -70,7 +64,7 @@ class WaterProposal(FoundSurface):
 
 
 def find_water(xyz: FloatArray, rgb: npt.NDArray[Any] | None = None) -> WaterProposal:
-    """Find the water surface of a cloud.
+    """Find the water level of a cloud.
 
     It is the height below which the ground gets flatter, as refraction lifts the bed, or colour
     fades with depth. Square tiles are summed separately, and resampling them gives the standard
@@ -107,7 +101,7 @@ def find_elsewhere(
     samples = sample_cloud(np.column_stack([xyz[:, :2], xyz[:, 2] - water_m]), rgb)
     try:
         coarse = _scanned(samples)
-        gain, heights = _gains(coarse, NO_TILT), coarse.heights_m + samples.origin[2]
+        gain, heights = _gains(coarse), coarse.heights_m + samples.origin[2]
         here = gain[np.abs(heights) <= DIFFERENT_M].max(initial=0.0)
         if gain.max() < LEAST_AGREED or here > MOST_RIVAL_AGREED * gain.max():
             return None
@@ -121,39 +115,18 @@ def find_elsewhere(
     return found if differs and sure else None
 
 
-LARGEST_TILT = 0.006
-TILT_STEP_M, MOST_TILT_STEPS = 0.15, 9
-TILT_GAIN = 6.0
 COARSE_M, FINE_M, MOST_HEIGHTS = 0.04, 0.01, 800
 FINE_REACH_M, SAME_PLACE_M = 0.6, 0.3
 WATERLINE_M = 0.05
 DRAWS = 120
-NO_TILT = np.zeros(2)
 
 
 class Scan(NamedTuple):
-    """The sums of all cues of a cloud, at heights above a tilted plane."""
+    """The sums of all cues of a cloud."""
 
-    cues: list[Moments]  # of the slope and of the stronger colour, if they show anything
+    cues: list[Moments]  # of the slope and of the colour, if they show anything
     samples: Samples
-    heights_m: FloatArray  # (h,)
-    tilt: FloatArray  # (2,), of the plane through the origin of the samples
-
-
-class Peak(NamedTuple):
-    """The best surface: level_m + tilt . xy from the origin of the samples."""
-
-    level_m: float
-    tilt: FloatArray
-    score: float  # total gain of its cues
-
-    def below(self, samples: Samples) -> FloatArray:
-        """Return the depth of the smooth ground of the cells below the surface, shape (m,)."""
-        return np.asarray(self.level_m + samples.xyz[:, :2] @ self.tilt - samples.smooth_m)
-
-    def shore(self, samples: Samples) -> BoolArray:
-        """Return the cells at the height of the surface, shape (m,)."""
-        return np.asarray(np.abs(self.below(samples)) <= WATERLINE_M)
+    heights_m: FloatArray  # (h,), above the origin of the samples
 
 
 def _scanned(samples: Samples) -> Scan:
@@ -167,89 +140,48 @@ def _scanned(samples: Samples) -> Scan:
             relief_m=float(high - low), least=LEAST_RELIEF_M,
         )  # fmt: skip
     count = int(np.clip((high - low) / COARSE_M, 8, MOST_HEIGHTS))
-    return _scan_at(samples, np.linspace(low, high, count), NO_TILT)
+    return _scan_at(samples, np.linspace(low, high, count))
 
 
-def _scan_at(samples: Samples, heights_m: FloatArray, tilt: FloatArray) -> Scan:
-    """Sum all cues at the given heights above a tilted plane."""
-    slope, *light = (
-        cue_moments(samples, cue, heights_m, tilt)
-        for cue in ((SLOPE, RED, BLUE) if len(samples.colour) else (SLOPE,))
-    )
-    known = [sums for sums in light if sums is not None]
-    stronger = sorted(known, key=lambda sums: -float(gain_of(sums)[0].max()))[:1]
-    return Scan([*([slope] if slope else []), *stronger], samples, heights_m, tilt)
+def _scan_at(samples: Samples, heights_m: FloatArray) -> Scan:
+    """Sum all cues at the given heights."""
+    cues = (SLOPE, RED) if len(samples.redness) else (SLOPE,)
+    found = (cue_moments(samples, cue, heights_m) for cue in cues)
+    return Scan([sums for sums in found if sums is not None], samples, heights_m)
 
 
-def _gains(scan: Scan, tilt: FloatArray, rng: np.random.Generator | None = None) -> FloatArray:
+def _gains(scan: Scan, rng: np.random.Generator | None = None) -> FloatArray:
     """Return the total gain of the cues at each height, shape (h,).
 
-    `tilt`, shape (2,), is added to that of `scan`. With `rng`, tiles are resampled with replacement
-    (bootstrap).
+    With `rng`, tiles are resampled with replacement (bootstrap).
     """
     total = np.zeros(len(scan.heights_m))
     for sums in scan.cues:
         count, times = len(sums.sums), None
         if rng is not None:
             times = np.bincount(rng.integers(0, count, count), minlength=count).astype(float)
-        total += np.maximum(gain_of(sums.shifted(tilt) if tilt.any() else sums, times)[0], 0.0)
+        total += np.maximum(gain_of(sums, times)[0], 0.0)
     return total
 
 
-def _best(scan: Scan, tilts: FloatArray) -> Peak:
-    """Return the best height and tilt among tilts of shape (k, 2)."""
-    found = []
-    for tilt in tilts:
-        gain = _gains(scan, tilt)
-        row = int(np.argmax(gain))
-        found.append(Peak(float(scan.heights_m[row]), scan.tilt + tilt, float(gain[row])))
-    return max(found, key=lambda peak: peak.score)
-
-
-def _along(step: FloatArray, steps: int) -> FloatArray:
-    """Return multiples of a tilt, zero first, shape (2 steps + 1, 2)."""
-    return np.outer(sorted(range(-steps, steps + 1), key=abs), step)
-
-
-def _refine(samples: Samples, start: Peak, step: FloatArray) -> tuple[Peak, Scan]:
-    """Search near a surface in fine steps of height and of tilt; a step of zero keeps it level."""
-    peak, steps = start, 2 if step.any() else 0
+def _refined(coarse: Scan) -> Scan:
+    """Return the sums near the best level, in fine steps; it is in the middle of their heights."""
+    level_m = _best(coarse)
     reach = np.arange(-FINE_REACH_M, FINE_REACH_M + FINE_M / 2.0, FINE_M)
-    for size in (0.5, 0.25, 0.125)[: 3 if steps else 1]:
-        scan = _scan_at(samples, peak.level_m + reach, peak.tilt)
-        peak = _best(scan, _along(size * step, steps))
-    return peak, _scan_at(samples, peak.level_m + reach, peak.tilt)
+    return _scan_at(coarse.samples, _best(_scan_at(coarse.samples, level_m + reach)) + reach)
 
 
-def _choose(coarse: Scan) -> tuple[Peak, Scan]:
-    """Return the level, or the plane if its tilt gains enough, and its sums.
-
-    Standing water is level, and flowing water is level across: it may only fall along the line of
-    the shore.
-    """
-    samples = coarse.samples
-    start = _best(coarse, NO_TILT[None])
-    level, near = _refine(samples, start, NO_TILT)
-    shore = samples.xyz[level.shore(samples), :2]
-    shore = shore if len(shore) > 2 else samples.xyz[:, :2]
-    axis = np.linalg.svd(shore - shore.mean(axis=0), full_matrices=False)[2][0]
-    extent = float(np.ptp(samples.xyz[:, :2], axis=0).max())
-    step = max(TILT_STEP_M / extent, LARGEST_TILT / MOST_TILT_STEPS)
-    tilted = _best(coarse, _along(step * axis, math.ceil(LARGEST_TILT / step)))
-    if tilted.score > start.score:
-        plane, near_plane = _refine(samples, tilted, step * axis)
-        along = abs(float(plane.tilt @ axis))
-        if plane.score > level.score + TILT_GAIN and step / 2.0 < along <= LARGEST_TILT:
-            return plane, near_plane
-    return level, near
+def _best(scan: Scan) -> float:
+    """Return the height of the largest gain."""
+    return float(scan.heights_m[int(np.argmax(_gains(scan)))])
 
 
 def _sigma_level(near: Scan) -> float:
-    """Return the standard error of the level by bootstrap, with the tilt found."""
+    """Return the standard error of the level by bootstrap."""
     rng = np.random.default_rng(0)
     heights = near.heights_m - near.heights_m[len(near.heights_m) // 2]
     same = np.abs(heights) <= SAME_PLACE_M
-    draws = [_gains(near, NO_TILT, rng)[same] for _ in range(DRAWS)]
+    draws = [_gains(near, rng)[same] for _ in range(DRAWS)]
     levels = np.array([heights[same][int(np.argmax(draw))] for draw in draws])
     return math.hypot(float(np.sqrt(np.mean(levels**2))), LEAST_SIGMA_M)
 
@@ -264,10 +196,12 @@ LEAST_SHARE = 0.005
 
 
 def _judged(coarse: Scan) -> WaterProposal:
-    """Return the best surface; GeometryError ``water.not_found`` if its evidence is not enough."""
+    """Return the best level; GeometryError ``water.not_found`` if its evidence is not enough."""
     samples, origin = coarse.samples, coarse.samples.origin
-    peak, near = _choose(coarse)
+    near = _refined(coarse)
     sigma_m, middle = _sigma_level(near), len(near.heights_m) // 2
+    found_m = float(near.heights_m[middle])
+    level, below = found_m + float(origin[2]), found_m - samples.smooth_m
     total, evidence, sentences, strong = 0.0, dict[str, float](), list[str](), list[str]()
     for sums in near.cues:
         cue = sums.cue
@@ -282,11 +216,11 @@ def _judged(coarse: Scan) -> WaterProposal:
                 text = f"true slopes are {1.0 + size:.2f} times the apparent ones"
             sentences.append(f"{cue.meaning}: {text} (standard error {sigma:.3f})")
     # the rival: the best height elsewhere
-    elsewhere = np.abs(coarse.heights_m - peak.level_m) > SAME_PLACE_M
-    rivals = np.where(elsewhere, _gains(coarse, peak.tilt), 0.0)
+    elsewhere = np.abs(coarse.heights_m - found_m) > SAME_PLACE_M
+    rivals = np.where(elsewhere, _gains(coarse), 0.0)
     row = int(np.argmax(rivals))
     rival, rival_m = float(rivals[row]), float(coarse.heights_m[row] + origin[2])
-    wet = float(np.mean(peak.below(samples) > 0.0))
+    wet = float(np.mean(below > 0.0))
     evidence |= {
         "rival gain": rival, "rival height": rival_m, "total gain": total, "share below": wet,
     }  # fmt: skip
@@ -297,7 +231,7 @@ def _judged(coarse: Scan) -> WaterProposal:
         least, most_rival = (LEAST_COLOUR_SINGLE if coloured else LEAST_SINGLE), MOST_RIVAL_SINGLE
     if strong == [SLOPE.name]:
         lift = evidence["slope amplitude"]
-    shore = samples.xyz[peak.shore(samples)]
+    shore = samples.xyz[np.abs(below) <= WATERLINE_M]
     is_one_sided = not LEAST_SHARE <= wet <= 1.0 - LEAST_SHARE or len(shore) == 0
     for reason, is_refused, why in (
         ("no_shoreline", is_one_sided, "nearly all of the cloud is on one side of it"),
@@ -309,23 +243,17 @@ def _judged(coarse: Scan) -> WaterProposal:
         ("inconsistent", sigma_m > MOST_SIGMA_M, f"parts of the cloud differ by {sigma_m:.2f} m"),
     ):  # fmt: skip
         if is_refused:
-            height = peak.level_m + float(samples.xyz[:, :2].mean(axis=0) @ peak.tilt + origin[2])
             raise GeometryError(
                 "water.not_found",
-                f"No water surface was found. The best candidate is {height:.2f} m, but {why}."
+                f"No water surface was found. The best candidate is {level:.2f} m, but {why}."
                 f" {INSTEAD}",
                 reason=reason, evidence=evidence,
             )  # fmt: skip
-    shore = shore[:: math.ceil(len(shore) / MOST_SHORELINE)] + origin
-    centre = shore[:, :2].mean(axis=0)
-    level = peak.level_m + float((centre - origin[:2]) @ peak.tilt + origin[2])
     return WaterProposal(
-        surface=WaterPlane(level - float(centre @ peak.tilt), *peak.tilt.tolist()),
-        points=shore,
+        surface=WaterPlane(level),
+        points=shore[:: math.ceil(len(shore) / MOST_SHORELINE)] + origin,
         sigma_level_m=sigma_m,
-        centre_xy=centre,
         level_m=level,
-        tilt=peak.tilt,
         confidence=float(min(1.0 - rival / total, 1.0 - math.exp(-total / (2.0 * least)))),
         evidence=evidence,
         reasons=tuple(sentences),
@@ -350,17 +278,16 @@ class Cue(NamedTuple):
 
     name: str
     meaning: str
-    colour: int | None  # column of the colours, whose ratio to green it is; None for the slope
+    is_colour: bool
     tile_cells: float  # side of a tile
     window_m: float  # observations weigh less towards this distance above and below
     scale_m: float = math.inf  # D; infinite for a straight line below
     amplitude: float | None = None  # given by physics, or negative and free
 
 
-SLOPE = Cue("slope", "the ground is flatter below the surface", None, 12.0, 0.6, amplitude=LIFT)
-RED = Cue("red/green", "red fades faster than green below the surface", 0, 24.0, 0.8, scale_m=0.7)
-BLUE = RED._replace(
-    name="blue/green", meaning="blue fades faster than green below the surface", colour=2
+SLOPE = Cue("slope", "the ground is flatter below the surface", False, 12.0, 0.6, amplitude=LIFT)
+RED = Cue(
+    "red/green", "red fades faster than green below the surface", True, 24.0, 0.8, scale_m=0.7
 )
 
 
@@ -371,20 +298,8 @@ class Moments(NamedTuple):
     # in units of its own residual variance
     sums: FloatArray
     number: FloatArray  # (t, h), observations
-    xy: FloatArray  # (t, 2), centre of each tile
     heights_m: FloatArray  # (h,), evenly spaced
     cue: Cue
-
-    def shifted(self, tilt: FloatArray) -> Moments:
-        """Return the sums at the heights `heights_m` + tilt . xy of each tile."""
-        step = self.heights_m[1] - self.heights_m[0]
-        offset = np.rint(self.xy @ tilt / step).astype(np.int64)
-        column = np.arange(len(self.heights_m)) + offset[:, None]
-        inside = (column >= 0) & (column < len(self.heights_m))
-        rows = np.arange(len(self.sums))[:, None]
-        column = np.clip(column, 0, len(self.heights_m) - 1)
-        sums = self.sums[rows, column] * inside[..., None]
-        return self._replace(sums=sums, number=self.number[rows, column] * inside)
 
 
 def gain_of(
@@ -448,7 +363,7 @@ def tile_moments(
     rows, weight, p = reached[enough], weight[enough], smooth.shape[1]
     below = np.maximum(depth[enough], 0.0)
     f = below if np.isinf(cue.scale_m) else -cue.scale_m * np.expm1(-below / cue.scale_m)
-    x = (at_m - at_m.mean()) * float(cue.colour is not None)
+    x = (at_m - at_m.mean()) * float(cue.is_colour)
     # the products of all columns, f last, at each height
     fixed = np.column_stack([smooth, y, x])
     products = (fixed[:, :, None] * fixed[:, None, :]).reshape(len(y), -1)
@@ -468,29 +383,27 @@ def tile_moments(
 LEAST_TILE_CELLS = 40
 
 
-def cue_moments(
-    samples: Samples, cue: Cue, heights_m: FloatArray, tilt: FloatArray
-) -> Moments | None:
+def cue_moments(samples: Samples, cue: Cue, heights_m: FloatArray) -> Moments | None:
     """Return the sums of a cue over the tiles that show anything; None without any.
 
-    Heights, shape (h,), are evenly spaced above the plane of that tilt through the samples' origin.
+    Heights, shape (h,), are evenly spaced above the samples' origin.
     """
-    xy, fall = samples.xyz[:, :2], samples.xyz[:, :2] @ tilt
+    xy = samples.xyz[:, :2]
     tile = square_tiles(xy, cue.tile_cells * samples.cell_m)
     order = np.argsort(tile, kind="stable")
     found = []
     for rows in np.split(order, np.flatnonzero(np.diff(tile[order])) + 1):
         if len(rows) < LEAST_TILE_CELLS:
             continue
-        if cue.colour is not None:
+        if cue.is_colour:
             smooth = np.ones((len(rows), 1))
-            y = samples.colour[rows, cue.colour] - samples.colour[rows, 1]
-            at = samples.smooth_m[rows] - fall[rows]
+            y = samples.redness[rows]
+            at = samples.smooth_m[rows]
         else:
             place = xy[rows] - xy[rows].mean(axis=0)
             u, v = (place / max(float(np.ptp(xy[rows])), 1e-9)).T
             smooth = np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v])
-            y = samples.xyz[rows, 2] - fall[rows]
+            y = samples.xyz[rows, 2]
             if y.min() > heights_m[-1] or y.max() < heights_m[0]:
                 continue
             # the smooth ground passes the height of the break: with the heights themselves, noise
@@ -498,13 +411,13 @@ def cue_moments(
             at = smooth @ np.linalg.lstsq(smooth, y, rcond=None)[0]
         tile_sums, tile_count = tile_moments(smooth, y, at, heights_m, cue)
         if tile_count.any():
-            found.append((tile_sums, tile_count, xy[rows].mean(axis=0)))
+            found.append((tile_sums, tile_count))
     if not found:
         return None
-    sums, count, middle = map(np.array, zip(*found, strict=True))
+    sums, count = map(np.array, zip(*found, strict=True))
     variance = sums[..., 0].sum(axis=1) / count.sum(axis=1)
     sums /= np.maximum(variance, 0.3 * np.median(variance) + _TINY)[:, None, None]
-    return Moments(sums, count, middle, heights_m, cue)
+    return Moments(sums, count, heights_m, cue)
 
 
 MOST_CELLS = 100_000
@@ -518,7 +431,7 @@ class Samples(NamedTuple):
 
     xyz: FloatArray  # (m, 3), mean x and y, median z, metres from `origin`
     smooth_m: FloatArray  # (m,), height at x, y of a plane through the cells around it
-    colour: FloatArray  # (m, 3), mean natural logarithms of red, green, blue; (0, 3) for none
+    redness: FloatArray  # (m,), mean natural logarithm of red by green; empty without colours
     cell_m: float  # side of a cell
     origin: FloatArray  # (3,), world frame
 
@@ -544,13 +457,14 @@ def sample_cloud(xyz: FloatArray, rgb: npt.NDArray[Any] | None) -> Samples:
     mean = [np.bincount(of_point, local[:, i]) / count for i in (0, 1)]
     median = ndimage.median(local[:, 2], of_point, np.arange(len(count)))
     ground = np.column_stack([*mean, median])
-    colour = np.empty((0, 3))
+    redness = np.zeros(0)
     if rgb is not None and (rgb != rgb[:1]).any():
         light = rgb.astype(np.float64)
         white = max(float(np.percentile(light, 99.0)), 1e-9)
         logs = np.log(light + 0.004 * white)  # a small part of white keeps black finite
-        colour = np.column_stack([np.bincount(of_point, column) / count for column in logs.T])
-    return Samples(ground, _smoothed(ground), colour, cell_m, origin)
+        red, green = (np.bincount(of_point, logs[:, i]) / count for i in (0, 1))
+        redness = red - green
+    return Samples(ground, _smoothed(ground), redness, cell_m, origin)
 
 
 def square_tiles(local: FloatArray, side_m: float) -> IntArray:

@@ -62,7 +62,6 @@ class RiverFit(ShoreFit):
             "upper_level_m": float(heights[0]),
             "drop_m": float(heights[0] - heights[-1]),
             "sigma_level_m": float(self.profile.sigma_height_m.mean()),
-            "falls": self.profile.falls,
             **super().as_dict(),
         }
 
@@ -97,18 +96,11 @@ def fit_river(
     order = np.lexsort((used[:, 2], station))
     known, station, z = known[order], station[order], used[order, 2]
     worth = np.ones(len(known)) if counts is None else np.asarray(counts, np.float64)[known]
-    falling, free = (_fit_profile(station, z, worth, falls=falls) for falls in (True, False))
-    held = falling.sigma_m <= RISES_IF_WORSE * max(free.sigma_m, LEAST_SCALE_M)
-    profile = falling if held else free
+    profile = _fit_profile(station, z, worth)
     notes = [
         f"Beyond the outermost points the surface is constant: {profile.height_m[0]:.2f} m upstream"
         f" and {profile.height_m[-1]:.2f} m downstream."
     ]
-    if not profile.falls:
-        notes.append(
-            "The points do not fall all along the river, so the surface may rise. Check the"
-            " direction of the line along the river, and the points."
-        )
     if len(known) < len(points):
         notes.append(f"{len(points) - len(known)} points have no height and are ignored.")
     residual, weight = np.full(len(points), np.nan), np.zeros(len(points))
@@ -225,8 +217,6 @@ MOST_NODES, NODES_A_POINT = 400, 2
 STIFF_PENALTY = 1e3  # penalty on rises, and on bends near the ends
 END_POINTS = 7
 """The outermost points are on one straight piece, so that a single one cannot bend it."""
-RISES_IF_WORSE = 1.25
-"""The surface may rise downstream if the scatter of the points is larger by this otherwise."""
 _TURNS, _BEND_M, _HUBER_M = 12, 1e-3, 0.02
 _LEAST = 1e-12  # keeps the equations solvable without points
 
@@ -241,14 +231,13 @@ class Profile:
     weight: FloatArray  # (n,), of the points, 0 to 1
     residual_m: FloatArray  # (n,)
     sigma_m: float  # standard deviation of one accepted point
-    falls: bool  # whether it was forced to fall
 
     def height_at(self, station_m: FloatArray) -> FloatArray:
         """Return heights at stations, constant beyond the ends."""
         return np.interp(station_m, self.station_m, self.height_m)
 
 
-def _fit_profile(station: FloatArray, z: FloatArray, worth: FloatArray, *, falls: bool) -> Profile:
+def _fit_profile(station: FloatArray, z: FloatArray, worth: FloatArray) -> Profile:
     """Fit the height of the water, shape (n,), which falls with the station, downstream.
 
     The stations are sorted. Each point is `worth` a number of independent observations; see
@@ -264,11 +253,11 @@ def _fit_profile(station: FloatArray, z: FloatArray, worth: FloatArray, *, falls
     for row, penalty in enumerate(PENALTIES):
         for k in range(FOLDS):
             rest, out = fold != k, fold == k
-            height = _solve(station[rest], z[rest], nodes, penalty, falls=falls)[0]
+            height = _solve(station[rest], z[rest], nodes, penalty)[0]
             missed[row, out] = np.abs(z[out] - np.interp(station[out], nodes, height))
     limit = TUKEY * max(TO_SIGMA * float(np.median(missed, axis=1).min()), LEAST_SCALE_M)
     best = PENALTIES[int(np.argmin((np.minimum(missed, limit) ** 2).mean(axis=1)))]
-    height, weight, band = _solve(station, z, nodes, best, falls=falls)
+    height, weight, band = _solve(station, z, nodes, best)
     inverse = solveh_banded(band, np.eye(len(nodes)), lower=True)
     splines = _splines(station, nodes)
     variance = splines.multiply(splines @ inverse).sum(axis=1)
@@ -276,7 +265,7 @@ def _fit_profile(station: FloatArray, z: FloatArray, worth: FloatArray, *, falls
     spare = accepted.sum() - float((weight * np.asarray(variance).ravel()).sum())
     sigma = float(np.sqrt((residual[accepted] ** 2).sum() / max(spare, 1.0)))
     sigma_height = sigma * np.sqrt(np.diag(inverse) * shared(weight, worth, 0.0))
-    return Profile(nodes, height, sigma_height, weight, residual, sigma, falls)
+    return Profile(nodes, height, sigma_height, weight, residual, sigma)
 
 
 def _splines(station: FloatArray, nodes: FloatArray) -> Any:
@@ -287,7 +276,7 @@ def _splines(station: FloatArray, nodes: FloatArray) -> Any:
 
 
 def _solve(
-    station: FloatArray, z: FloatArray, nodes: FloatArray, penalty: float, *, falls: bool
+    station: FloatArray, z: FloatArray, nodes: FloatArray, penalty: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return heights, the points' weights, and the lower band of the normal equations.
 
@@ -313,7 +302,7 @@ def _solve(
         band[2, :-2] = bends
         height = solveh_banded(band, splines.T @ (weight * z), lower=True)
         bend = 1.0 / np.maximum(np.abs(np.diff(height, 2)), _BEND_M)
-        rise = np.where(np.diff(height) > 0.0, float(falls), 0.0)
+        rise = np.where(np.diff(height) > 0.0, 1.0, 0.0)
         residual = np.abs(z - np.interp(station, nodes, height))
         if turn < _TURNS:
             weight = np.minimum(_HUBER_M / np.maximum(residual, 1e-9), 1.0)

@@ -87,7 +87,9 @@ def surface_above(
             x, y = np.ascontiguousarray(xyz[:, :2].T)
             tin = build_tin(water) if isinstance(water, WaterMesh) else None
             field = build_field(water) if isinstance(water, WaterRaster) else None
-            return SurfaceAbove(*heights_above(tin, field, x, y))
+            height, slope = np.empty(x.size), np.empty((x.size, 2))
+            in_tiles(_set_heights, x.size, tin, field, x, y, height, slope)
+            return SurfaceAbove(height, slope)
 
 
 def is_submerged(z: FloatArray, surface: SurfaceAbove) -> BoolArray:
@@ -162,13 +164,6 @@ def height_at(field: Field, x: float, y: float) -> tuple[float, float, float]:
     twist = field.heights[at + columns + 1] - z - east - south
     height = z + s * east + t * south + s * t * twist
     return height, (east + t * twist) / frame[k, 2], -(south + s * twist) / frame[k, 3]
-
-
-class OwnWater(NamedTuple):
-    """Separate water surfaces of images, and their standard errors."""
-
-    heights: Field
-    sigma: Field
 
 
 EDGE_TOLERANCE = 1e-9  # of a barycentric coordinate: a point on an edge belongs to both sides
@@ -277,15 +272,6 @@ def surface_at(
             b, c = tin.planes[facet, 1], tin.planes[facet, 2]
             return tin.planes[facet, 0] + b * (x - tin.origin_x) + c * (y - tin.origin_y), b, c
     return np.nan, 0.0, 0.0
-
-
-def heights_above(
-    tin: Tin | None, field: Field | None, x: FloatArray, y: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return `surface_at` for n positions: heights, shape (n,), and slopes, shape (n, 2)."""
-    height, slope = np.empty(x.size), np.empty((x.size, 2))
-    in_tiles(_set_heights, x.size, tin, field, x, y, height, slope)
-    return height, slope
 
 
 @kernel

@@ -7,8 +7,7 @@ clouds that COLMAP and OpenMVS made of rendered images (`REAL`). All numbers are
 points of a scene, those under more than 0.2 m of water, in ground sampling distances. Points that
 a method left uncorrected are not in its row; "done" is the share of the others.
 
-Cameras: "views" is the view list of the software; "pairs" the stereo pairs, which for all methods
-but `consistent` are the same cameras; "mvs" a model of dense matching, which tracks and pairs are
+Cameras: "views" is the view list of the software; "mvs" a model of dense matching, which tracks are
 not; "all" every camera whose frame holds the point; "auto" what pcfix detects without any option.
 "In 95 %" is the share of points whose error in Z is within 1.96 SigmaZ.
 
@@ -18,11 +17,10 @@ is no limit.
 
 ``--sensitivity`` compares the effect of wrong inputs on Z with the predicted budget instead. The
 method is `consistent` with known tracks, one input is wrong at a time, and the budget has only that
-one. Level, index and tilt are common to the scene: measured is the mean change of Z if the
-correction is given a value that is off by one standard deviation (of the tilt about each axis in
-turn, added in quadrature), predicted the mean sigma. The others are random: the scene is simulated
-with them, with several seeds, as a block has few poses; measured is the RMS error of Z, predicted
-the RMS of sigma.
+one. Level and index are common to the scene: measured is the mean change of Z if the correction is
+given a value that is off by one standard deviation, predicted the mean sigma. The others are
+random: the scene is simulated with them, with several seeds, as a block has few poses; measured is
+the RMS error of Z, predicted the RMS of sigma.
 """
 
 import argparse
@@ -41,7 +39,6 @@ import pcfix
 from pcfix.flow.check_depths import fit_check_depths
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.label.labelling import Part
-from pcfix.model import Views, WaterPlane
 from pcfix.options.correct import BudgetOptions
 from pcfix.simulate.tracing import piercing_points_of_planes, project
 from pcfix.water.surface import surface_above
@@ -118,9 +115,8 @@ def simulated(name: str, points: int, seed: int) -> Case:
     kind = "depth-maps" if name == "depth-maps" else "tracks"
     known: dict[str, dict[str, Any]] = {"views": {"views": replace(scene.views, kind=kind)}}
     mvs = {"camera_set": "mvs"}
-    if scene.pairs is not None:
-        pairs = Views(2 * scene.pairs_start, scene.pairs.ravel(), kind="pairs")
-        known["pairs"], mvs["matcher"] = {"views": pairs}, "pairs"
+    if name == "pairs":
+        mvs["matcher"] = "pairs"
     measured, floor = measured_of(scene), None
     if kind == "tracks":
         rng = np.random.default_rng([seed, 99])
@@ -233,7 +229,7 @@ def rows_of(case: Case, seed: int) -> list[dict[str, Any]]:
         (method, name, {**options, "max_angle": None})
         for method in METHODS
         for name, options in case.known.items()
-        if name != "pairs" or method == "consistent"
+        if name != "mvs" or method == "consistent"
     ]
     return rows + [row_of(case, *one) for one in runs]
 
@@ -285,7 +281,7 @@ SENSITIVITY = {
     "ratio": ".2f",
 }  # fmt: skip
 SEEDS = 5
-LEVEL_M, INDEX, TILT = 0.05, 0.005, 0.001
+LEVEL_M, INDEX = 0.05, 0.005
 RANDOM = (
     ("image", "0.5 px", {"image_noise": 0.5}, {"sigma_image": 0.5}),
     ("image", "1 px", {"image_noise": 1.0}, {"sigma_image": 1.0}),
@@ -306,21 +302,14 @@ def sensitivity(name: str, points: int, seed: int) -> list[dict[str, Any]]:
 
     scene = scene_of(points, seed)
     level, use, right = scene.water, measured_of(scene), corrected(scene)
-    x, y = scene.cameras.centres[:, :2].mean(axis=0)
-    tilts = (
-        WaterPlane(level.a - TILT * x, level.b + TILT, level.c),
-        WaterPlane(level.a - TILT * y, level.b, level.c + TILT),
-    )
-    degrees = float(np.degrees(np.arctan(TILT)))
     common = (
-        ("level", "+5 cm", [{"water": replace(level, a=level.a + LEVEL_M)}], LEVEL_M),
-        ("index", "+0.005", [{"index": scene.refractive_index + INDEX}], INDEX),
-        ("tilt", "0.1 %", [{"water": tilted} for tilted in tilts], degrees),
+        ("level", "+5 cm", {"water": replace(level, a=level.a + LEVEL_M)}, LEVEL_M),
+        ("index", "+0.005", {"index": scene.refractive_index + INDEX}, INDEX),
     )
     rows = []
-    for what, size, wrongs, sigma in common:
-        changes = [(corrected(scene, **wrong).xyz - right.xyz)[use, 2] for wrong in wrongs]
-        measured = np.sqrt(np.sum(np.square(changes), axis=0)).mean()
+    for what, size, wrong, sigma in common:
+        changes = (corrected(scene, **wrong).xyz - right.xyz)[use, 2]
+        measured = np.abs(changes).mean()
         predicted = corrected(scene, **{f"sigma_{what}": sigma}).sigma_z_m[use].mean()
         rows.append((what, size, np.mean(changes), measured, predicted))
     for what, size, made, sigmas in RANDOM:

@@ -58,7 +58,7 @@ OF_RIVER = {
     "sea": "--index sea",
     "salt": "--salinity 10 --temperature 25 --wavelength 0.6",
     "sigmas": (
-        "--sigma-image 1 --sigma-level 0.05 --sigma-tilt 0.1 --sigma-index 0.005 --sigma-waves 1"
+        "--sigma-image 1 --sigma-level 0.05 --sigma-index 0.005 --sigma-waves 1"
         " --sigma-centre 0.03 --sigma-attitude 0.01"
     ),
     "withhold": "--max-angle 4",

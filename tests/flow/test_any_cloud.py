@@ -137,13 +137,12 @@ def test_larger_index_deeper(data, scene, n, more):
 
 @st.composite
 def listed(draw, scene: Scene) -> pcfix.Views:
-    """Draw a list of two cameras or more for each point, in pairs where that is its kind."""
+    """Draw a list of two cameras or more for each point."""
     kinds = ["tracks", "depth-maps", "pairs"] if scene.cameras.rotations is not None else ["tracks"]
     kind = draw(st.sampled_from(kinds))
     rng = np.random.default_rng(draw(st.integers(0, 99)))
     k = len(scene.cameras)
-    count = rng.integers(2, k + 1, len(scene.xyz)) // (2 if kind == "pairs" else 1)
-    rows = [rng.permutation(k)[: c * (2 if kind == "pairs" else 1)] for c in count]
+    rows = [rng.permutation(k)[:count] for count in rng.integers(2, k + 1, len(scene.xyz))]
     start = np.cumsum([0, *map(len, rows)])
     return pcfix.Views(start, np.concatenate(rows), None, kind)
 

@@ -1,4 +1,4 @@
-"""Uncertainty if the method or list is wrong, and clouds that are merged, large or gridded."""
+"""Uncertainty if the method or list is wrong, and large or gridded clouds."""
 
 from dataclasses import replace
 from functools import cache
@@ -10,11 +10,10 @@ from scipy.spatial import cKDTree
 
 import pcfix
 from pcfix.flow import planning
-from pcfix.model import TiePoints
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract import patches
 from pcfix.refract.batch import Batch, Survey
-from pcfix.refract.learning import CORRECTED_RATIO, depth_ratio, learn_of_sample
+from pcfix.refract.learning import learn_of_sample
 from pcfix.refract.patches import grid_m
 from pcfix.refract.reconstructions import IN_FRAME, hint_of
 from pcfix.water.surface import surface_above
@@ -68,42 +67,11 @@ def test_coverage_of_a_wrong_list():
     assert covered(scene, found) >= 0.90
 
 
-def as_file(path, xyz, sources):
-    las = laspy.read(write_las(path, xyz, crs=None))
-    las.point_source_id = np.broadcast_to(sources, len(xyz))
-    las.write(path)
-    return path
-
-
-@pytest.mark.nightly
-def test_merged_clouds(tmp_path):
-    clouds = [scene_of(cloud) for cloud in ("tracks", "depth-maps")]
-    assert np.array_equal(clouds[0].cameras.centres, clouds[1].cameras.centres)
-    xyz = np.vstack([scene.apparent_xyz for scene in clouds])
-    sources = np.repeat([7, 9], [len(scene.apparent_xyz) for scene in clouds])
-    order = np.random.default_rng(1).permutation(len(xyz))
-    path = as_file(tmp_path / "both.las", xyz[order], sources[order])
-    given = {"cameras": clouds[0].cameras, "water": clouds[0].water}
-    summary = pcfix.correct_file(path, tmp_path / "out.las", **given)
-    assert "Point source 7" in summary.reconstruction["because"]
-    assert "Point source 9" in summary.reconstruction["because"]
-    out = np.empty_like(xyz)
-    out[order] = laspy.read(tmp_path / "out.las").xyz
-    for source, scene, told in zip((7, 9), clouds, IN_FRAME[:2], strict=True):
-        rows = wet(scene)
-        error = (out[sources == source] - scene.true_xyz)[rows, 2]
-        best = pcfix.correct_points(
-            scene.apparent_xyz, scene.cameras, scene.water, **told.changes
-        )  # fmt: skip
-        least = (best.xyz - scene.true_xyz)[rows, 2]
-        assert np.sqrt(np.mean(error**2)) < 1.1 * np.sqrt(np.mean(least**2))
-
-
 @pytest.mark.parametrize("cloud", mostly_nightly(("depth-maps", "tracks"), "tracks"))
 def test_large_cloud(cloud, tmp_path, monkeypatch):
     """As if it were hundreds of times as large: few of its points are looked at."""
     scene = scene_of(cloud, points=16_000)
-    path = as_file(tmp_path / "large.las", scene.apparent_xyz, 0)
+    path = write_las(tmp_path / "large.las", scene.apparent_xyz, crs=None)
     for name in ("FEWEST_BED_POINTS", "MOST_BED_POINTS"):
         monkeypatch.setattr(planning, name, 1200)
     monkeypatch.setattr(patches, "MOST_IN_SQUARES", 10_000)
@@ -113,18 +81,6 @@ def test_large_cloud(cloud, tmp_path, monkeypatch):
     assert made["type"] == IN_FRAME[["tracks", "depth-maps"].index(cloud)].words
     monkeypatch.setattr(planning, "Squares", lambda width_m: None)
     assert "sure" not in pcfix.correct_file(path, tmp_path / "out.las", **given).reconstruction
-
-
-def test_sources(tmp_path):
-    scene = scene_of()
-    sources = np.arange(len(scene.apparent_xyz)) % 3
-    given = {"cameras": scene.cameras, "water": scene.water}
-    paths = [tmp_path / name for name in ("some.las", "one.las")]
-    for path, source in zip(paths, (sources, np.zeros_like(sources)), strict=True):
-        as_file(path, scene.apparent_xyz, source)
-        pcfix.correct_file(path, path.with_suffix(".out.las"), **given)
-    some, one = (laspy.read(path.with_suffix(".out.las")) for path in paths)
-    np.testing.assert_array_equal(some.xyz, one.xyz)
 
 
 @pytest.mark.parametrize(
@@ -172,19 +128,6 @@ def test_mesh():
         assert any("mesh or a filtered cloud" in one for one in verdict.remarks) is is_mesh
 
 
-def test_depth_ratio():
-    scene = scene_of()
-    above = surface_above(scene.water, scene.apparent_xyz)
-    rows = np.flatnonzero(wet(scene))
-    survey = Survey(scene.water, scene.cameras, ScienceOptions())
-    views = scene.views.take(rows[::20])
-    ties = TiePoints(scene.apparent_xyz[rows[::20]], views, np.zeros((len(views.camera), 2)))
-    came = Batch(scene.apparent_xyz, above, survey).take(rows)
-    done = replace(came, xyz=scene.true_xyz[rows])
-    assert depth_ratio(came, ties) == pytest.approx(1.0, abs=0.05)
-    assert depth_ratio(done, ties) > CORRECTED_RATIO + 0.1
-
-
 @pytest.mark.filterwarnings("ignore::pcfix.PcfixWarning")
 def test_list_of_half(tmp_path):
     scene = scene_of(points=6000)
@@ -194,7 +137,7 @@ def test_list_of_half(tmp_path):
     ]
     write_vis(tmp_path / "fused.ply.vis", images)
     write_ply(tmp_path / "fused.ply", scene.apparent_xyz[rows], position="double")
-    path = as_file(tmp_path / "cloud.las", scene.apparent_xyz, 0)
+    path = write_las(tmp_path / "cloud.las", scene.apparent_xyz, crs=None)
     given = {"cameras": scene.cameras, "water": scene.water}
     out = {}
     for name, views in (("half", tmp_path / "fused.ply.vis"), ("none", None)):

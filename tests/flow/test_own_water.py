@@ -71,14 +71,11 @@ def raster_of(heights):
     return WaterRaster(values.reshape(x.shape), left, top, (CELL_M, CELL_M))
 
 
-def write(folder, heights, sigma=0.002):
-    """Write a raster of each image, and its standard error."""
-    (folder / "sigma").mkdir(parents=True)
+def write(folder, heights):
+    """Write a raster of each image."""
+    folder.mkdir(parents=True)
     for number, one in enumerate(heights):
         write_water_raster(folder / f"DJI_{number}.tif", raster_of(one), None)
-        if sigma is not None:
-            error = raster_of(lambda xy: sigma)
-            write_water_raster(folder / "sigma" / f"DJI_{number}.tif", error, None)
     return folder
 
 
@@ -130,28 +127,6 @@ def test_raster_missing(seen, tmp_path, method):
     assert own.xyz[west] == pytest.approx(tide.xyz[west], abs=MICROMETRE)
     assert own.xyz[east] == pytest.approx(flat.xyz[east], abs=MICROMETRE)
     assert np.abs(tide.xyz - flat.xyz)[west].max() > MILLIMETRE
-
-
-@pytest.mark.parametrize("method", ["snell", "consistent"])
-def test_standard_error(seen, tmp_path, method):
-    """The rms of what one standard error of each image's water does to Z, image after image."""
-    points, sigma, none = seen[1][::10], 0.03, {"sigma_image": 0.0, "sigma_index": 0.0}
-    level = write(tmp_path / "level", [lambda xy: 0.0] * 6, sigma)
-    told = pcfix.correct_points(
-        points, block(), 0.0, method=method, water_per_image=level, sigma_level=0.0, **none
-    )
-    moved = []
-    for image in range(6):
-        off = [lambda xy, up=sigma * (number == image): up for number in range(6)]
-        folder = write(tmp_path / str(image), off, None)
-        with pytest.warns(PcfixWarning):
-            found = pcfix.correct_points(
-                points, block(), 0.0, method=method, water_per_image=folder
-            )
-        moved.append(found.xyz[:, 2] - told.xyz[:, 2])
-    measured = np.sqrt(np.square(moved).sum(axis=0))
-    # the mean over the rays takes them as alike; the flat ones count for more: 13 and 16 %
-    assert 0.8 < np.median(told.sigma_z_m / measured) < 1.0
 
 
 def test_file(seen, waters, tmp_path):

@@ -143,15 +143,6 @@ def test_check_depths_off_the_cloud(tmp_path):
     assert "line 5" in str(found.notes[0])
 
 
-def test_outlier(tmp_path):
-    xy = places(12)
-    depths = true_at(xy)
-    depths[4] += 1.5
-    found = fit_check_depths(table(tmp_path, xy, depths), parts(cloud()))
-    assert (found.count, found.outliers) == (12, (4,))
-    assert "line 6" in str(found.notes[-1])
-
-
 def sorted_places():
     xy = places(10)
     xy[:, 0] = np.sort(xy[:, 0])

@@ -43,6 +43,7 @@ LENSES = {
     ),
     "round fisheye": pcfix.Lens(1100.0, *SIZE, projection="equisolid"),
     "folding": pcfix.Lens(3000.0, *SIZE, radial=(-0.9,)),
+    "straight": pcfix.Lens(3000.0, *SIZE),
 }  # fmt: skip
 
 
@@ -94,7 +95,7 @@ def views_slowly(points, cameras):
     return pcfix.Views(start, np.array([c for r in rows for c in r], np.int64))
 
 
-@pytest.mark.parametrize("name", mostly_nightly(LENSES, "everything", "fisheye"))
+@pytest.mark.parametrize("name", mostly_nightly(LENSES, "everything", "fisheye", "straight"))
 def test_slow_implementation(name, points):
     cameras = block(LENSES[name])
     some = points if name != "inverse" else points[: 2 * TILE]  # its twin is very slow

@@ -72,12 +72,9 @@ def test_without_list(scene):
     assert agrees.mean() > 0.95
 
 
-def test_snell(scene):
-    # what `snell` leaves: a third of a metre becomes some centimetres, not nothing
-    found = run(scene, ScienceOptions(), scene.views)
-    before, after = rms(scene.apparent - scene.truth)[2], rms(errors_of(scene, found))[2]
-    assert 0.01 < after < 0.5 * before
-    # the rays one by one, intersected in numpy about the apparent point
+def test_ray_distance(scene):
+    """The rays through the apparent point one by one, about the point that is nearest to them."""
+    found = run(scene, CONSISTENT, scene.views)
     window, start = window_of(coefficients(scene.port)), scene.views.start
     for i in range(0, len(scene.apparent), 50):
         places, rays, point = [], [], scene.apparent[i]
@@ -87,7 +84,6 @@ def test_snell(scene):
             places.append(turn.T @ place + (centre - point))
             rays.append(turn.T @ ray)
         truth = stacked_intersection(np.array(places), rays)
-        assert found.shift_m[i] == pytest.approx(truth, abs=5e-9)
         misses = np.linalg.norm(np.cross(truth - places, rays), axis=1)
         assert found.ray_miss_m[i] == pytest.approx(np.sqrt((misses**2).mean()), abs=1e-7)
 

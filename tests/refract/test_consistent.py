@@ -187,15 +187,6 @@ def test_frames_hold_images():
     assert np.count_nonzero(error < MICROMETRE) >= 0.7 * len(differ)
 
 
-def test_snell_is_biased(exact):
-    cameras, plane, truth, apparent, lists = exact
-    result = run(
-        apparent + UTM, moved(cameras, UTM), in_utm(plane), views_of(lists), method="snell"
-    )
-    # half a pixel on the ground and more: the scenes test something
-    assert np.abs(apparent + result.shift_m - truth).max() > 0.01
-
-
 def test_level_per_camera():
     cameras, truth = oblique_block(np.random.default_rng(1)), bed(10, seed=8)
     truth[:5, 2] = np.linspace(0.05, 0.3, 5)  # above the water of some cameras

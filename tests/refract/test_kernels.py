@@ -54,28 +54,6 @@ def same(one, other):
         assert np.array_equal(getattr(one, name), getattr(other, name)), name
 
 
-def views_in_frame(points, cameras):
-    """Return the cameras whose frame holds each point, by plain projection."""
-    rows = []
-    for point in points:
-        local = np.einsum("kij,kj->ki", cameras.rotations, point - cameras.centres)
-        u = lens().focal * local[:, 0] / local[:, 2] + lens().principal_x
-        v = lens().focal * local[:, 1] / local[:, 2] + lens().principal_y
-        inside = (u >= 0) & (u <= 4000) & (v >= 0) & (v <= 3000) & (local[:, 2] > 0)
-        rows.append(np.flatnonzero(inside))
-    start = np.concatenate([[0], np.cumsum([len(r) for r in rows])])
-    return pcfix.Views(start, np.concatenate(rows))
-
-
-def test_frames_are_projection(points, cameras):
-    views = views_in_frame(points, cameras)
-    result = snell(points, cameras, 0.0)
-    seen = np.diff(views.start)
-    assert 0 < seen.min() + 1 < seen.max() < len(cameras)  # the scene tests something
-    assert np.array_equal(result.ray_count, np.where(seen >= 2, seen, 0))
-    same(result, snell(points, cameras, 0.0, views=views))
-
-
 WAVES = WaterRaster(
     0.15 * np.sin(np.arange(-20.0, 120.0) / 4.0) * np.ones((140, 1)), -20.0, 120.0, (1.0, 1.0)
 )

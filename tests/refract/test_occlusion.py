@@ -5,17 +5,9 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix import Cameras, Lens
 from pcfix.io.views import ViewMatch, read_views
-from pcfix.model import Views, WaterPlane
-from pcfix.options.correct import ScienceOptions
-from pcfix.refract.batch import Learned
-from pcfix.refract.methods import correct
+from pcfix.model import Views
 from pcfix.refract.occlusion import occluded, visible_cameras
-from pcfix.simulate.tracing import project, triangulate
-from pcfix.water.surface import SurfaceAbove
-from tests.utils.batches import batch_of
-from tests.utils.bed_rays import piercing_points
 from tests.utils.clouds import occluder_of
 from tests.utils.shared import needs
 
@@ -95,25 +87,6 @@ def test_wall_face(walled):
     assert not found[:, 0].any()
     # the ray to the back rises 1/3: after the 1 m of wall it is still below its top
     assert found[:, 1].all()
-
-
-def deck_scene(deck_m=5.0):
-    """Return a river bed 1 m deep under a deck from x = -3 to 3, and their surface."""
-    rng = np.random.default_rng(5)
-    bed = plain(rng, noise_m=0.02) + np.array([0.0, 0.0, 4.0])
-    deck = np.column_stack([rng.uniform([-3, -10], [3, 10], (20_000, 2)), np.full(20_000, deck_m)])
-    deck[:, 2] += rng.normal(0.0, 0.02, len(deck))
-    return bed, occluder_of(np.vstack([bed, deck]))
-
-
-def test_under_deck():
-    bed, occluder = deck_scene()
-    under = bed[(np.abs(bed[:, 0] - 2.0) < 0.2) & (np.abs(bed[:, 1]) < 8.0)]
-    above, steep, flat = [2.0, 0.0, 80.0], [12.0, 0.0, 80.0], [102.0, 0.0, 50.0]
-    found = hidden_of(under, np.array([above, steep, flat]), occluder)
-    # the steep rays rise 8 a metre and pierce the deck, 6 m up, 0.75 m on, before its edge 1 m on;
-    # the flat ones rise 0.5 a metre
-    assert found[:, 0].all() and found[:, 1].all() and not found[:, 2].any()
 
 
 def hidden_by_small_steps(point, centre, occluder):
@@ -197,69 +170,3 @@ def test_real_views():
     match = ViewMatch(views, cameras, points=len(xyz))
     found = occluded(xyz, cameras.centres, match.views_of(xyz, 0)[0], occluder_of(xyz))
     assert found.mean() < 0.01  # of entries, all of which are of images that saw the point
-
-
-# --- the correction ------------------------------------------------------------------------------
-
-CLIFF_M = 15.0
-LENS = Lens(2_000.0, 4_000.0, 3_000.0, 2_000.0, 1_500.0)
-
-
-def looking_at(centre, target):
-    """Return the rotation of a camera whose axis goes through a target."""
-    z = (target - centre) / np.linalg.norm(target - centre)
-    x = np.cross(z, [0.0, 1.0, 1e-3])
-    x /= np.linalg.norm(x)
-    return np.array([x, np.cross(z, x), z])
-
-
-def cliff_block():
-    """Return obliques from both sides of a cliff: land 15 m high at x < 0, water at x > 0."""
-    targets = np.array([[8.0, y, 0.0] for y in (-24, -12, 0, 12, 24) for _ in range(5)])
-    away = np.tile([-45.0, -30.0, 0.0, 20.0, 40.0], 5)
-    centres = targets + np.column_stack([away, 0.0 * away, np.full(25, 45.0)])
-    rotations = np.array([looking_at(*pair) for pair in zip(centres, targets, strict=True)])
-    return Cameras(tuple(f"c{i}" for i in range(25)), centres, rotations, (LENS,) * 25)
-
-
-def cliff_scene(rng, n=20_000):
-    """Return the true bed, its apparent points, and the cloud with the cliff, by exact tracing."""
-    cameras = cliff_block()
-    true = np.column_stack([rng.uniform([0.3, -15], [16, 15], (n, 2)), np.zeros(n)])
-    true[:, 2] = -1.0 - 0.15 * true[:, 0]
-    point, camera = (side.ravel() for side in np.mgrid[: len(true), : len(cameras)])
-    centres = cameras.centres[camera]
-    surface = piercing_points(true[point], centres, 0.0, 1.34)
-    pixels, _ = project(surface, cameras, camera, LENS)
-    share = surface[:, 0] / (surface[:, 0] - np.minimum(centres[:, 0], -1e-9))
-    over_edge = surface[:, 2] + share * (centres[:, 2] - surface[:, 2]) > CLIFF_M
-    seen = (surface[:, 0] > 0.0) & ((centres[:, 0] > 0.0) | over_edge)
-    seen &= ((pixels > 0.0) & (pixels < [LENS.width, LENS.height])).all(axis=1)
-    counts = np.bincount(point[seen], minlength=len(true))
-    assert counts.min() >= 2
-    start = np.concatenate([[0], np.cumsum(counts)])
-    pixels = pixels[seen] + rng.normal(0.0, 0.3, (seen.sum(), 2))
-    apparent = triangulate(pixels, cameras, camera[seen], start, LENS, true)
-    top = np.column_stack([rng.uniform([-25, -25], [0, 25], (50_000, 2)), np.full(50_000, CLIFF_M)])
-    face = rng.uniform([0.0, -25, 0], [0.0, 25, CLIFF_M], (20_000, 3))
-    cloud = np.vstack([apparent, top, face])
-    return cameras, true, apparent, cloud, Views(start, camera[seen])
-
-
-def test_cliff():
-    cameras, true, apparent, cloud, views = cliff_scene(np.random.default_rng(9))
-    water, flat = WaterPlane(0.0), SurfaceAbove(np.zeros(len(true)), np.zeros((len(true), 2)))
-
-    def rms_m(views=None, occluder=None):
-        result = correct(
-            batch_of(
-                apparent, flat, water, cameras, ScienceOptions(method="snell"), views,
-                learned=Learned(occluder=occluder),
-            )
-        )  # fmt: skip
-        return np.sqrt(((apparent + result.shift_m - true) ** 2).sum(axis=1).mean())
-
-    occluder = occluder_of(cloud)
-    all_in_frame, known, without_hidden = rms_m(), rms_m(views), rms_m(occluder=occluder)
-    # what is left of the error that hidden cameras bring is of rays past the edge, to a cell
-    assert without_hidden - known < 0.2 * (all_in_frame - known)

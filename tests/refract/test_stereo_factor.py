@@ -41,11 +41,6 @@ def test_traced_light():
         assert 0.05 / apparent == pytest.approx(found[i, j], rel=2e-4)
 
 
-def test_nodes():
-    fine = np.mean([ratios(0.2, 0.5 + d, 0.75, N).mean() for d in (-1e-4, 1e-4)])
-    assert ratios(0.2, 0.5, 0.75, N).mean() == pytest.approx(fine, rel=1e-6)
-
-
 def measured(scene):
     """Return true by apparent depth of a simulated cloud, on average."""
     apparent, true = (scene.depth_m(xyz) for xyz in (scene.apparent_xyz, scene.true_xyz))

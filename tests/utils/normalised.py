@@ -56,9 +56,9 @@ def apparent(
 ) -> FloatArray:
     """Return what SfM software makes of m points on the bed, shape (draws * m, 3).
 
-    Each draw has errors of its own, and m rows. The software believes in `cameras`, and the
-    correction later in a level surface at 0 and in `INDEX`; the light goes by what is drawn. The
-    water leans about the middle of the cameras, waves lean about where the light pierces them.
+    Each draw has errors of its own, and m rows. The software uses `cameras`, and the correction
+    later a level surface at 0 and `INDEX`; the light is traced with what is drawn. Waves lean about
+    where the light pierces them.
     """
     m, k = len(bed), len(cameras)
     # the rays of one draw after those of the other, each with cameras of its own
@@ -67,18 +67,17 @@ def apparent(
     points = np.tile(np.repeat(bed, k, axis=0), (draws, 1))
     n = (INDEX + sigma.sigma_index * rng.normal(size=draws))[per_ray]
     level = ((sigma.sigma_level or 0.0) * rng.normal(size=draws))[per_ray]
-    tilt = (math.radians(sigma.sigma_tilt) * rng.normal(size=(draws, 2)))[per_ray]
     true = _misplaced(cameras, sigma, rng, draws)
     seen_by = per_ray * k + camera
     centres = true.centres[seen_by]
-    middle = np.tile(cameras.centres[:, :2].mean(axis=0), (len(n), 1))
-    pivot = np.column_stack([middle, level])
-    surface = through_tilted(points, centres, pivot, tilt, n)
+    up = np.outer(level, [0.0, 0.0, 1.0])
+    surface = piercing_points(points - up, centres - up, 0.0, n) + up
     if sigma.sigma_waves:
         # the waves lean about where the light pierces the surface, which hardly moves by that
         waves = math.radians(sigma.sigma_waves) * rng.normal(size=(len(n), 2))
         for _ in range(3):
-            surface = through_tilted(points, centres, surface, tilt + waves, n, pivot, tilt)
+            surface[:, 2] = level
+            surface = through_waves(points, centres, surface, waves, n)
     pixels, _ = project(surface, true, seen_by, LENS)
     pixels += sigma.sigma_image * rng.normal(size=pixels.shape)
     start = np.arange(draws * m + 1) * k
@@ -100,23 +99,13 @@ def _misplaced(
     )
 
 
-def through_tilted(
-    points: FloatArray,
-    centres: FloatArray,
-    about: FloatArray,
-    slope: FloatArray,
-    n: FloatArray,
-    pivot: FloatArray | None = None,
-    mean_slope: FloatArray | None = None,
+def through_waves(
+    points: FloatArray, centres: FloatArray, about: FloatArray, slope: FloatArray, n: FloatArray
 ) -> FloatArray:
     """Return where light pierces planes of the given slopes (m, 2) through `about`.
 
     Turned so that the plane is upright, with camera and point, it is a level surface.
-    With a pivot, `about` gives the places only: their height is that of the mean surface there.
     """
-    about = about.copy()
-    if pivot is not None and mean_slope is not None:
-        about[:, 2] = pivot[:, 2] + (mean_slope * (about - pivot)[:, :2]).sum(axis=1)
     # the turn that makes the normal (-b, -c, 1) upright
     axis = np.column_stack([-slope[:, 1], slope[:, 0], np.zeros(len(slope))])
     steep = np.hypot(*slope.T)

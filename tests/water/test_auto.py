@@ -18,7 +18,7 @@ EAST_M, NORTH_M = 400_000.0, 5_000_000.0
 LIFT = 1.36
 
 
-def shore(n=30_000, *, slope=0.06, tilt=0.0, noise_m=0.01, bumps_m=0.04, seed=0):
+def shore(n=30_000, *, slope=0.06, noise_m=0.01, bumps_m=0.04, seed=0):
     """Return apparent points and colours of a bumpy shore; the bed is lifted, red fades."""
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(0.0, 60.0, n), rng.uniform(0.0, 80.0, n)
@@ -26,14 +26,14 @@ def shore(n=30_000, *, slope=0.06, tilt=0.0, noise_m=0.01, bumps_m=0.04, seed=0)
     apparent = np.where(true < 0.0, true / LIFT, true) + rng.normal(0.0, noise_m, n)
     ground = rng.uniform(0.7, 1.3, n)[:, None] * [120.0, 110.0, 90.0]
     fading = np.exp(np.minimum(true, 0.0)[:, None] * [0.45, 0.12, 0.10])
-    xyz = np.column_stack([x + EAST_M, y + NORTH_M, apparent + LEVEL_M + tilt * y])
+    xyz = np.column_stack([x + EAST_M, y + NORTH_M, apparent + LEVEL_M])
     return xyz, ground * fading
 
 
 @cache
-def found_of(tilt=0.0):
+def found_of():
     """Return the water of a shore with colours, which several tests look at."""
-    xyz, rgb = shore(tilt=tilt)
+    xyz, rgb = shore()
     return find_water(xyz, rgb=rgb)
 
 
@@ -51,14 +51,6 @@ def test_slope_only():
     assert abs(found.level_m - LEVEL_M) < 0.05
     # a bend of the shore within a tile rounds the break off
     assert found.evidence["slope amplitude"] == pytest.approx(LIFT - 1.0, abs=0.12)
-
-
-def test_tilt():
-    found = found_of(0.004)
-    along = found.points[:, 1] - NORTH_M
-    error = found.level_m + (found.points[:, :2] - found.centre_xy) @ found.tilt
-    assert found.tilt[1] == pytest.approx(0.004, abs=0.00125)  # 4 standard errors
-    assert np.abs(error - LEVEL_M - 0.004 * along).max() < 0.08  # m, at the ends too
 
 
 def test_repeated_and_shifted():
@@ -103,7 +95,7 @@ def test_refused():
 def test_amplitude_of_break():
     rng = np.random.default_rng(5)
     heights = np.array([0.0, 0.1])
-    cue = Cue("a colour", "", 0, 1.0, 1e6)
+    cue = Cue("a colour", "", True, 1.0, 1e6)
     parts = []
     everything = []
     for tile in range(3):
@@ -112,7 +104,7 @@ def test_amplitude_of_break():
         parts.append(tile_moments(np.ones((200, 1)), y, at, heights, cue))
         everything.append((tile, at, y))
     sums, count = map(np.array, zip(*parts, strict=True))
-    gain, amplitude, _ = gain_of(Moments(sums, count, None, heights, cue))
+    gain, amplitude, _ = gain_of(Moments(sums, count, heights, cue))
     design = np.vstack(
         [np.column_stack([np.eye(3)[np.full(200, t)], at, np.maximum(-at, 0)])
          for t, at, _ in everything]

@@ -5,8 +5,6 @@ import pytest
 from pcfix.water.index import index_of, refractive_index
 from tests.utils.codes import refused
 
-FORMULAS = ("skarlatos", "quan-fry")
-
 
 def iapws_1997(temperature_c, wavelength_um, density_kg_m3):
     """Return n of pure water relative to vacuum (release R9-97 of the IAPWS)."""
@@ -54,25 +52,6 @@ def test_eq_13_as_printed():
 def test_iapws():
     # R9-97, table of check values: 0 degrees Celsius, 0.1 MPa, 0.589 um and 100 degrees
     assert iapws_1997(0.0, 0.5893, 999.843) == pytest.approx(1.33434, abs=2e-5)
-
-
-@pytest.mark.parametrize("temperature_c", [2.0, 15.0, 28.0])
-@pytest.mark.parametrize("wavelength_nm", [450.0, 532.0, 600.0])
-@pytest.mark.parametrize(
-    ("salinity", "a", "b", "c", "d", "e"),
-    [
-        (35.0, -1.50156e-6, 1.07085e-7, -4.27594e-5, -1.60476e-4, 1.39807),
-        (0.0, -1.97812e-6, 1.03223e-7, -8.58125e-6, -1.54834e-4, 1.38919),
-    ],
-)
-@pytest.mark.parametrize("formula", FORMULAS)
-def test_parrish_2020(formula, salinity, a, b, c, d, e, wavelength_nm, temperature_c):
-    # a surface through the tables of Mobley 2010, with an RMSE of 2e-4 of its own: three times
-    # that is allowed, 9 mm in 15 m of water
-    published = a * temperature_c**2 + b * wavelength_nm**2 + c * temperature_c
-    published += d * wavelength_nm + e
-    found = refractive_index(salinity, temperature_c, wavelength_nm / 1000.0, formula)
-    assert found == pytest.approx(published, abs=6e-4)
 
 
 def test_index_of():

@@ -32,21 +32,6 @@ def test_height():
     assert heights[inside] == pytest.approx(expected[inside], abs=1e-9)
 
 
-def test_flat_mesh():
-    b, c = 0.01, -0.02
-    plan = np.array([[0, 0], [60, 0], [60, 60], [0, 60], [25, 31]], float)
-    vertices = np.column_stack([plan, 1.0 + b * plan[:, 0] + c * plan[:, 1]])
-    mesh = pcfix.WaterMesh(vertices, Delaunay(plan).simplices.astype(np.int64))
-    rng = np.random.default_rng(5)
-    points = np.column_stack([rng.uniform(5, 55, (300, 2)), rng.uniform(-8, -2, 300)])
-    centres = np.column_stack([rng.uniform(0, 60, (5, 2)), np.full(5, 70.0)])
-    cameras = pcfix.Cameras(tuple("abcde"), centres)
-    one = pcfix.correct_points(points, cameras, mesh)
-    other = pcfix.correct_points(points, cameras, pcfix.WaterPlane(1.0, b, c))
-    assert one.corrected.all()
-    assert one.xyz == pytest.approx(other.xyz, abs=1e-9)
-
-
 def test_all_facets():
     vertices, triangles = random_mesh(relief=0.5)
     mesh = pcfix.WaterMesh(vertices, triangles)

@@ -21,14 +21,9 @@ PAIRS_AT_ONCE = 50_000
 
 @dataclass(frozen=True, eq=False)
 class MatchedScene(Scene):
-    """A scene with the images that each image was matched with, shape (k, c), -1 for none.
-
-    In a cloud of pairs, point i has the stereo pairs ``pairs[pairs_start[i]:pairs_start[i + 1]]``.
-    """
+    """A scene with the images that each image was matched with, shape (k, c), -1 for none."""
 
     neighbours: np.ndarray | None = None
-    pairs: np.ndarray | None = None
-    pairs_start: np.ndarray | None = None
 
 
 def matched_scene(points: int, *, cloud: str = "tracks", **keywords) -> Scene:
@@ -39,7 +34,7 @@ def matched_scene(points: int, *, cloud: str = "tracks", **keywords) -> Scene:
     site, count = lay_out(chosen), NEIGHBOURS[cloud]
     truth = points_on(site.terrain, points, site.rng)
     rng, matching = map(np.random.default_rng, (0, [chosen.seed, 4]))
-    sure, parts, pairs = replace(site, detection=1.0), [], []
+    sure, parts = replace(site, detection=1.0), []
     if cloud == "pairs":
         sample = truth[:: max(1, len(truth) // SAMPLE)][:SAMPLE]
         table = neighbour_table(see(sample, sure, rng), count)
@@ -62,15 +57,10 @@ def matched_scene(points: int, *, cloud: str = "tracks", **keywords) -> Scene:
             normals, nearest = normals_of(site.terrain, *some[:, :2].T), cloud == "nearest-map"
             parts.append(keep_single_maps(sight, normals, partners, matching, nearest=nearest))
         else:
-            part, *of_part = match_pairs(sight, table, matching)
-            parts.append(part)
-            pairs.append(of_part)
+            parts.append(match_pairs(sight, table, matching))
     xyz, true, camera, counts, *weight = map(np.concatenate, zip(*parts, strict=True))
     scene = vars(scene_of(chosen, site, xyz, true, Views(starts(counts), camera, *weight)))
-    if cloud != "pairs":
-        return MatchedScene(**scene, neighbours=table)
-    pairs, counts = map(np.concatenate, zip(*pairs, strict=True))
-    return MatchedScene(**scene, neighbours=table, pairs=pairs, pairs_start=starts(counts))
+    return MatchedScene(**scene, neighbours=table)
 
 
 def normals_of(ground: Terrain, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -149,10 +149,8 @@ def rows_of(sight: Sight) -> IntArray:
     return rows
 
 
-def match_pairs(
-    sight: Sight, table: IntArray, rng: np.random.Generator
-) -> tuple[tuple[np.ndarray, ...], IntArray, IntArray]:
-    """Return the medians of the pairs of each point, the pairs, (p, 2), and their numbers, (n,).
+def match_pairs(sight: Sight, table: IntArray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Return the medians of the pairs of each point, the true points, and the images in pairs.
 
     A point without a pair stays where it is and has no cameras. `table`, shape (k, c), has the
     neighbours of each camera, -1 for none; `rng` makes the noise, of two image points a pair.
@@ -184,5 +182,4 @@ def match_pairs(
     used = np.zeros(len(sight.point), bool)
     used[both] = True
     count = np.bincount(sight.point[used], minlength=len(truth))
-    pairs = np.column_stack([sight.camera[one], sight.camera[other]])
-    return (xyz, truth, sight.camera[used], count), pairs, np.diff(start)
+    return xyz, truth, sight.camera[used], count
