@@ -24,11 +24,11 @@ def pipeline_for(input: Path, output: Path | None, options: CorrectOptions) -> d
     The stage gets the options that differ from their defaults. PDAL replaces existing outputs. What
     `pcfix.correct_file` refuses before it reads points is refused here, too.
     """
-    for name in ("bounds", "read_resolution", "port"):
+    for name in ("bounds", "port"):
         if getattr(options, name) is not None:
             raise SettingError(
                 "option.no_use",
-                f"--{name.replace('_', '-')} has no effect in a pipeline. Choose points by options"
+                f"--{name} has no effect in a pipeline. Choose points by options"
                 " of readers.copc, and use 'pcfix correct' for a cloud taken under water.",
                 option=name,
             )

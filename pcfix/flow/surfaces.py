@@ -28,7 +28,7 @@ from pcfix.io.vectors import (
     read_shoreline,
     write_layers,
 )
-from pcfix.io.water import rasters_of_images, read_water, read_water_raster
+from pcfix.io.water import rasters_of_images, read_image_raster, read_water
 from pcfix.label.labelling import Part
 from pcfix.model import (
     NOISE_CLASSES,
@@ -213,11 +213,11 @@ def own_water_of(
     overlaps, differs = [], list[float]()
     with warnings.catch_warnings():  # those of the first raster are enough
         for image, path in paths.items():
-            heights[image] = raster = read_water_raster(path, view.crs)
+            heights[image] = raster = read_image_raster(path, view.crs)
             warnings.simplefilter("ignore", PcfixWarning)
             error = path.parent / "sigma" / path.name
             if error.is_file():
-                sigma[image] = read_water_raster(error, view.crs)
+                sigma[image] = read_image_raster(error, view.crs)
             # the rasters must overlap the cloud, and have the vertical datum of the common water
             rows, columns = np.nonzero(np.isfinite(raster.height_m))
             x = raster.left_m + (columns + 0.5) * raster.cell_m[0]

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
-from pcfix.io.files import check_input, read_json, refusing
+from pcfix.io.files import check_input, refusing
 from pcfix.io.labels import match_labels
 from pcfix.io.tables import read_table
 from pcfix.model import FloatArray
@@ -57,19 +57,15 @@ def read_image_times(path: File, labels: Sequence[str]) -> ImageTimes:
     Parameters
     ----------
     path : path
-        A table with the columns ``label`` and ``time`` (ISO 8601); a folder with the images,
-        whose EXIF data has DateTimeOriginal, and OffsetTimeOriginal for the zone; ODM's
-        ``images.json`` or ``shots.geojson``, or OpenSfM's ``reconstruction.json``. These last
-        count as UTC; if the images' EXIF data states no zone they hold local time.
+        A table with the columns ``label`` and ``time`` (ISO 8601), or a folder with the images,
+        whose EXIF data has DateTimeOriginal, and OffsetTimeOriginal for the zone.
     labels : sequence of str
         Names of the k images; a folder or an extension may be missing on either side.
     """
     found = Path(path)
     if found.is_dir():
         return _from_exif(found, labels)
-    if check_input(found).suffix.lower() in (".json", ".geojson"):
-        return _from_json(found, labels)
-    table = read_table(found, ("label", "time"))
+    table = read_table(check_input(found), ("label", "time"))
     rows = _rows(table.column("label"), labels, found)
     texts = table.column("time")
     where = [f"line {table.line[row]}" for row in rows]
@@ -93,24 +89,6 @@ def _from_exif(folder: Path, labels: Sequence[str]) -> ImageTimes:
             raise bad_file(file, "image_times.missing", sentence)
         texts.append(text + (f".{fraction}" if fraction.isdecimal() else "") + zone)
     return _times(folder, [f"image {file.name}" for file in chosen], texts)
-
-
-def _from_json(path: Path, labels: Sequence[str]) -> ImageTimes:
-    sentence = f"is not a file of OpenDroneMap or OpenSfM ({{}}). {_USE_TABLE}"
-    with refusing(path, "image_times.not_one", sentence):
-        content = read_json(path)
-        if isinstance(content, dict):  # shots.geojson
-            shots = [one["properties"] for one in content.get("features", ())]
-            pairs = [(one["filename"], one.get("capture_time")) for one in shots]
-        elif content and "shots" in content[0]:  # reconstruction.json
-            items = [item for part in content for item in part["shots"].items()]
-            pairs = [(name, shot.get("capture_time")) for name, shot in items]
-        else:  # images.json, milliseconds
-            pairs = [(one["filename"], float(one.get("utc_time") or 0.0) / 1e3) for one in content]
-        times = {str(name): float(time_s or 0.0) for name, time_s in pairs}
-    known = [name for name, time_s in times.items() if 0.0 < time_s < np.inf]
-    chosen = [known[row] for row in _rows(known, labels, path)]
-    return ImageTimes(np.array([times[name] for name in chosen]), True, str(path))
 
 
 def _rows(names: Sequence[str], labels: Sequence[str], source: Path) -> list[int]:

@@ -91,7 +91,7 @@ def part_of(path: CloudFiles, options: Any = None) -> Any:
     if not isinstance(path, Path):
         return path
     bounds, band = getattr(options, "bounds", None), getattr(options, "band", None)
-    part = CloudPart(path, bounds, getattr(options, "read_resolution", None), band)
+    part = CloudPart(path, bounds, band)
     if band is not None and not is_raster(path):
         words = "band has an effect only if the input is a raster; omit it."
         raise SettingError("option.needs", words, option="band", needs="raster")
@@ -124,11 +124,11 @@ def part_of(path: CloudFiles, options: Any = None) -> Any:
 def check_one_file(cloud: Any, options: Any) -> None:
     """Refuse options that are about one file, or about many, where it is the other."""
     many = isinstance(cloud, Tiles)
-    for name in ("bounds", "read_resolution") if many else ("scheduler",):
-        if getattr(options, name, None) is not None:
-            kind = "a single file" if many else "many files (a folder, glob or list of tiles)"
-            sentence = f"{name.replace('_', '-')} works only with {kind}; omit it."
-            raise SettingError("option.one_file", sentence, option=name)
+    name = "bounds" if many else "scheduler"
+    if getattr(options, name, None) is not None:
+        kind = "a single file" if many else "many files (a folder, glob or list of tiles)"
+        sentence = f"{name} works only with {kind}; omit it."
+        raise SettingError("option.one_file", sentence, option=name)
 
 
 def inputs_of(cloud: Any) -> list[Any]:

@@ -42,7 +42,6 @@ UNIT = re.compile(r"(?<=\d) (?=(?:m|cm|px|deg|%)(?:\W|$))")
 _PART: RowTable = (
     ("Read", "a part of {part[of]:,} points", "part"),
     ("", "within {part[bounds]:.12g}", "part[bounds]"),
-    ("", "at a resolution of {part[read_resolution]:g} m", "part[read_resolution]"),
 )
 _NO_SURFACE = ("No surface", "{water_unknown:,} points have no water surface", "water_unknown")
 _SHORELINE: RowTable = (

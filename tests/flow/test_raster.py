@@ -296,7 +296,6 @@ def test_may_be_depths(tmp_path):
         ("option.conflict", ("dsm.tif", "out.tif"), {"uncorrected": "drop"}),
         ("output.is_input", ("dsm.tif", "dsm.tif"), {}),
         ("output.is_input", ("dsm.tif", "out.tif"), {"depth": "out.tif"}),
-        ("cloud.not_copc", ("dsm.tif", "out.tif"), {"read_resolution": 1.0}),
         ("cloud.bounds", ("dsm.tif", "out.tif"), {"bounds": "0,0,1,1"}),
         ("water.below_cloud", ("dsm.tif", "out.tif"), {"water": -30.0}),
         ("cloud.rasters", (["dsm.tif", "other.tif"], "out"), {}),

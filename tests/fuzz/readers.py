@@ -360,10 +360,8 @@ def read_picture(path: Path) -> Iterator[Any]:
 
 def read_points(path: Path) -> Iterator[Any]:
     yield read_cloud(path)
-    part = {"bounds": (456_000.0, 5_432_000.0, 456_060.0, 5_432_090.0), "read_resolution": None}
-    if "copc" in path.name:
-        part["read_resolution"] = 5.0
-    with open_cloud(part_of(path, SimpleNamespace(**part)), 1) as source:
+    box = SimpleNamespace(bounds=(456_000.0, 5_432_000.0, 456_060.0, 5_432_090.0))
+    with open_cloud(part_of(path, box), 1) as source:
         yield sum(len(points) for points in source.chunks())
 
 
@@ -433,7 +431,6 @@ READERS: dict[str, Reader] = {
     ),
     "vectors": Reader(read_lines, {
         "csv": text("shore.csv", LINE), "geojson": text("water.geojson", SHAPE),
-        "wkt": text("a.wkt", "POLYGON Z ((0 0 1, 9 0 1, 9 9 1, 0 0 1))\nPOINT (3 4)\n"),
         "gpkg": vector("water.gpkg"), "shp": vector("water.shp"),
     }),
     "control": one(
@@ -446,8 +443,7 @@ READERS: dict[str, Reader] = {
         table=text("gnss.csv", GNSS), geo=text("geo.txt", GEO), images=ODM_IMAGES,
     ),
     "tides": one(
-        times, pictures=pictures, tide=text("tide.csv", TIDE), times=text("times.csv", TIMES),
-        images=ODM_IMAGES,
+        times, pictures=pictures, tide=text("tide.csv", TIDE), times=text("times.csv", TIMES)
     ),
     "depths": one(read_check_depths, table=text("depths.csv", DEPTHS)),
     "regression": one(read_regression, line=regression),

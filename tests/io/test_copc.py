@@ -9,9 +9,6 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.io.las import source as las_source
-from pcfix.io.tiles import open_cloud, part_of
-from pcfix.options.shared import PartOptions
 from tests.utils.clouds import (
     EAST_M,
     NORTH_M,
@@ -59,8 +56,7 @@ def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, chun
         source, tmp_path / "part.laz", cameras=block(), bounds=BOX,
         summary=tmp_path / "part.json", **SNELL,
     )  # fmt: skip
-    expected = {"points": int(inside(before).sum()), "of": 2000, "bounds": list(BOX),
-                "read_resolution": None}  # fmt: skip
+    expected = {"points": int(inside(before).sum()), "of": 2000, "bounds": list(BOX)}
     assert summary.part == json.loads((tmp_path / "part.json").read_text())["part"] == expected
     assert summary.points == len(laspy.read(tmp_path / "part.laz")) == expected["points"]
     pcfix.correct_file(source, tmp_path / "whole.laz", cameras=block(), **SNELL)
@@ -70,34 +66,6 @@ def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, chun
     assert json.loads(ours.record_data)["part"] == expected
     pcfix.restore_file(tmp_path / "part.laz", tmp_path / "back.laz")
     assert rows(tmp_path / "back.laz") == sorted(map(bytes, before.points.array[inside(before)]))
-
-
-def test_only_nodes_within_are_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source, unpacked = cloud(tmp_path / "tree.copc.laz"), []
-    name = "decompress_points_with_chunk_table"
-    of = getattr(las_source.lazrs, name)
-    monkeypatch.setattr(las_source.lazrs, name, lambda *a: unpacked.append(len(a[3])) or of(*a))
-    with open_cloud(part_of(source, PartOptions(bounds=BOX))) as found:
-        points = np.concatenate([one.array for one in found.chunks()])
-    assert len(points) == len(found) == inside(laspy.read(source)).sum()
-    nodes = 1 + 8 + 64  # of three levels, at most
-    assert 0 < sum(unpacked) / 2 < nodes / 2
-
-
-@pytest.mark.parametrize("resolution", [100.0, 20.0, 3.0])
-@pytest.mark.parametrize("box", [None, BOX])
-def test_coarse_levels(tmp_path: Path, resolution: float, box: Any) -> None:
-    source = cloud(tmp_path / "tree.copc.laz")
-    summary = pcfix.label_file(
-        source, tmp_path / "part.las", water=WATER_M, bounds=box, read_resolution=resolution
-    )
-    corners = None if box is None else laspy.copc.Bounds(np.array(box[:2]), np.array(box[2:]))
-    with laspy.CopcReader.open(source) as reader:
-        expected = reader.query(bounds=corners, resolution=resolution)
-    found = laspy.read(tmp_path / "part.las")
-    np.testing.assert_array_equal(np.sort(found.gps_time), np.sort(expected["gps_time"]))
-    assert summary.part is not None
-    assert (summary.part["points"], summary.part["of"]) == (len(expected), 2000)
 
 
 def test_output_has_no_index(tmp_path: Path) -> None:
@@ -119,10 +87,8 @@ def test_copc_output(tmp_path: Path, suffix: str) -> None:
     ("options", "code"),
     [
         ({"bounds": (0, 0, 1, 1)}, "cloud.bounds"),
-        ({"read_resolution": 1.0}, "cloud.not_copc"),
         ({"bounds": "1,2,3"}, "option.count"),
         ({"bounds": (2, 0, 1, 1)}, "option.range"),
-        ({"read_resolution": 0.0}, "option.range"),
     ],
 )
 def test_bad_parts(tmp_path: Path, options: dict[str, Any], code: str) -> None:

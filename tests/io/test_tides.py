@@ -1,6 +1,5 @@
 """Tide tables, the times of images, the water level of each, and recorded flying heights."""
 
-import json
 import math
 
 import numpy as np
@@ -137,24 +136,6 @@ def test_exif(tmp_path):
     (tmp_path / "five.jpg").write_text("no image")
     with refused("photos.unreadable", path=tmp_path / "five.jpg"):
         read_image_times(tmp_path, ["five"])
-
-
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("images.json", [{"filename": "a.jpg", "utc_time": 1000.0 * NOON_S}]),
-        ("shots.geojson",
-         {"features": [{"properties": {"filename": "a.jpg", "capture_time": NOON_S}}]}),
-        ("reconstruction.json", [{"shots": {"a.jpg": {"capture_time": NOON_S}}}]),
-    ],
-)  # fmt: skip
-def test_times_of_other_software(tmp_path, name, content):
-    path = table(tmp_path, json.dumps(content), name)
-    times = read_image_times(path, ["a"])
-    assert (times.time_s.tolist(), times.zoned) == ([NOON_S], True)
-    zero = path.read_text().replace(str(1000.0 * NOON_S), "0").replace(str(NOON_S), "0")
-    with refused("image_times.missing", images=["a"]):
-        read_image_times(table(tmp_path, zero, name), ["a"])
 
 
 @pytest.mark.parametrize("text", ['="+30.10"', ">30.10</drone-dji:RelativeAltitude>", "='30.1'"])

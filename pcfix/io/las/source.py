@@ -7,7 +7,6 @@ believes any number of records that a damaged header states.
 
 from __future__ import annotations
 
-import math
 import os
 import struct
 from collections.abc import Iterator, Sequence
@@ -20,11 +19,10 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import laspy
 import lazrs
 import numpy as np
-from laspy.copc import Bounds, CopcReader, load_octree_for_query
 from laspy.vlrs.vlr import VLR
 from laspy.vlrs.vlrlist import VLRList
 
-from pcfix.errors import SettingError, bad_file
+from pcfix.errors import bad_file
 from pcfix.io.crs import METRES, shortened
 from pcfix.io.files import check_input
 from pcfix.model import BoolArray, FloatArray
@@ -84,7 +82,6 @@ class CloudPart:
 
     path: Path
     bounds: Box | None = None  # west, south, east, north, metres; points on the edges belong to it
-    resolution: float | None = None  # of COPC: levels down to the first with this spacing, metres
     band: int | None = None  # of a raster, if it has several
     points: int = 0
     points_of_file: int = 0
@@ -100,7 +97,7 @@ class CloudPart:
     @property
     def is_whole(self) -> bool:
         """Whether it is all of its file."""
-        return self.bounds is None and self.resolution is None
+        return self.bounds is None
 
     def holds(self, points: laspy.ScaleAwarePointRecord) -> BoolArray:
         """Return which points of a chunk are within the bounds."""
@@ -116,12 +113,7 @@ def part_report(cloud: object) -> dict[str, Any] | None:
     """Return what a summary says of the part that was read; None unless the cloud is a part."""
     if not isinstance(cloud, CloudPart) or cloud.is_whole:
         return None
-    return {
-        "points": cloud.points,
-        "of": cloud.points_of_file,
-        "bounds": None if cloud.bounds is None else list(cloud.bounds),
-        "read_resolution": cloud.resolution,
-    }
+    return {"points": cloud.points, "of": cloud.points_of_file, "bounds": list(cloud.bounds or ())}
 
 
 class Record(VLR):  # type: ignore[misc]  # laspy is untyped
@@ -333,27 +325,16 @@ class LasSource:
     def chunks(self, part: CloudPart | None = None) -> Iterator[laspy.ScaleAwarePointRecord]:
         """Yield all points, or those of a part, in order, at most `CHUNK_POINTS` at a time.
 
-        A larger node of COPC is one chunk. An `InputError` if the file ends before its last point.
+        An `InputError` if the file ends before its last point.
         """
         part = part or self.part
         if part is None:
             yield from self._all_chunks()
             return
-        if part.resolution is not None and not is_copc(self.header):
-            sentence = "is not COPC and has no coarser levels to read. Omit --read-resolution."
-            raise SettingError("cloud.not_copc", f"{self.path}: {sentence}", path=self.path)
-        with las_errors(self.path):
-            chunks = self._all_chunks()
-            if is_copc(self.header):
-                info = self.header.vlrs[0]
-                end = info.hierarchy_root_offset + info.hierarchy_root_size
-                if end > self.path.stat().st_size:  # laspy would take memory for all of it
-                    raise ValueError("its octree begins or ends behind its end")
-                chunks = nodes_in(part, CHUNK_POINTS)
-            for points in chunks:
-                inside = part.holds(points)
-                if inside.any():
-                    yield points[inside]
+        for points in self._all_chunks():
+            inside = part.holds(points)
+            if inside.any():
+                yield points[inside]
 
     def _all_chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
         clouds = self._clouds
@@ -389,47 +370,6 @@ class LasSource:
             sentence = f"has no dimension {name}; {listing}."
             raise bad_file(self.path, "cloud.no_dimension", sentence, dimension=name)
         return np.asarray(points[name], dtype=np.float64)
-
-
-def is_copc(header: laspy.LasHeader) -> bool:
-    """Whether a cloud that is read is COPC."""
-    return bool(len(header.vlrs) and isinstance(header.vlrs[0], laspy.copc.CopcInfoVlr))
-
-
-def nodes_in(part: CloudPart, most: int) -> Iterator[laspy.ScaleAwarePointRecord]:
-    """Yield points of the nodes of a COPC file that a part may touch, at most `most` at a time.
-
-    They come in the order of the file; a node with more points is one batch.
-    """
-    with CopcReader.open(part.path) as reader:
-        header, info, levels, box = reader.header, reader.copc_info, None, None
-        if part.resolution is not None:
-            halvings = math.ceil(math.log2(info.spacing / part.resolution))
-            levels = range(max(halvings, 0) + 1)
-        if part.bounds is not None:
-            corners = np.array(part.bounds).reshape(2, 2)
-            box = Bounds(*corners).ensure_3d(header.mins, header.maxs)
-        found = load_octree_for_query(reader.source, info, reader.root_page, box, levels)
-        nodes = sorted((one for one in found if one.point_count), key=lambda one: one.offset)
-        if sum(one.point_count for one in nodes) > header.point_count:
-            raise ValueError("its octree has more points than its header")
-        while nodes:
-            counts = np.cumsum([one.point_count for one in nodes])
-            count = max(int(np.searchsorted(counts, most, side="right")), 1)
-            data = bytearray()
-            for one in nodes[:count]:
-                reader.source.seek(one.offset)
-                data += reader.source.read(one.byte_size)
-            rows = np.zeros(counts[count - 1], header.point_format.dtype())
-            table = [(one.point_count, one.byte_size) for one in nodes[:count]]
-            lazrs.decompress_points_with_chunk_table(
-                data, reader.laszip_vlr.record_data, rows.view(np.uint8), table,
-                laspy.DecompressionSelection.all().to_lazrs(),
-            )  # fmt: skip
-            yield laspy.ScaleAwarePointRecord(
-                rows, header.point_format, header.scales, header.offsets
-            )
-            del nodes[:count]
 
 
 def backend(jobs: int | None) -> laspy.LazBackend:
