@@ -7,7 +7,7 @@ A plan is made for the whole cloud (`pcfix.flow.planning`), each chunk is correc
 from __future__ import annotations
 
 import warnings
-from dataclasses import fields, replace
+from dataclasses import fields
 from itertools import compress
 from os import PathLike
 from typing import Any
@@ -31,7 +31,7 @@ from pcfix.io.las.writing import output_header
 from pcfix.io.raster_cloud import is_raster
 from pcfix.io.saved import write_regression
 from pcfix.io.tiles import Clouds
-from pcfix.io.views import ViewReport, beside
+from pcfix.io.views import ViewReport
 from pcfix.label.labelling import Labelling
 from pcfix.lens.frames import beside_frames
 from pcfix.model import (
@@ -145,10 +145,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     Warns of what is uncertain, and writes the shoreline and the line of a regression if asked.
     """
     options, figures, transfer = plan.options, tally.figures, plan.transfer
-    report = None
-    if tally.views is not None and plan.match is not None:
-        report = replace(tally.views, notes=plan.match.notes)
-    water_notes = _check_counts(plan, tally, report)
+    water_notes = _check_counts(plan, tally, tally.views)
     counts, uncertainty = figures.as_dict(), figures.uncertainty(plan.reconstruction)
     tested, poses, absorbed, shoreline = None, None, None, None
     if plan.inputs.port is None:
@@ -183,7 +180,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         detected += coded("regression.range", tally.beyond.notes(line, least))
     notes = [
         *plan.input_notes,
-        *([] if report is None else report.warnings()),
+        *([] if tally.views is None else tally.views.notes()),
         *coded("cloud.labels", plan.labelling.notes),
         *(() if tested is None else tested.doubts),
         *detected,
@@ -200,7 +197,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         cameras_used=len(plan.cameras) - len(unused),
         cameras_unused=unused,  # labels of those without corrected points
         seconds=task.seconds,
-        views=None if report is None else report.as_dict(),
+        views=None if tally.views is None else vars(tally.views),
         warnings=[one.as_dict() for one in notes],
         labelling=plan.labelling.report(tally.labels),
         settings={**options.part(ScienceOptions).as_dict(), **plan.settings},
@@ -228,8 +225,7 @@ def _check_counts(plan: Plan, tally: CloudTally, report: ViewReport | None) -> l
     # also leave points without cameras.
     name, figures = plan.view.name, tally.figures
     if report is not None:
-        report.check()
-        for note in report.warnings():
+        for note in report.notes():
             warnings.warn(note, stacklevel=2)
     if plan.transfer is not None and tally.transfer is not None:
         plan.transfer.check(name, tally.transfer)
@@ -452,5 +448,6 @@ def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:
     counts = beside_frames(points, views, cameras)
     if counts.any():
         entries, outside = int(counts.sum()), int(np.count_nonzero(counts))
-        note = PcfixWarning("views.outside", f"views: {beside(entries, outside)}", entries=entries)
+        sentence = f"views: {entries:,} entries of {outside:,} points are ignored: their cameras"
+        note = PcfixWarning("views.outside", f"{sentence} face elsewhere.", entries=entries)
         warnings.warn(note, stacklevel=3)
