@@ -124,7 +124,7 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
     summary = finish(plan, task, tally)
     outs.update(results.dimensions)
     write_summary(options, summary.as_dict())
-    namespace["out_metadata"] = metadata_of(summary.as_dict(), unpacked=cloud.unpacked)
+    namespace["out_metadata"] = metadata_of(summary.as_dict())
 
 
 def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
@@ -144,7 +144,7 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     outs["Classification"] = classes
     outs.update(cloud.flags())
     found = {**tally.of_classes(), "labelling": plan.labelling.report(tally)}
-    namespace["out_metadata"] = metadata_of(found, unpacked=cloud.unpacked)
+    namespace["out_metadata"] = metadata_of(found)
 
 
 def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
@@ -168,7 +168,7 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     seconds = round(time.perf_counter() - started, 3)
     summary = {**found.as_dict(), "input": NAME, "output": NAME, "seconds": seconds}
     write_summary(options, summary)
-    namespace["out_metadata"] = metadata_of(summary, unpacked=cloud.unpacked and not options.drop)
+    namespace["out_metadata"] = metadata_of(summary)
 
 
 def _compare(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:

@@ -26,7 +26,7 @@ from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of, write_shoreline
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.las import columns
-from pcfix.io.las.source import LasSource, centring_steps, part_report
+from pcfix.io.las.source import LasSource, part_report
 from pcfix.io.las.writing import output_header
 from pcfix.io.raster_cloud import is_raster
 from pcfix.io.saved import write_regression
@@ -113,8 +113,7 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
     written = columns.columns_for(plan.options.dimensions, plan.options.unsure)
     if is_raster(source.path):
         written = (*columns.columns_for("all", plan.options.unsure), columns.OUTCOME)
-    steps = centring_steps(source.header)
-    header = output_header(source, "settings", plan.provenance(), written, steps)
+    header = output_header(source, "settings", plan.provenance(), written)
     uncorrected = plan.options.uncorrected
 
     def compute(points: Chunk, row: int) -> tuple[Correction, CloudTally]:
@@ -123,14 +122,13 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
     def apply(points: Chunk, correction: Correction) -> Chunk:
         """Move points, and write their new dimensions, classes and flags."""
         new = columns.convert(points, header.point_format)
-        new.offsets = header.offsets
         # whole steps of the file's own scale, so that 'pcfix restore' gets back every bit
         classes = np.array(new["classification"])
         withheld = np.asarray(new["withheld"]).astype(bool)
         changes = columns.changes_of(
             written, correction, classes, withheld, new.scales, withhold=uncorrected == "withhold"
         )
-        columns.move(new, changes.steps + np.array(steps), source.path)
+        columns.move(new, changes.steps, source.path)
         columns.fill(new, changes)
         new.array["classification"][correction.corrected] = BATHYMETRIC_POINT
         new["withheld"][:] = (withheld | changes.flagged).astype(np.uint8)

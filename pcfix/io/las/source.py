@@ -55,8 +55,6 @@ _UNITS, _OWN_CODE = {9001: "metre", 9002: "foot", 9003: "US survey foot"}, 32767
 
 MOST_SCALE_M = 1000.0
 """Largest step of coordinates that a header may state."""
-MOST_SHIFT_M = 1000.0
-"""For which there is room in the coordinates of a corrected cloud."""
 
 _LAST_DIGIT = 2.0**-52
 """Of a float64, relative."""
@@ -381,19 +379,6 @@ def coordinates(points: laspy.ScaleAwarePointRecord) -> FloatArray:
     """Return x, y, z of a chunk, shape (n, 3), metres."""
     steps = np.column_stack([points.array[axis] for axis in "XYZ"])
     return np.asarray(steps * points.scales + points.offsets)
-
-
-def centring_steps(header: laspy.LasHeader) -> tuple[int, ...]:
-    """Return by how many steps each integer axis must be moved, so that its points can be shifted.
-
-    That is 0 where they have room in 32 bits for a shift of `MOST_SHIFT_M`, or where the header
-    states impossible bounds; else the middle of the axis becomes 0.
-    """
-    ends, most = (header.mins, header.maxs), 2.0**31
-    low, high = (np.clip((one - header.offsets) / header.scales, -1e10, 1e10) for one in ends)
-    reach = np.maximum(np.abs(low), np.abs(high))
-    is_near = (reach <= most) & (reach + MOST_SHIFT_M / header.scales > most)
-    return tuple(np.where(is_near, -np.rint((low + high) / 2), 0.0).astype(int).tolist())
 
 
 def read_xyz(path: File) -> FloatArray:

@@ -52,18 +52,13 @@ _SEAL = "sha256"
 
 
 def output_header(
-    source: LasSource,
-    kind: str,
-    content: dict[str, Any],
-    columns: tuple[Column, ...] = (),
-    steps: tuple[int, ...] = (0, 0, 0),
+    source: LasSource, kind: str, content: dict[str, Any], columns: tuple[Column, ...] = ()
 ) -> laspy.LasHeader:
     """Return the header of an output cloud: LAS 1.4, the input's records, and pcfix's own.
 
     That is of a `kind` (see `NOTES`) with `content`; of a correction also with what the file was
-    before. The `columns` are added as extra dimensions. Each integer axis will be moved by its
-    `steps`, for which the offsets make up. An `InputError` if a cloud to be corrected already has a
-    dimension of one of these names, or was corrected before.
+    before. The `columns` are added as extra dimensions. An `InputError` if a cloud to be corrected
+    already has a dimension of one of these names, or was corrected before.
     """
     old, is_correction = source.header, kind == "settings"
     if is_correction and any(is_ours(v) for v in source.vlrs):
@@ -103,10 +98,8 @@ def output_header(
             "point_format": old.point_format.id,
             "identity": source.identity.decode("latin-1"),
             "global_encoding": old.global_encoding.value,
-            "offsets": old.offsets.tolist(),
             "added_wkt": crs is not None,
             "undescribed": [dimension.name for dimension in undescribed],
-            "steps": list(steps),
         }
         content = {**content, "before": before}
         content[_SEAL] = _seal_of(content)
@@ -114,7 +107,6 @@ def output_header(
     version = max(old.version, laspy.header.Version(1, 4))
     header = _header(source, version, point_format, vlrs, described)
     header.global_encoding.wkt = header.global_encoding.wkt or crs is not None
-    header.offsets = old.offsets - np.array(steps) * old.scales
     return header
 
 
@@ -135,7 +127,6 @@ def restored_header(source: LasSource, before: dict[str, Any], drop: set[str]) -
     version = laspy.header.Version.from_str(before["version"])
     header = _header(source, version, point_format, vlrs, records)
     header.global_encoding.value = before["global_encoding"]
-    header.offsets = np.array(before["offsets"], dtype=np.float64).reshape(3)
     return header
 
 
