@@ -61,9 +61,10 @@ class PdalCloud:
                 raise _missing(*CLASS_FLAGS.split("="))
             if len(self.classes) and self.classes.max() >= _PACKED_FLAGS:
                 sentence = (
-                    f"{NAME}: has flags in Classification, as PDAL before 2.5 reads them from"
+                    f"{NAME}: has flags in Classification, where PDAL before 2.5 leaves those"
                 )
-                raise SettingError("cloud.packed", f"{sentence} old formats. Write format 6 first.")
+                sentence += " of point formats 0 to 5. Convert the cloud to format 6 first."
+                raise SettingError("cloud.packed", sentence)
         if "Withheld" in ins:
             self.withheld = ins["Withheld"] != 0
         elif self._class_flags is not None:

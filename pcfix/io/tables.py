@@ -288,7 +288,7 @@ def read_table(path: Path, *needed: Sequence[str], spellings: Spellings | None =
 POINT_SPELLINGS = {
     "x": ("x", "easting", "east"),
     "y": ("y", "northing", "north"),
-    "z": ("z", "height", "elevation", "elev", "altitude"),
+    "z": ("z", "height", "h", "elevation", "elev", "altitude", "alt", "level"),
 }
 DEPTH_SPELLINGS = POINT_SPELLINGS | {
     "depth": ("depth", "true_depth", "water_depth", "measured_depth")
@@ -316,23 +316,14 @@ class CheckDepths:
 def read_check_depths(path: File) -> CheckDepths:
     """Read check depths from a table with a header line.
 
-    Parameters
-    ----------
-    path : path
-        Columns in any order, separated by comma, semicolon, tab or space: ``x`` and ``y`` (or
-        easting and northing) in the cloud's CRS, and ``depth``, metres below the water surface
-        that the correction is given, positive down, or ``z``, the height of the bed in the
-        cloud's heights. If both are there, the depth is used. Other columns are ignored, a
-        standard error too: all check depths have the same weight.
+    Its columns are ``x`` and ``y`` (or easting and northing) in the cloud's CRS, and ``depth``,
+    metres below the water surface that the correction is given, positive down, or ``z``, the height
+    of the bed in the cloud's heights. If both are there, the depth is used. Other columns are
+    ignored, a standard error too: all check depths have the same weight.
     """
     source = check_input(path)
     table = read_table(source, ("x", "y", "depth"), ("x", "y", "z"), spellings=DEPTH_SPELLINGS)
     what = "depth" if table.has("depth") else "z"
-    for role in ("x", "y", what):
-        there = [name for name in table.header if name in DEPTH_SPELLINGS[role]]
-        if len(there) > 1:
-            sentence = f"the columns {', '.join(there)} may all be {role}. Remove all but one."
-            raise bad_file(source, "table.column_twice", sentence, columns=there)
     values = table.of(("x", "y", what))
     found = CheckDepths(str(source), values[:, :2], values[:, 2], what == "z", table.line)
     negative = np.flatnonzero(found.value_m < 0.0)

@@ -144,36 +144,28 @@ def level_offsets(
 ) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
     """Return how much higher than on average the water was at each of k images, metres, and notes.
 
-    The level is linear between the rows of the table, and continues beyond its ends for at most
-    the interval of the two rows there. The average over the images is the level that the user
-    gives.
+    The level is linear between the rows of the table. The average over the images is the level that
+    the user gives.
     """
     clock, name = tide.time_s, tide.name
     if tide.zoned != times.zoned:
         without = times if tide.zoned else tide
         sentence = "its times have no zone, those of the other file have. Add +02:00, or Z for UTC."
         raise bad_file(without.name, "time.zone", sentence)
-    gaps = np.diff(clock)
-    first, last = clock[0] - gaps[0], clock[-1] + gaps[-1]
-    outside = np.flatnonzero((times.time_s < first) | (times.time_s > last))
+    outside = np.flatnonzero((times.time_s < clock[0]) | (times.time_s > clock[-1]))
     if outside.size:
         image, at = labels[outside[0]], float(times.time_s[outside[0]])
         taken = datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M:%S")
         sentence = f"does not cover image {image}, taken at {taken} ({outside.size} of"
-        sentence += f" {len(labels)} images are outside). Check the zones."
+        sentence += f" {len(labels)} images are outside). Add rows, or check the zones."
         raise bad_file(name, "tide.not_covered", sentence, image=image, count=int(outside.size))
+    level = np.interp(times.time_s, clock, tide.level_m)
     row = np.clip(np.searchsorted(clock, times.time_s) - 1, 0, len(clock) - 2)
-    share = (times.time_s - clock[row]) / gaps[row]
-    level = tide.level_m[row] + share * np.diff(tide.level_m)[row]
-    notes = []
-    beyond = int(((share < 0.0) | (share > 1.0)).sum())
-    if beyond:
-        sentence = f"{name}: is extrapolated for {beyond} images beyond its first or last row."
-        notes.append(PcfixWarning("tide.extrapolated", sentence, count=beyond))
-    longest_h = float(gaps[row].max()) / 3600.0
-    if longest_h > LONG_GAP_S / 3600.0:
-        sentence = f"{name}: its rows are up to {longest_h:.1f} h apart; give one each hour."
-        notes.append(PcfixWarning("tide.sparse", sentence, hours=longest_h))
+    longest_s, notes = float(np.diff(clock)[row].max()), list[PcfixWarning]()
+    if longest_s > LONG_GAP_S:
+        hours = longest_s / 3600.0
+        sentence = f"{name}: its rows are up to {hours:.1f} h apart; give one each hour."
+        notes.append(PcfixWarning("tide.sparse", sentence, hours=hours))
     return level - level.mean(), tuple(notes)
 
 

@@ -32,12 +32,9 @@ load_pyogrio = partial(optional_library, "pyogrio", "vector", "Read and write ve
 TABLES = (".csv", ".txt")
 GDAL_SUFFIXES = (".gpkg", ".shp", ".geojson", ".json", ".kml", ".gpx")
 KINDS = "GeoPackage (.gpkg), Shapefile (.shp), GeoJSON, KML, GPX or a table of points (.csv)"
-COLUMNS = {
-    "x": ("x", "easting", "east", "e"),
-    "y": ("y", "northing", "north", "n"),
-    "longitude": ("longitude", "lon", "long", "lng"),
+COLUMNS = tables.POINT_SPELLINGS | {
+    "longitude": ("longitude", "lon", "long"),
     "latitude": ("latitude", "lat"),
-    "z": ("z", "height", "h", "altitude", "alt", "elevation", "elev", "level"),
 }
 """Names of a column; the first that the header has is used."""
 LAYER_MARK = "|"

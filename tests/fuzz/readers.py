@@ -440,7 +440,7 @@ READERS: dict[str, Reader] = {
     ),
     "gnss": one(
         lambda path: read_gnss(path, cameras()),
-        table=text("gnss.csv", GNSS), geo=text("geo.txt", GEO), images=ODM_IMAGES,
+        table=text("gnss.csv", GNSS), geo=text("geo.txt", GEO)
     ),
     "tides": one(
         times, pictures=pictures, tide=text("tide.csv", TIDE), times=text("times.csv", TIMES)
