@@ -35,7 +35,7 @@ from pcfix.io.pdal import NAME, OUTCOME, Dimensions, PdalCloud, Results, metadat
 from pcfix.model import LOW_NOISE, WaterDimension, WaterSurface
 from pcfix.options.correct import RasterOutputs
 from pcfix.options.declare import OptionSet, named, options_of
-from pcfix.options.shared import PartOptions
+from pcfix.options.shared import BandOption
 
 Set = TypeVar("Set", bound=OptionSet)
 
@@ -193,8 +193,8 @@ def _options(namespace: dict[str, Any], kind: type[Set]) -> Set:
         sentence = f"pdalargs: {twice} is given twice, with dashes and underscores."
         raise SettingError("option.twice", sentence, option=twice)
     given = {name.replace("-", "_"): value for name, value in given.items()}
-    # readers choose points, and writers make rasters
-    files = (*options_of(PartOptions), *options_of(RasterOutputs))
+    # PDAL reads and writes rasters
+    files = (*options_of(BandOption), *options_of(RasterOutputs))
     elsewhere = {"port", *(one.name for one in files)}
     known = {one.name: one for one in options_of(kind) if one.name not in elsewhere}
     values = named(given, known.values(), "pdalargs")

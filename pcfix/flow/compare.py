@@ -25,7 +25,7 @@ from pcfix.io.clouds import (
 )
 from pcfix.io.crs import parse_crs
 from pcfix.io.files import check_output, scratch_arrays, write_text
-from pcfix.io.tiles import Clouds, cloud_of, inputs_of, part_of
+from pcfix.io.tiles import Clouds, band_of, cloud_of, inputs_of
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CompareOptions, CompareRules
@@ -65,7 +65,7 @@ def compare_clouds(
     given = taken(CompareOptions, options, keywords, "compare_clouds")
     lines = [parse_line(line) if isinstance(line, str) else line for line in given.section]
     held = cloud if isinstance(cloud, CloudView) else None
-    clouds = [] if isinstance(cloud, CloudView) else [part_of(cloud_of(cloud), given)]
+    clouds = [] if isinstance(cloud, CloudView) else [band_of(cloud_of(cloud), given)]
     also = {name: cloud_of(path) for name, path in given.also}
     surveyed = reference_of(reference)
     read = (*clouds, surveyed, *also.values())

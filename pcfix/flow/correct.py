@@ -26,7 +26,7 @@ from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of, write_shoreline
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.las import columns
-from pcfix.io.las.source import LasSource, part_report
+from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header
 from pcfix.io.raster_cloud import is_raster
 from pcfix.io.saved import write_regression
@@ -199,7 +199,6 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         warnings=[one.as_dict() for one in notes],
         labelling=plan.labelling.report(tally.labels),
         settings={**options.part(ScienceOptions).as_dict(), **plan.settings},
-        part=part_report(task.source),  # what was read, if not all points were
         water=water,
         water_fit=plan.found.as_dict(),
         uncertainty=uncertainty,

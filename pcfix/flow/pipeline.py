@@ -24,14 +24,9 @@ def pipeline_for(input: Path, output: Path | None, options: CorrectOptions) -> d
     The stage gets the options that differ from their defaults. PDAL replaces existing outputs. What
     `pcfix.correct_file` refuses before it reads points is refused here, too.
     """
-    for name in ("bounds", "port"):
-        if getattr(options, name) is not None:
-            raise SettingError(
-                "option.no_use",
-                f"--{name} has no effect in a pipeline. Choose points by options"
-                " of readers.copc, and use 'pcfix correct' for a cloud taken under water.",
-                option=name,
-            )
+    if options.port is not None:
+        sentence = "--port has no effect in a pipeline. Use 'pcfix correct'."
+        raise SettingError("option.no_use", sentence, option="port")
     drop, plain = options.uncorrected == "drop", options.plain()
     if drop and output is None:
         raise SettingError(

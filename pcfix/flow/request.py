@@ -23,10 +23,10 @@ from pcfix.io.rasters import open_raster
 from pcfix.io.tiles import (
     CloudFiles,
     Tiles,
+    band_of,
     cloud_of,
     inputs_of,
     open_cloud,
-    part_of,
     tiles_from,
     tiles_of,
 )
@@ -51,7 +51,7 @@ class Request(RunOptions):
     @cached_property
     def source(self) -> CloudFiles:
         """The cloud, in one file or many, or the cells of a raster."""
-        return tiles_of(self.input) or part_of(Path(str(self.input)), self)
+        return tiles_of(self.input) or band_of(Path(str(self.input)), self)
 
     @cached_property
     def surveyed(self) -> Path | Tiles:

@@ -33,7 +33,7 @@ from pcfix.io import rasters, vectors
 from pcfix.io.clouds import is_cloud
 from pcfix.io.files import read_json
 from pcfix.io.gnss_positions import read_gnss
-from pcfix.io.las.source import CloudPart
+from pcfix.io.las.source import RasterBand
 from pcfix.io.saved import ENSEMBLE
 from pcfix.io.tiles import Tiles, check_one_file
 from pcfix.libraries import analysis_library
@@ -186,7 +186,7 @@ def run_all(
         run.files_of(run.cleaned),
     )  # fmt: skip
     errors = corrected["uncertainty"] is not None
-    cells = isinstance(request.source, CloudPart)
+    cells = isinstance(request.source, RasterBand)
     outputs = maps.raster_files(out_dir, errors=errors, cells=cells)
     step(
         "dsm", "Gridding", outputs[0],

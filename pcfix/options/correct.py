@@ -17,7 +17,6 @@ from pcfix.options.shared import (
     NeededOptions,
     OverwriteOption,
     Panel,
-    PartOptions,
     PortOptions,
     ShorelineOption,
     SummaryOption,
@@ -199,7 +198,7 @@ class RasterOutputs(OptionSet, panel=Panel.OUTPUT):
 
 
 class CorrectOptions(
-    RasterOutputs, PartOptions, ShorelineOption, TileOptions, SummaryOption, ScienceOptions,
+    RasterOutputs, BandOption, ShorelineOption, TileOptions, SummaryOption, ScienceOptions,
     WaterPerImageOption, MaskOption, LandRules, InputOptions, panel=Panel.OUTPUT,
 ):  # fmt: skip
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
@@ -238,7 +237,7 @@ class StageLabelOptions(LabelRules, MaskOption, NeededOptions):
     """The options of the PDAL stage ``label``, which writes no files."""
 
 
-class LabelOptions(PartOptions, TileOptions, SummaryOption, StageLabelOptions):
+class LabelOptions(BandOption, TileOptions, SummaryOption, StageLabelOptions):
     """The options of ``pcfix label``."""
 
 

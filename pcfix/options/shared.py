@@ -16,7 +16,7 @@ class Panel(StrEnum):
     """The panels of the help, in order."""
 
     NEED = "What you need"
-    INPUT = "Part of the cloud"
+    INPUT = "Raster input"
     FLIGHT = "Flight"
     CAMERA = "Camera"
     WATER = "Water"
@@ -186,15 +186,6 @@ class BandOption(OptionSet, panel=Panel.INPUT):
 
     band: int | None = option(None, least=1)
     """Band with the heights, if the input is a raster with several."""
-
-
-class PartOptions(BandOption, panel=Panel.INPUT):
-    """The part of a cloud to read; see `pcfix.io.las.source`."""
-
-    bounds: tuple[float, float, float, float] | None = option(
-        None, parse=numbers, metavar="X,Y,X,Y"
-    )
-    """Read only the points in this box (west, south, east, north). [m] [default: all]"""
 
 
 class OverwriteOption(OptionSet, panel=Panel.OUTPUT):

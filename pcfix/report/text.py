@@ -39,10 +39,7 @@ WIDTH = 100
 UNIT = re.compile(r"(?<=\d) (?=(?:m|cm|px|deg|%)(?:\W|$))")
 """The space between a number and its unit."""
 
-_PART: RowTable = (
-    ("Read", "a part of {part[of]:,} points", "part"),
-    ("", "within {part[bounds]:.12g}", "part[bounds]"),
-)
+_PART: RowTable = ()
 _NO_SURFACE = ("No surface", "{water_unknown:,} points have no water surface", "water_unknown")
 _SHORELINE: RowTable = (
     ("Shoreline", "{shoreline[lines]} lines, {shoreline[length_m]:.1f} m, standard error in plan"

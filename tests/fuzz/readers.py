@@ -5,7 +5,6 @@ import json
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -25,7 +24,7 @@ from pcfix.io.photographs import read_photograph, size_of
 from pcfix.io.saved import ENSEMBLE, find_members, read_regression, write_members, write_regression
 from pcfix.io.tables import read_check_depths
 from pcfix.io.tides import read_image_times, read_tide
-from pcfix.io.tiles import open_cloud, part_of
+from pcfix.io.tiles import open_cloud
 from pcfix.io.vectors import read_shoreline, read_water_polygons
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.model import Cameras, Lens
@@ -152,7 +151,6 @@ def odm_shots(folder: Path) -> Path:
 
 IMAGE = {"latitude": 46.9, "longitude": 9.0, "altitude": 90.0, "utc_time": 1e12}
 IMAGE |= {"gps_xy_stddev": 2.0, "gps_z_stddev": 3.0}
-ODM_IMAGES = text("images.json", [{"filename": one} | IMAGE for one in LABELS])
 
 
 def opensfm_tracks(folder: Path) -> Path:
@@ -360,8 +358,7 @@ def read_picture(path: Path) -> Iterator[Any]:
 
 def read_points(path: Path) -> Iterator[Any]:
     yield read_cloud(path)
-    box = SimpleNamespace(bounds=(456_000.0, 5_432_000.0, 456_060.0, 5_432_090.0))
-    with open_cloud(part_of(path, box), 1) as source:
+    with open_cloud(path, 1) as source:
         yield sum(len(points) for points in source.chunks())
 
 

@@ -1,4 +1,4 @@
-"""Read a LAS or LAZ file, or a part of it, chunk by chunk, and keep what laspy would rewrite.
+"""Read a LAS or LAZ file chunk by chunk, and keep what laspy would rewrite.
 
 Variable length records stay with their bytes as they are in the file. laspy has classes of its own
 for many of them, which lose some bytes when they write; it cuts names that fill their field; and it
@@ -11,10 +11,9 @@ import os
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import laspy
 import lazrs
@@ -25,7 +24,7 @@ from laspy.vlrs.vlrlist import VLRList
 from pcfix.errors import bad_file
 from pcfix.io.crs import METRES, shortened
 from pcfix.io.files import check_input
-from pcfix.model import BoolArray, FloatArray
+from pcfix.model import FloatArray
 from pcfix.options.declare import File
 from pcfix.running import current
 
@@ -68,22 +67,15 @@ CHUNK_BYTES = 500_000_000
 SMALL_BYTES = 250_000_000
 """Point records of a cloud that stay in memory until it is read again."""
 
-Box = tuple[float, float, float, float]
-
 
 @dataclass(frozen=True)
-class CloudPart:
-    """A part of the cloud in a file; see `pcfix.io.tiles.part_of`, which counts its points.
-
-    Of a raster it may be all cells.
-    """
+class RasterBand:
+    """A band of a raster that is read as a cloud; `pcfix.io.tiles.band_of` counts its points."""
 
     path: Path
-    bounds: Box | None = None  # west, south, east, north, metres; points on the edges belong to it
-    band: int | None = None  # of a raster, if it has several
+    band: int | None = None
     points: int = 0
-    points_of_file: int = 0
-    # the lowest and highest coordinates of the part, shape (3,), metres
+    # the lowest and highest coordinates, shape (3,), metres
     mins: FloatArray = field(default_factory=lambda: np.zeros(3))
     maxs: FloatArray = field(default_factory=lambda: np.zeros(3))
 
@@ -91,27 +83,6 @@ class CloudPart:
         return str(self.path)
 
     __fspath__ = __str__
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether it is all of its file."""
-        return self.bounds is None
-
-    def holds(self, points: laspy.ScaleAwarePointRecord) -> BoolArray:
-        """Return which points of a chunk are within the bounds."""
-        if self.bounds is None:
-            return np.ones(len(points), np.bool_)
-        steps = (np.reshape(self.bounds, (2, 2)) - points.offsets[:2]) / points.scales[:2]
-        (west, south), (east, north) = np.ceil(steps[0] - 1e-4), np.floor(steps[1] + 1e-4)
-        x, y = points.array["X"], points.array["Y"]
-        return np.asarray((x >= west) & (x <= east) & (y >= south) & (y <= north))
-
-
-def part_report(cloud: object) -> dict[str, Any] | None:
-    """Return what a summary says of the part that was read; None unless the cloud is a part."""
-    if not isinstance(cloud, CloudPart) or cloud.is_whole:
-        return None
-    return {"points": cloud.points, "of": cloud.points_of_file, "bounds": list(cloud.bounds or ())}
 
 
 class Record(VLR):  # type: ignore[misc]  # laspy is untyped
@@ -220,15 +191,12 @@ class LasSource:
 
     It has `path`, laspy's `header`, `vlrs` and `evlrs` from `read_records`, and `identity`: system
     identifier, generating software and date as they are in the file, where other software writes
-    what laspy would not. With a `part` it has only the points of that, and the header says so;
-    `points_of_file` is how many points the file has.
+    what laspy would not.
     """
 
-    def __init__(
-        self, path: File, jobs: int | None = None, *, part: CloudPart | None = None
-    ) -> None:
+    def __init__(self, path: File, jobs: int | None = None) -> None:
         """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable."""
-        self.path, self.part, self._clouds = check_input(path), part, current().clouds
+        self.path, self._clouds = check_input(path), current().clouds
         with las_errors(self.path):
             with self.path.open("rb") as stream:
                 if other := _OTHER_CLOUDS.get(stream.read(4)):
@@ -241,15 +209,10 @@ class LasSource:
         self.header: laspy.LasHeader = self._reader.header
         try:
             with las_errors(self.path):
-                self.points_of_file = len(self)
                 self._check_header()
         except BaseException:
             self._reader.close()
             raise
-        if part is not None:
-            self.header = copy(self.header)
-            self.header.point_count = part.points
-            self.header.mins, self.header.maxs = part.mins, part.maxs
 
     def __enter__(self) -> LasSource:
         return self
@@ -320,35 +283,25 @@ class LasSource:
                 (last,) = struct.unpack("<I", stream.read(4))
         return (chunks - 1) * chunk_points + last, chunks * chunk_points
 
-    def chunks(self, part: CloudPart | None = None) -> Iterator[laspy.ScaleAwarePointRecord]:
-        """Yield all points, or those of a part, in order, at most `CHUNK_POINTS` at a time.
+    def chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
+        """Yield all points in order, at most `CHUNK_POINTS` at a time.
 
         An `InputError` if the file ends before its last point.
         """
-        part = part or self.part
-        if part is None:
-            yield from self._all_chunks()
-            return
-        for points in self._all_chunks():
-            inside = part.holds(points)
-            if inside.any():
-                yield points[inside]
-
-    def _all_chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
         clouds = self._clouds
         if clouds is not None and self.path in clouds:
             yield from clouds[self.path]
             return
-        is_small = self.points_of_file * self.header.point_format.size <= SMALL_BYTES
+        is_small = len(self) * self.header.point_format.size <= SMALL_BYTES
         read, chunks = 0, list[laspy.ScaleAwarePointRecord]()
         most = max(1, min(CHUNK_POINTS, CHUNK_BYTES // self.header.point_format.size))
-        while read < self.points_of_file:
+        while read < len(self):
             with las_errors(self.path):
                 points = self._reader.read_points(most)
-            if len(points) < min(most, self.points_of_file - read):
-                held = f"{read + len(points):,} of {self.points_of_file:,} points"
+            if len(points) < min(most, len(self) - read):
+                held = f"{read + len(points):,} of {len(self):,} points"
                 sentence = f"it ends after {held}. Copy it again."
-                raise bad_file(self.path, "cloud.count", sentence, stated=self.points_of_file)
+                raise bad_file(self.path, "cloud.count", sentence, stated=len(self))
             read += len(points)
             if clouds is not None and is_small:
                 chunks.append(points)

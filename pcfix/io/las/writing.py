@@ -34,7 +34,6 @@ from pcfix.io.las.source import (
     RecordList,
     append_evlrs,
     backend,
-    part_report,
     stated_crs,
 )
 from pcfix.model import FloatArray
@@ -90,8 +89,6 @@ def output_header(
     if crs is not None:
         wkt = WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL")).record_data_bytes()
         vlrs.append(VLR("LASF_Projection", 2112, "OGC COORDINATE SYSTEM WKT", wkt))
-    if source.part is not None:
-        content = {**content, "part": part_report(source.part)}
     if is_correction:
         before = {
             "version": str(old.version),
