@@ -432,9 +432,6 @@ class Correction:
     covariance_m2 : array, shape (n, 6), or None
         Covariances of the coordinates: xx, xy, xz, yy, yz, zz; see `pcfix.refract.uncertainty`.
         None if they were not requested.
-    unsure : array of bool, shape (n,), or None
-        Corrected points that are visible in oblique images only, without a view list. None if the
-        option `unsure` is ``keep``.
     """
 
     apparent_xyz: FloatArray
@@ -449,7 +446,6 @@ class Correction:
     water_known: BoolArray
     lowest_water_m: float
     covariance_m2: FloatArray | None = None
-    unsure: BoolArray | None = None
 
     @cached_property
     def xyz(self) -> FloatArray:

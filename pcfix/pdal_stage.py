@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 import numpy as np
 
 from pcfix.errors import PcfixError, SettingError, show_warning
-from pcfix.io.pdal import NAME, OUTCOME, Dimensions, PdalCloud, Results, metadata_of
+from pcfix.io.pdal import NAME, Dimensions, PdalCloud, Results, metadata_of
 from pcfix.model import LOW_NOISE, WaterDimension, WaterSurface
 from pcfix.options.correct import RasterOutputs
 from pcfix.options.declare import OptionSet, named, options_of
@@ -104,14 +104,8 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
 
     task = FileTask(NAME, Path(NAME))
     options = _options(namespace, CorrectOptions)
-    if options.uncorrected == "drop":
-        sentence = (
-            f"uncorrected 'drop' is not for PDAL. Use withhold, add \"{OUTCOME}=uint8\" to"
-            f' add_dimension, and let filters.range keep "{OUTCOME}[0:1]".'
-        )
-        raise SettingError("option.not_in_pdal", sentence, option="uncorrected")
     cloud = PdalCloud(ins, namespace.get("metadata"))
-    results = Results(cloud, columns_for(options.dimensions, options.unsure))
+    results = Results(cloud, columns_for(options.dimensions))
     plan = read_inputs(options, _view(cloud))
     check_summary(options, paths_in(options))
     tally: Any = None

@@ -320,7 +320,7 @@ def test_restore(corrected, words, code):
     [
         ("index", "0.99"), ("index", "1.51"), ("index", "nan"), ("index", "inf"),
         ("max-angle", "0"), ("max-angle", "91"), ("max-angle", "-5"), ("max-angle", "nan"),
-        ("max-cameras", "1"), ("max-cameras", "0"), ("jobs", "0"), ("jobs", "-2"),
+        ("jobs", "0"), ("jobs", "-2"),
     ],
 )  # fmt: skip
 def test_out_of_range(folder, option, value):
@@ -340,7 +340,7 @@ def test_corrected_twice(corrected, name):
         ["correct", "cloud.las", "out.las", "--water", "3"],
         ["correct", "cloud.las", "out.las", "--cameras", "cameras.csv"],
         correct("--deeper"),
-        correct("--max-cameras", "few"),
+        correct("--jobs", "few"),
         correct("--uncorrected", "burn"),
         correct("--dimensions", "some"),
         ["restore", "cloud.las"],

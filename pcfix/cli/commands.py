@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pcfix
-from pcfix.cli.flags import COMMANDS, UsageError, command, progress_bar, say, status_line
+from pcfix.cli.flags import COMMANDS, command, progress_bar, say, status_line
 from pcfix.options.correct import (
     AdjustOptions,
     CamerasCheckOptions,
@@ -52,30 +51,11 @@ def _summarized(
     "pcfix run cloud.laz out --cameras cameras.xml --water 0.37 --reference lidar.laz",
     input=TILED,
     out_dir="Folder for all results.",
-    config="Repeat the run of this run.json.",
 )
-def run(
-    input: str | None = None, out_dir: Path | None = None, /, *, options: RunOptions,
-    config: Path | None = None, quiet: bool,
-) -> None:  # fmt: skip
-    """Adjust, correct, clean, grid, compare and report; resumes where it stopped.
-
-    With --config give only the folder: pcfix run OUT_DIR --config run.json.
-    """
+def run(input: str, out_dir: Path, /, *, options: RunOptions, quiet: bool) -> None:
+    """Adjust, correct, clean, grid, compare and report; resumes where it stopped."""
     shown: Any = {"say": partial(say, quiet=quiet), "bar": partial(progress_bar, quiet=quiet)}
-    if config is None:
-        if input is None or out_dir is None:
-            raise UsageError("INPUT and OUT_DIR are needed")
-        pcfix.run(input, out_dir, options=options, **shown)
-        return
-    from pcfix.flow.request import request_of
-    from pcfix.flow.run import run_all
-
-    folder = out_dir or input
-    if folder is None or options.cameras is not None or options.water is not None:
-        raise UsageError("with --config give only OUT_DIR")
-    request = replace(request_of(config), overwrite=options.overwrite, jobs=options.jobs)
-    run_all(request, Path(folder), **shown)
+    pcfix.run(input, out_dir, options=options, **shown)
 
 
 @command(
@@ -241,20 +221,15 @@ def simulate(out_dir: Path, /, *, options: SimulateOptions, quiet: bool) -> None
     "pcfix pipeline cloud.laz corrected.laz --cameras cameras.csv --water 0.37",
     input="LAS or LAZ cloud.",
     output="LAS or LAZ to write.",
-    stage="Print only the stage, for use in another pipeline.",
 )
-def pipeline(
-    input: Path, output: Path | None = None, /, *, options: CorrectOptions, stage: bool = False
-) -> None:
+def pipeline(input: Path, output: Path, /, *, options: CorrectOptions) -> None:
     """Print the PDAL pipeline equivalent to 'pcfix correct', as JSON."""
     from pcfix.flow.pipeline import pipeline_for
 
-    if output is None and not stage:
-        raise UsageError("Give OUTPUT, or --stage to print only the stage")
-    say(json.dumps(pipeline_for(input, None if stage else output, options), indent=2))
+    say(json.dumps(pipeline_for(input, output, options), indent=2))
 
 
-@command("pcfix plan --height 60 --overlap 0.8 --sidelap 0.7 --depth 5 --plot plan.png")
+@command("pcfix plan --height 60 --overlap 0.8 --sidelap 0.7 --depth 1,2,5")
 def plan(*, options: PlanOptions, quiet: bool) -> None:
     """Predict the accuracy of a planned flight."""
     from pcfix.flow.plan import plan_text

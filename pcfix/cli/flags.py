@@ -66,7 +66,7 @@ class Command(NamedTuple):
             names = [one.name for one in options if one.name in given]
             asked = self.kind(**{name: given.pop(name) for name in names})
             missing = asked.missing()
-            if missing and given.get("config") is None:  # run.json has the rest
+            if missing:
                 other = f", or --{missing.instead}" if hasattr(asked, missing.instead) else ""
                 raise UsageError(f"{missing.flag} is needed{other}")
             quiet = {"quiet": given.pop("quiet", False)} if "quiet" in hints else {}

@@ -1,68 +1,27 @@
-"""The line of the method regression: read from a file, or fitted to check depths."""
+"""The line of the method regression, fitted to check depths."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from pcfix.errors import GeometryError, SettingError
-from pcfix.flow.surfaces import CloudView, Points, parts_of
-from pcfix.io.saved import read_regression
+from pcfix.errors import GeometryError
 from pcfix.io.tables import read_check_depths
 from pcfix.label.labelling import Part
-from pcfix.options.correct import ScienceOptions
 from pcfix.options.declare import File
-from pcfix.refract.batch import Survey
 from pcfix.refract.regression import LEAST_COUNT, DepthRegression, apparent_depths, fit_depths
 from pcfix.water.fit import FEWEST
 
-
-def regression_of(
-    inputs: Any, view: CloudView, chunks: Iterable[Points], survey: Survey
-) -> tuple[DepthRegression, tuple[str, ...]]:
-    """Read the line of a regression, or fit it to check depths; return it with notes."""
-    path, where = inputs.check_depths, ""
-    if inputs.regression is not None:
-        found = read_regression(inputs.regression)
-        fitted = f", fitted to {found.source}" if found.source else ""
-        where = (
-            f" It comes from {inputs.regression}{fitted}; whether it fits this cloud is not"
-            " checked."
-        )
-    else:
-        found = learn_regression(path, parts_of(chunks, survey.water), survey.settings)
-        source = f"{Path(path).name} on {Path(view.name).name}, water {survey.water}"
-        found = replace(found, source=source)
-    again = "" if found.cv_rmse_m is None else f", cross-validated {found.cv_rmse_m:.3f} m"
-    return found, (
-        f"Regression: {found}; standard errors {found.intercept_se_m:.3f} m and"
-        f" {found.slope_se:.3f}, RMSE {found.rmse_m:.3f} m{again}.{where}",
-        *found.notes,
-    )
+LEAST_R2 = 0.5
+"""Smallest coefficient of determination of a fit that is used."""
 
 
-def check_regression(inputs: Any) -> None:
-    """Raise SettingError unless the method regression has either check depths or a line."""
-    given = [n for n in ("check_depths", "regression") if getattr(inputs, n) is not None]
-    if len(given) != 1:
-        raise SettingError(
-            "option.together",
-            "Method regression needs check-depths (a CSV of measured depths) or regression (the"
-            " line of another cloud). Give one of the two.",
-            options=given,
-        )
-
-
-def learn_regression(
-    path: File, parts: Iterable[Part], settings: ScienceOptions
-) -> DepthRegression:
+def fit_check_depths(path: File, parts: Iterable[Part]) -> DepthRegression:
     """Fit true depth = a + b * apparent depth to the check depths of a file.
 
-    The parts are the whole apparent cloud, each point with the water above it; they are read once,
+    The parts are the entire apparent cloud, each point with the water above it; they are read once,
     in bounded memory. Points of noise (classes 7 and 18) do not count.
 
     Notes
@@ -103,14 +62,13 @@ def learn_regression(
         found = fit_depths(apparent[rows], true)
     except GeometryError as error:
         raise GeometryError(error.code, f"{checks.name}: {error}", **error.values) from error
-    if found.r2 < settings.least_r2:
+    if found.r2 < LEAST_R2:
         raise GeometryError(
             "check_depths.low_r2",
             f"{checks.name}: r2 {found.r2:.3f} of the regression over {found.count} check depths is"
-            f" below {settings.least_r2:g}. Check their CRS and the water level, or lower"
-            " --least-r2.",
+            f" below {LEAST_R2:g}. Check their CRS and the water level.",
             r2=found.r2,
-            least=settings.least_r2,
+            least=LEAST_R2,
         )
     notes += found.notes
     if found.outliers:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import warnings
 from dataclasses import fields
 from itertools import compress
-from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -23,13 +22,12 @@ from pcfix.flow.planning import plan_correction, plan_of, read_inputs
 from pcfix.flow.plausibility import CloudSample, Plausible, plausible
 from pcfix.flow.raster import command_for
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress
-from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of, write_shoreline
+from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header
 from pcfix.io.raster_cloud import is_raster
-from pcfix.io.saved import write_regression
 from pcfix.io.tiles import Clouds
 from pcfix.io.views import ViewReport
 from pcfix.label.labelling import Labelling
@@ -54,7 +52,7 @@ from pcfix.options.correct import (
     ScienceOptions,
 )
 from pcfix.options.declare import File, taken
-from pcfix.refract.regression import LEAST_BEYOND, DepthRegression
+from pcfix.refract.regression import DepthRegression
 from pcfix.refract.tally import Tally
 from pcfix.report.summary import Summary
 from pcfix.version import __version__
@@ -110,9 +108,9 @@ def correct_file(
 
 def _correcting(plan: Plan, source: LasSource) -> FileWork:
     """Return the correction of one file: its header, and each chunk."""
-    written = columns.columns_for(plan.options.dimensions, plan.options.unsure)
+    written = columns.columns_for(plan.options.dimensions)
     if is_raster(source.path):
-        written = (*columns.columns_for("all", plan.options.unsure), columns.OUTCOME)
+        written = (*columns.COLUMNS, columns.OUTCOME)
     header = output_header(source, "settings", plan.provenance(), written)
     uncorrected = plan.options.uncorrected
 
@@ -132,7 +130,7 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
         columns.fill(new, changes)
         new.array["classification"][correction.corrected] = BATHYMETRIC_POINT
         new["withheld"][:] = (withheld | changes.flagged).astype(np.uint8)
-        return new[~correction.uncorrected] if uncorrected == "drop" else new
+        return new
 
     return FileWork(header, compute, apply)
 
@@ -140,21 +138,16 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
 def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     """Refuse a result in which cloud, water and cameras do not fit, else summarize it.
 
-    Warns of what is uncertain, and writes the shoreline and the line of a regression if asked.
+    Warns of what is uncertain.
     """
     options, figures, transfer = plan.options, tally.figures, plan.transfer
     water_notes = _check_counts(plan, tally, tally.views)
     counts, uncertainty = figures.as_dict(), figures.uncertainty(plan.reconstruction)
-    tested, poses, absorbed, shoreline = None, None, None, None
+    tested, poses, absorbed = None, None, None
     if plan.inputs.port is None:
         ties = quick_ties(plan.inputs, plan.view.crs) if len(plan.cameras) else None
         tested = check_fit(plan, tally, ties)
         poses, absorbed = diagnose_in_passing(plan, ties)
-        if tally.shore is not None and options.shoreline is not None:
-            shoreline = write_shoreline(
-                options.shoreline, tally.shore, plan.found, plan.view.crs,
-                overwrite=options.overwrite, sigma_level_m=options.sigma_level,
-            )  # fmt: skip
         water, moved = str(plan.found.surface), plan.survey.level_offset_m
         if moved is not None:
             times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
@@ -165,23 +158,14 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     else:  # no depths, and no orders by depth
         counts["depth_m"], uncertainty = {}, None
         water = f"all around, seen through a {plan.inputs.port}"
-    path, line = options.save_regression, plan.regression
-    if path is not None and line is not None:
-        write_regression(path, line, overwrite=options.overwrite)
-    if options.unsure != "withhold":
-        counts["unsure"] = None
     unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
-    not_moved = sum(counts["uncorrected"].values()) + int(figures.outcomes[Outcome.NOT_TRANSFERRED])
-    reconstruction, detected = plan.reconstruction, [*plan.notes]
-    if tally.beyond is not None and line is not None:
-        least = LEAST_BEYOND if plan.inputs.regression is None else 0.0
-        detected += coded("regression.range", tally.beyond.notes(line, least))
+    reconstruction = plan.reconstruction
     notes = [
         *plan.input_notes,
         *([] if tally.views is None else tally.views.notes()),
         *coded("cloud.labels", plan.labelling.notes),
         *(() if tested is None else tested.doubts),
-        *detected,
+        *plan.notes,
         *coded("water.extent", water_notes),
         *([] if absorbed is None else [absorbed]),
     ]
@@ -190,7 +174,6 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         output=str(task.target),
         pcfix=__version__,
         **counts,
-        dropped=not_moved if options.uncorrected == "drop" else 0,
         cameras=len(plan.cameras),
         cameras_used=len(plan.cameras) - len(unused),
         cameras_unused=unused,  # labels of those without corrected points
@@ -207,11 +190,10 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         # other notes on the cloud, also in `warnings`
         notes=[
             one
-            for one in map(str, detected)
+            for one in map(str, plan.notes)
             if reconstruction is None or one not in reconstruction["because"]
         ],
         poses=poses,  # whether they have absorbed the refraction
-        shoreline=shoreline,
         fit=None if tested is None else tested.as_dict(),
     )
 
@@ -283,8 +265,7 @@ def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> P
     sought = (plan.found.as_dict() or {}).get("model") == "auto"
     tested = plausible(
         plan.cameras, sample.xyz, ties, () if sought else sample.level_doubts(),
-        file="" if isinstance(given, Cameras) else given or "", water_m=sample.water_m,
-        listed=plan.kind is not None, every=sample.every,
+        file="" if isinstance(given, Cameras) else given or "", listed=plan.kind is not None,
     )  # fmt: skip
     for warning in tested.doubts:
         warnings.warn(warning, stacklevel=3)
@@ -301,7 +282,7 @@ def correct_points(
     may_be_submerged: npt.ArrayLike | None = None,
     level_offset_m: npt.ArrayLike | None = None,
     adjusted_from: Cameras | None = None,
-    regression: DepthRegression | File | None = None,
+    regression: DepthRegression | None = None,
     **keywords: Any,
 ) -> Correction:
     """Correct apparent points for refraction at the water surface.
@@ -319,9 +300,9 @@ def correct_points(
         each point, NaN where it is unknown.
     options : RefractionOptions, optional
         Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
-        from the surface normal), max_cameras, camera_set, matcher, depth_factor, unsure (with
-        ``"withhold"`` the result has a flag), sigma_image and the other standard deviations. With
-        water_per_image, `water` still decides which points are submerged, and how deep.
+        from the surface normal), camera_set, matcher, depth_factor, sigma_image and the other
+        standard deviations. With water_per_image, `water` still decides which points are submerged,
+        and how deep.
     views : Views, optional
         The view list: the images that contributed to each point, as rows of `adjusted_from` if it
         is given, else of `cameras`. Default: as the option `camera_set` says.
@@ -336,8 +317,8 @@ def correct_points(
         The original cameras, in the same frame, if `cameras` are the same images (matched by their
         labels) after an adjustment. All points are first transferred to the adjusted cameras; see
         `pcfix.adjust.transfer`.
-    regression : DepthRegression or path, optional
-        For the method regression: see `pcfix.refract.regression`, or the file of a line.
+    regression : DepthRegression, optional
+        For the method regression; see `pcfix.refract.regression`.
 
     Returns
     -------
@@ -397,29 +378,23 @@ def correct_points(
         "xyz", None, *corners(*xyz[:, :2].T), len(xyz), lambda water=None: iter([points])
     )
     transfer = None if adjusted_from is None else transfer_between(adjusted_from, cameras)
-    line, path = regression, None
-    if isinstance(line, str | PathLike):
-        line, path = None, line
     plan = plan_of(
         with_index(all_options),
-        Inputs(cameras=cameras, water=surface, regression=path),
+        Inputs(cameras=cameras, water=surface),
         view,
         CameraInputs(cameras, None, original, transfer),
         FoundSurface(surface),
         offset,
         views,
         Labelling(LabelRules(respect_classes=(NOT_SUBMERGED,))),
-        line,
+        regression,
     )
     plan = plan_correction(plan)
     correction, tally = correct_chunk(plan, points, 0, covariances=True)
     if tally.water is not None:
         tally.water.check_reach("xyz", surface, deep=given.deep)
     check_fit(plan, tally)
-    line, beyond = plan.regression, list[str]()
-    if line is not None and tally.beyond is not None:
-        beyond = tally.beyond.notes(line)
-    for note in (*plan.input_notes, *coded("regression.range", beyond)):
+    for note in plan.input_notes:
         warnings.warn(note, stacklevel=2)
     return correction
 

@@ -18,7 +18,6 @@ from pcfix.errors import PcfixWarning
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.plausibility import CloudSample
 from pcfix.flow.surfaces import CloudView, Points
-from pcfix.grid.shoreline import NearWater
 from pcfix.io.views import ViewMatch, ViewReport
 from pcfix.label.labelling import LabelCounts, Labelling
 from pcfix.model import (
@@ -36,7 +35,6 @@ from pcfix.port.methods import correct_through_port
 from pcfix.refract.batch import Batch, Intersection, OriginalModel, Survey
 from pcfix.refract.methods import correct, shift_of_land
 from pcfix.refract.reconstructions import Verdict
-from pcfix.refract.regression import BeyondRange, DepthRegression
 from pcfix.refract.tally import Tally
 from pcfix.sums import Sums
 from pcfix.version import __version__
@@ -75,16 +73,12 @@ class Plan:
         return None if self.transfer is None else self.transfer.original
 
     @property
-    def regression(self) -> DepthRegression | None:
-        """The line of the method regression."""
-        return self.survey.learned.regression
-
-    @property
     def settings(self) -> dict[str, Any]:
         """What the summary and the output file say of the settings besides the options."""
         options, port = self.options, self.inputs.port
-        files = {name: getattr(options, name) for name in ("regression", "water_per_image")}
-        more: dict[str, Any] = {name: str(one) for name, one in files.items() if one is not None}
+        more: dict[str, Any] = {}
+        if options.water_per_image is not None:
+            more["water_per_image"] = str(options.water_per_image)
         if port is not None:
             return {"port": asdict(port)}
         if options.depth_factor == "auto":
@@ -149,8 +143,6 @@ class CloudTally(Sums):
     views: ViewReport | None = None
     water: WaterMeeting | None = None
     sample: CloudSample | None = None
-    beyond: BeyondRange | None = None
-    shore: NearWater | None = None
     transfer: TransferCounts | None = None
 
 
@@ -202,14 +194,6 @@ def correct_chunk(
     if step is not None:
         submerged &= step.moved  # a point without a place in the adjusted block is left where it is
     correction = _through_water(plan, batch, np.flatnonzero(submerged), covariances=covariances)
-    beyond, line = None, plan.regression
-    if line is not None:
-        beyond = BeyondRange.of((above.height_m - xyz[:, 2])[correction.submerged], line)
-    shore = None
-    if plan.options.shoreline is not None:
-        higher = xyz[:, 2] + correction.shift_m[:, 2] - above.height_m
-        height = np.where(correction.submerged, -correction.depth_m, higher)
-        shore = NearWater.of(xyz + correction.shift_m, height, correction.sigma_z_m)
     moved = None
     if step is not None:
         correction = step.whole(correction)
@@ -220,8 +204,6 @@ def correct_chunk(
         views=counts,
         water=WaterMeeting.of(xyz, correction, plan.found.surface),
         sample=CloudSample.of(points, above.height_m, row, plan.view.points),
-        beyond=beyond,
-        shore=shore,
         transfer=moved,
     )
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pcfix.flow.correct import correct_points
-from pcfix.flow.request import Request
-from pcfix.flow.run import run_all
+from pcfix.flow.run import run
 from pcfix.flow.runner import Bar, no_bar
 from pcfix.io.las.source import read_xyz
 from pcfix.io.scenes import write_scene
@@ -32,8 +31,10 @@ def run_demo(
         with bar(f"Simulating, {kind}") as progress:
             scene = simulate_scene(points, block=kind, progress=progress)
         write_scene(scene, folder, overwrite=overwrite)
-        request = Request(
-            input=str(folder / "cloud.laz"),
+        result = run(
+            folder / "cloud.laz",
+            folder / REPORT,
+            bar=bar,
             cameras=str(folder / "cameras.csv"),
             water=str(scene.water_level_m),
             reference=str(folder / "lidar.laz"),
@@ -44,9 +45,8 @@ def run_demo(
             project=f"pcfix demo, {kind} block",
             overwrite=overwrite,
         )
-        page = run_all(request, folder / REPORT, bar=bar)
         table = _table(scene, read_xyz(folder / REPORT / "corrected.laz"))
-        sections.append(f"{folder}\n{scene.description}\n{table}\nreport: {page}")
+        sections.append(f"{folder}\n{scene.description}\n{table}\nreport: {result.report}")
     return "\n\n".join(sections)
 
 

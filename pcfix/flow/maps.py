@@ -13,9 +13,9 @@ import shapely
 
 from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
 from pcfix.flow.raster import write_cells
-from pcfix.flow.request import SURFACE, RunFolder
+from pcfix.flow.run_folder import SURFACE, RunFolder
 from pcfix.flow.runner import Progress
-from pcfix.flow.surfaces import file_points, shoreline_layer, view_of
+from pcfix.flow.surfaces import file_points, view_of
 from pcfix.grid.colours import hillshade, relief_colours
 from pcfix.grid.lattice import round_resolution
 from pcfix.grid.maps import contours, depth_interval
@@ -62,8 +62,8 @@ def write_rasters(run: RunFolder, *, errors: bool, progress: Progress | None = N
     By default the cells have 2 to 4 points, or those of a raster are as large as its own. This is
     also written on its own grid. Returns the side of the cells for ``run.json``.
     """
-    folder, cloud, cell_m = run.folder, run.cleaned_cloud, run.request.resolution
-    source = run.request.source
+    folder, cloud, cell_m = run.folder, run.cleaned, run.options.resolution
+    source = run.source
     if isinstance(source, RasterBand) and isinstance(cloud, Path):
         write_cells(source, cloud, {"height": folder / CORRECTED})
         with rasters.open_raster(source.path) as raster:
@@ -130,33 +130,32 @@ def write_map(path: Path, run: RunFolder, corrected: Plain, compared: Plain) -> 
     `corrected` and `compared` are the results of these steps. The height of the water has one
     standard error for all places.
     """
-    folder, cloud, request = run.folder, run.cleaned_cloud, run.request
+    folder, cloud, options = run.folder, run.cleaned, run.options
     shapes = rasters.outlines(folder / DEPTH, MOST_CELLS)
     area = shapely.area(np.array(shapes, object)) if shapes else np.zeros(0)
     style = vector_style({"area": Symbol("fill", DARK, 0.5)})
-    known = request.sigma_level, (corrected["water_fit"] or {}).get("sigma_level_m"), LEVEL_M
+    known = options.sigma_level, (corrected["water_fit"] or {}).get("sigma_level_m"), LEVEL_M
     sigma_m = next(one for one in known if one is not None)
     # x, y, reference height, and cloud minus reference
     points = np.array(compared.get("check_points", [])).reshape(-1, 4)
     sections = compared.get("figures", {}).get("sections", [])
     layers = [
         Layer("corrected_area", "Polygon", shapes, {"area_m2": area}, style),
-        contours_layer(folder),
-        _waterline(cloud, run.water, sigma_m),
+        _contours(folder),
+        waterline(cloud, run.water, sigma_m),
         *([_sections(sections)] if sections else []),
         _cameras(run.cameras, corrected["cameras_unused"]),
-        *_checks(folder, points, request.check_depths),
+        *_checks(folder, points, options.check_depths),
     ]
     write_layers(path, layers, view_of(cloud).crs, overwrite=True)
 
 
-def contours_layer(folder: Path, interval: float | None = None) -> Layer:
-    """Return the depth contours; the default interval follows from the uncertainty."""
+def _contours(folder: Path) -> Layer:
+    """Return the depth contours, no finer than the depth is known."""
     depth, bounds = rasters.preview(folder / DEPTH, MOST_CELLS)
-    if interval is None:
-        path = folder / UNCERTAINTY
-        sigma = rasters.preview(path)[0] if path.exists() else np.zeros(0)
-        interval = depth_interval(depth, sigma)
+    path = folder / UNCERTAINTY
+    sigma = rasters.preview(path)[0] if path.exists() else np.zeros(0)
+    interval = depth_interval(depth, sigma)
     found = contours(depth, interval)
     lines = [shapely.linestrings(rasters.centres(place, depth, bounds)) for _, place in found]
     level = np.array([level for level, _ in found])
@@ -165,8 +164,11 @@ def contours_layer(folder: Path, interval: float | None = None) -> Layer:
     return Layer("depth_contours", "LineString", lines, values, style)
 
 
-def _waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Layer:
-    """Return where the water meets the corrected cloud."""
+def waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Layer:
+    """Return where the water meets the corrected cloud, with the standard error across the line.
+
+    `sigma_m` is that of the height of the water.
+    """
     near = NearWater()
     for points in file_points(cloud, water, ("WaterDepth", "SigmaZ")):
         known = points.dimensions or {}
@@ -176,8 +178,13 @@ def _waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Laye
         above[~points.counts()] = np.nan
         near += NearWater.of(points.xyz, above, known["SigmaZ"])
     lines = near.lines(lambda xy: np.full(len(xy), sigma_m))
+    values = {
+        figure: np.array([getattr(one, figure) for one in lines], np.float64)
+        for figure in ("level_m", "sigma_m", "length_m")
+    }
+    geometries = [shapely.linestrings(one.xy) for one in lines]
     style = vector_style({"line": Symbol("line", RED, 0.5)})
-    return shoreline_layer("waterline", lines, style)
+    return Layer("waterline", "LineString", geometries, values, style)
 
 
 def _sections(sections: Sequence[Mapping[str, float]]) -> Layer:

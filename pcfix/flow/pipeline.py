@@ -11,15 +11,15 @@ from pcfix.flow.surfaces import view_of
 from pcfix.io.las.columns import UPGRADE, Column, columns_for
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix
-from pcfix.io.pdal import CLASS_FLAGS, OUTCOME, STAGE_SOURCE, add_dimension
+from pcfix.io.pdal import CLASS_FLAGS, STAGE_SOURCE, add_dimension
 from pcfix.options.correct import CorrectOptions
 
 if TYPE_CHECKING:
     import laspy
 
 
-def pipeline_for(input: Path, output: Path | None, options: CorrectOptions) -> dict[str, Any]:
-    """Return the pipeline, ready for JSON; without an output only the stage of pcfix.
+def pipeline_for(input: Path, output: Path, options: CorrectOptions) -> dict[str, Any]:
+    """Return the pipeline, ready for JSON.
 
     The stage gets the options that differ from their defaults. PDAL replaces existing outputs. What
     `pcfix.correct_file` refuses before it reads points is refused here, too.
@@ -27,33 +27,24 @@ def pipeline_for(input: Path, output: Path | None, options: CorrectOptions) -> d
     if options.port is not None:
         sentence = "--port has no effect in a pipeline. Use 'pcfix correct'."
         raise SettingError("option.no_use", sentence, option="port")
-    drop, plain = options.uncorrected == "drop", options.plain()
-    if drop and output is None:
-        raise SettingError(
-            "pipeline.drop",
-            "--uncorrected drop needs a stage that drops points. Print the whole pipeline.",
-        )
-    if output is not None:
-        check_suffix(output)
+    check_suffix(output)
     read_inputs(options, view_of(input))
-    columns = columns_for(options.dimensions, options.unsure)
+    columns = columns_for(options.dimensions)
+    plain = options.plain()
     first = {name: plain[name] for name in ("cameras", "water") if name in plain}
-    added = [add_dimension(columns), CLASS_FLAGS, f"{OUTCOME}=uint8" if drop else ""]
     stage: dict[str, Any] = {
         "type": "filters.python",
         "source": STAGE_SOURCE.format("correct"),
         "module": "pcfix_stage",
         "function": "correct",
-        "add_dimension": ",".join(filter(None, added)),
+        "add_dimension": ",".join(filter(None, [add_dimension(columns), CLASS_FLAGS])),
         "pdalargs": {
             **first,
             **plain,
-            "uncorrected": "keep" if drop else options.uncorrected,
+            "uncorrected": options.uncorrected,
             "dimensions": options.dimensions,
         },
     }
-    if output is None:
-        return stage
     with LasSource(input) as source:
         point_format = source.header.point_format
     if UPGRADE[point_format.id] in (9, 10):
@@ -63,7 +54,6 @@ def pipeline_for(input: Path, output: Path | None, options: CorrectOptions) -> d
         )
         raise bad_file(input, "cloud.waveforms", sentence, point_format=point_format.id)
     reader = {"type": "readers.las", "filename": str(input)}
-    dropping = {"type": "filters.range", "limits": f"{OUTCOME}[0:1]"}
     writer = {
         "type": "writers.las",
         "filename": str(output),
@@ -73,7 +63,7 @@ def pipeline_for(input: Path, output: Path | None, options: CorrectOptions) -> d
     }
     if extra := _extra_dims(point_format, columns):
         writer["extra_dims"] = extra
-    return {"pipeline": [reader, stage, *([dropping] if drop else []), writer]}
+    return {"pipeline": [reader, stage, writer]}
 
 
 def _extra_dims(point_format: laspy.PointFormat, columns: tuple[Column, ...]) -> str:

@@ -2,8 +2,7 @@
 
 The block is simulated over flat beds without noise, the apparent points are intersected with
 straight rays, and `pcfix.correct_points` gives the standard errors of the corrected points for each
-part of the error budget. Poses are adjusted twice: through the water, whose covariance is what
-adjusted poses add, and by straight rays, which shows how much of the refraction is absorbed.
+part of the error budget. An adjustment through the water gives the errors of the poses.
 """
 
 from __future__ import annotations
@@ -11,37 +10,25 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pcfix.adjust.block import Block, Unknowns, plain_block, restricted, well_seen
-from pcfix.adjust.normal import residuals
 from pcfix.adjust.precision import precision_of
-from pcfix.adjust.problem import prepare, solved_cameras
-from pcfix.adjust.solve import solve
+from pcfix.adjust.problem import prepare
 from pcfix.errors import PcfixWarning, SettingError
-from pcfix.flow.cameras import draw_footprints
 from pcfix.flow.correct import correct_points
 from pcfix.flow.pose_errors import pose_errors
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import Points
-from pcfix.model import Cameras, Correction, FloatArray, TiePoints, Views, WaterPlane
+from pcfix.model import Correction, FloatArray, TiePoints, Views, WaterPlane
 from pcfix.options.correct import BudgetOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import options_of, taken
 from pcfix.options.scenes import PlanOptions
 from pcfix.refract.batch import Survey
 from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
-from pcfix.report.page import (
-    AFTER,
-    BEFORE,
-    REFERENCE,
-    WATER,
-    Table,
-    label_plan,
-    legend_below,
-    new_figure,
-)
+from pcfix.report.page import Table
 from pcfix.report.text import aligned
 from pcfix.running import threads
 from pcfix.simulate.scene import lay_out, points_on, see
@@ -49,26 +36,21 @@ from pcfix.simulate.settings import SceneSettings
 from pcfix.sums import Figures
 from pcfix.water.index import index_of
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 POINTS = 400
 """Of each bed; they are also the tie points of the adjustments."""
 MOST_BASES, MOST_SPACINGS = 8, 4
 """Limits of the simulated block: farther inside, the geometry repeats."""
-FEWEST_SEEN, NOTHING_PX = 50, 1e-6
+FEWEST_SEEN = 50
 PARTS = {
-    "image": (("sigma_image",), BEFORE,
+    "image": (("sigma_image",),
               "noise in the images: fly lower, or with more overlap or obliques"),
-    "level": (("sigma_level", "sigma_tilt"), WATER,
+    "level": (("sigma_level", "sigma_tilt"),
               "the water level: measure it better, at the time of the flight"),
-    "waves": (("sigma_waves",), "#7a5195", "waves: wait for calmer water"),
-    "index": (("sigma_index",), "#8a8a8a",
-              "the refractive index: measure salinity and temperature"),
-    "poses": (("sigma_centre", "sigma_attitude"), "#58a55c",
-              "poses: use RTK or more control points"),
+    "waves": (("sigma_waves",), "waves: wait for calmer water"),
+    "index": (("sigma_index",), "the refractive index: measure salinity and temperature"),
+    "poses": (("sigma_centre", "sigma_attitude"), "poses: use RTK or more control points"),
 }  # fmt: skip
-"""Parts of the error budget: their options, the colour in the figure, and the remedy."""
+"""Parts of the error budget: their options, and the remedy."""
 
 
 def plan_flight(
@@ -101,7 +83,6 @@ def plan_flight(
             if progress is not None:
                 progress(len(beds), len(given.depth))
     scene = _scene(given, max(given.depth))
-    cameras = lay_out(scene).true  # as a drone would fly them, in strips along x from the origin
     base_m, spacing_m = scene.base_and_spacing_m
     plan = Figures(
         options=given.as_dict(),
@@ -109,9 +90,9 @@ def plan_flight(
         base_m=base_m,  # between images
         spacing_m=spacing_m,  # between strips
         depths=beds,
-        images=len(cameras),
+        images=len(lay_out(scene).true),
     )
-    write_summary(given, plan.as_dict(), lambda: plan_figure(plan, given, cameras))
+    write_summary(given, plan)
     return plan
 
 
@@ -127,7 +108,6 @@ def _predicted(given: PlanOptions, depth_m: float) -> Figures:
     sigma_m = float(np.hypot(_rms(corrected.sigma_z_m), adjusted_m))
     parts_m = {part: _rms(_corrected(given, bed, apparent, part).sigma_z_m) for part in PARTS}
     parts_m["poses"] = float(np.hypot(parts_m["poses"], adjusted_m))
-    share, left_m = _absorbed(given, bed, apparent)
     depth, tvu = np.array([depth_m]), COVERAGE_95 * sigma_m
     return Figures(
         depth_m=depth_m,
@@ -135,8 +115,6 @@ def _predicted(given: PlanOptions, depth_m: float) -> Figures:
         rays=float(corrected.ray_count.mean()),  # per point
         sigma_m=sigma_m,  # standard error of the corrected heights, rms over the bed
         parts_m=parts_m,  # of it; their squares add up
-        absorbed=share,  # of the misfit, by poses and focal length of an ordinary adjustment
-        left_m=left_m,  # true minus corrected height with such poses, mean
         # the strictest order that the uncertainty at 95 % would keep
         s44=next((one.name for one in ORDERS if tvu <= largest_tvu_m(one, depth)[0]), "-"),
     )
@@ -217,23 +195,6 @@ def _of_adjusted_poses(given: PlanOptions, bed: Block, apparent: FloatArray) -> 
     return float("nan") if found is None else found.middle_m
 
 
-def _absorbed(given: PlanOptions, bed: Block, apparent: FloatArray) -> tuple[float, float]:
-    """Return the absorbed share of the refraction, and the bias of the bed with such poses.
-
-    The share is of the misfit of straight rays at the true poses; the bias, true minus corrected
-    height, is of the bed corrected with the adjusted poses.
-    """
-    problem, start = prepare(replace(bed, xyz=apparent), Unknowns(lens=("f",)))
-    found = solve(problem, start)
-    before, after = (_rms(residuals(one.state, problem.given)) for one in (start, found))
-    adjusted = replace(bed, cameras=solved_cameras(problem, found))
-    moved = _corrected(given, adjusted, found.state.xyz + problem.origin)
-    known = moved.corrected
-    off = bed.xyz[known, 2] - moved.xyz[known, 2]
-    share = 1.0 - after / before if before > NOTHING_PX else 0.0
-    return share, float(off.mean())
-
-
 def plan_text(plan: Figures) -> str:
     """Return the plan as the terminal shows it."""
     given, deepest = plan.options, max(plan.depths, key=lambda one: float(one.depth_m))
@@ -246,44 +207,18 @@ def plan_text(plan: Figures) -> str:
     head = "Planned {:g} m above the water over {:g} x {:g} m".format(
         given["height"], *given["area"]
     )
-    header = ["depth", "apparent", "rays", *deepest.parts_m, "total", "95 %", "S-44 order",
-              "absorbed", "bias"]  # fmt: skip
+    header = ["depth", "apparent", "rays", *deepest.parts_m, "total", "95 %", "S-44 order"]
     errors = [
         [
             f"{one.depth_m:.4g} m", f"{one.apparent_m:.2f} m", f"{one.rays:.1f}",
             *(f"{100.0 * part:.2f}" for part in one.parts_m.values()),
             f"{100.0 * one.sigma_m:.2f}", f"{100.0 * COVERAGE_95 * one.sigma_m:.2f}", one.s44,
-            f"{one.absorbed:.0%}", f"{100.0 * one.left_m:+.1f}",
         ]
         for one in plan.depths
     ]  # fmt: skip
     title = f"Standard errors of the corrected bed in cm (refractive index {given['index']:g}):"
     largest = max(deepest.parts_m, key=deepest.parts_m.get)
-    advice = f"The largest part of the error at {deepest.depth_m:g} m is {PARTS[largest][2]}."
+    advice = f"The largest part of the error at {deepest.depth_m:g} m is {PARTS[largest][1]}."
     return "\n".join([
         aligned(head, flight), "", title, *Table(title, header, errors).lines(), "", advice,
     ])  # fmt: skip
-
-
-def plan_figure(plan: Figures, given: PlanOptions, cameras: Cameras) -> Figure:
-    """Draw the block in plan, and the standard errors over the depth."""
-    figure, (block, errors) = new_figure(10.0, 4.6, ncols=2)
-    draw_footprints(block, cameras, 0.0, linewidth=0.5, alpha=0.5)
-    block.plot(*cameras.centres[:, :2].T, "^", color=AFTER, markersize=4, label="images")
-    x, y = given.area
-    block.plot([0, x, x, 0, 0], [0, 0, y, y, 0], color=REFERENCE, label="area")
-    block.plot([], [], color=WATER, label="footprints at the water")
-    label_plan(block)
-    legend_below(block)
-    block.set_title(f"{len(cameras):,} images, GSD {100.0 * plan.gsd_m:.2f} cm")
-    beds = sorted(plan.depths, key=lambda one: float(one.depth_m))
-    depth = [one.depth_m for one in beds]
-    for part, (_, colour, _) in PARTS.items():
-        values = [100.0 * one.parts_m[part] for one in beds]
-        errors.plot(depth, values, ".-", color=colour, label=part)
-    total = [100.0 * one.sigma_m for one in beds]
-    errors.plot(depth, total, "o-", color=REFERENCE, linewidth=2, label="total")
-    errors.set(xlabel="Depth (m)", ylabel="Standard error of Z (cm)", ylim=(0.0, None))
-    errors.set_title("Predicted standard error of the bed")
-    legend_below(errors)
-    return figure

@@ -13,24 +13,10 @@ from itertools import compress
 import numpy as np
 
 from pcfix.errors import PcfixWarning, SettingError, coded
-from pcfix.flow.check_depths import check_regression, regression_of
+from pcfix.flow.check_depths import fit_check_depths
 from pcfix.flow.correction import Plan, batch_of, transferred
-from pcfix.flow.inputs import (
-    CameraInputs,
-    Inputs,
-    labelling_of,
-    original_ties,
-    paths_in,
-    read_blocks,
-)
-from pcfix.flow.surfaces import (
-    CloudView,
-    Points,
-    check_shoreline,
-    own_water_of,
-    parts_of,
-    sample_of,
-)
+from pcfix.flow.inputs import CameraInputs, Inputs, labelling_of, original_ties, read_blocks
+from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
 from pcfix.io.las.source import CHUNK_POINTS
 from pcfix.io.views import ViewMatch
 from pcfix.label.labelling import Labelling
@@ -82,9 +68,6 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
             match, None if listed is None else listed.kind, input_notes=cameras.notes,
             notes=tuple(notes),
         )  # fmt: skip
-    if options.shoreline is not None:
-        reads = paths_in(options)
-        check_shoreline(options.shoreline, overwrite=options.overwrite, inputs=reads)
     found = inputs.surface(view)
     if match is None and not isinstance(options.cameras, Cameras):
         _check_frames(blocks.cameras, options)
@@ -93,8 +76,9 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
         options, inputs, view, blocks, found, offset, listed, labelling_of(options, view)
     )
     check_tilt(found.surface)
-    if plan.survey.settings.method == "regression":
-        check_regression(inputs)
+    if plan.survey.settings.method == "regression" and inputs.check_depths is None:
+        sentence = "Method regression needs check-depths, a CSV of measured depths. Give it."
+        raise SettingError("option.together", sentence, options=[])
     return replace(plan, match=match, input_notes=(*blocks.cameras.notes, *plan.input_notes))
 
 
@@ -144,7 +128,6 @@ def _check_port(options: CorrectOptions) -> None:
         "camera_set": options.camera_set == "mvs",
         "occlusion": options.occlusion == "on",
         "method": options.method not in ("auto", "snell", "consistent"),
-        "unsure": options.unsure == "withhold",
     }
     for name in compress(excluded, excluded.values()):
         raise SettingError(
@@ -175,12 +158,17 @@ def plan_correction(plan: Plan) -> Plan:
     chunks = partial(_whole_cloud, plan)
     labelling = plan.labelling.scanned(parts_of(chunks(), water), view.low, view.high)
     plan = replace(plan, labelling=labelling)
-    if (inputs.check_depths or inputs.regression) is not None and plan.regression is None:
-        line, notes = regression_of(inputs, view, chunks(), plan.survey)
+    if inputs.check_depths is not None:
+        line = fit_check_depths(inputs.check_depths, parts_of(chunks(), water))
         survey = replace(plan.survey, learned=plan.survey.learned._replace(regression=line))
-        plan = replace(plan, survey=survey, notes=tuple(coded("regression.fit", notes)))
+        notes = coded("regression.fit", (line.words, *line.notes))
+        plan = replace(plan, survey=survey, notes=tuple(notes))
     plan = _estimated_from_cloud(plan, chunks)
-    if plan.options.dimensions == "all" and plan.regression is None and len(plan.cameras):
+    if (
+        plan.options.dimensions == "all"
+        and plan.survey.learned.regression is None
+        and len(plan.cameras)
+    ):
         plan = _with_pose_errors(plan)
     if first is not None and plan.kind is not None:
         plan = _with_type_of_list(plan, first)

@@ -109,9 +109,6 @@ def raster_command(
         sentence = f"{output}: is a raster, and the input is not. Give a name that ends in .laz,"
         sentence += " and grid that cloud with 'pcfix dsm'."
         raise SettingError("output.suffix", sentence, path=output)
-    if getattr(options, "uncorrected", None) == "drop":
-        sentence = "uncorrected drop is for clouds. With withhold such cells become nodata."
-        raise SettingError("option.conflict", sentence, option="uncorrected")
     asked = {one: getattr(options, one, None) for one in OUTPUTS}
     more = {one: Path(path) for one, path in asked.items() if path is not None}
     task = file_task(

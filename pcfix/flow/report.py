@@ -11,7 +11,7 @@ import numpy as np
 
 from pcfix.flow.adjust import FOLDER, SUMMARY
 from pcfix.flow.maps import DEPTH, UNCERTAINTY
-from pcfix.flow.request import SURFACE, RunFolder
+from pcfix.flow.run_folder import SURFACE, RunFolder
 from pcfix.flow.surfaces import view_of
 from pcfix.flow.water import found_picture
 from pcfix.grid.lattice import Lattice
@@ -64,10 +64,10 @@ def report_run(
     if first["why"]:
         how = "not adjusted:" if first["model"] is None else "adjusted first, as"
         more["verdict"] = f" The cameras were {how} {first['why']}."
-    request, summary = run.request, Summary(**corrected)
+    options, summary = run.options, Summary(**corrected)
     rasters = [SURFACE, DEPTH, *([] if summary.uncertainty is None else [UNCERTAINTY])]
-    rasters += [DIFFERENCE] if compared and request.has_surface else []
-    with open_cloud(run.cleaned_cloud) as source:
+    rasters += [DIFFERENCE] if compared and run.has_surface else []
+    with open_cloud(run.cleaned) as source:
         maps = read_maps(run.folder, rasters, *crs_words(stated_crs(source)))
     if compared:
         figures = evaluation(
@@ -77,10 +77,10 @@ def report_run(
     if first["model"] is not None:
         more["verdict"] += f" {adjustment_sentence(read_json(run.folder / FOLDER / SUMMARY))}."
     if (summary.water_fit or {}).get("model") == "auto":  # the water was sought in the cloud
-        more["pictures"].append(found_picture(run.inputs.surface(view_of(request.source))))
+        more["pictures"].append(found_picture(run.inputs.surface(view_of(run.source))))
     page = write_report(
         run.folder, summary, run.cameras, maps, inputs,
-        project=request.project or "", date=request.date or "", **more,
+        project=options.project or "", date=options.date or "", **more,
     )  # fmt: skip
     shown = [
         f"{tile.title}{f', {tile.tag}' if tile.tag else ''}: "

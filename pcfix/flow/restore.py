@@ -9,7 +9,7 @@ import numpy as np
 
 from pcfix.errors import bad_file
 from pcfix.flow.runner import Chunk, FileWork, run_command
-from pcfix.io.las.columns import SHIFTS, UNSURE, columns_for, convert, move
+from pcfix.io.las.columns import SHIFTS, columns_for, convert, move
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import read_settings, record_errors, restored_header
 from pcfix.io.raster_cloud import is_raster
@@ -41,7 +41,7 @@ def restore_file(
     Returns
     -------
     int
-        Number of points written. Points dropped by ``uncorrected="drop"`` are lost.
+        Number of points written.
 
     Raises
     ------
@@ -72,8 +72,6 @@ def _restoring(plan: None, source: LasSource) -> FileWork:
         points.array["classification"][moved] = points.array["SourceClass"][moved]
         # points that pcfix withheld: submerged, but not corrected
         ours = np.asarray(~moved & (points.array["WaterDepth"] > 0))
-        if UNSURE.name in names:
-            ours |= points.array[UNSURE.name] > 0
         withheld = np.asarray(points["withheld"]).astype(bool)
         points["withheld"][:] = (withheld & ~ours).astype(np.uint8)
         shift = np.column_stack([points.array[name] for name in SHIFTS]).astype(np.int64)
@@ -87,7 +85,7 @@ def _restoring(plan: None, source: LasSource) -> FileWork:
 def _ours(source: LasSource, settings: dict[str, Any]) -> set[str]:
     """Return the dimensions that pcfix added; InputError if any is missing or has changed."""
     dimensions = settings["dimensions"]
-    columns = columns_for(dimensions, settings.get("unsure", "keep"))
+    columns = columns_for(dimensions)
     names = {column.name for column in columns}
     wrong, header = "", source.header.point_format
     missing = names.difference(header.dimension_names)

@@ -25,10 +25,10 @@ from pcfix.flow.correct import correct_file
 from pcfix.flow.diagnosis import diagnose_inputs, has_datum
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.report import PAGE, report_run
-from pcfix.flow.request import SURFACE, Record, Request, RunFolder, read_record
+from pcfix.flow.report import DIFFERENCE, PAGE, report_run
+from pcfix.flow.run_folder import SURFACE, Record, RunFolder, finished_steps
 from pcfix.flow.runner import Bar, Progress, check_folder, no_bar
-from pcfix.flow.surfaces import check_shoreline, view_of
+from pcfix.flow.surfaces import view_of
 from pcfix.io import rasters, vectors
 from pcfix.io.clouds import is_cloud
 from pcfix.io.files import read_json
@@ -39,10 +39,9 @@ from pcfix.io.tiles import Tiles, check_one_file
 from pcfix.libraries import analysis_library
 from pcfix.model import WaterDimension
 from pcfix.options.correct import AdjustOptions, CorrectOptions, RunOptions
-from pcfix.options.declare import File, options_of, taken
+from pcfix.options.declare import File, taken
 from pcfix.options.steps import CleanOptions, DistanceOptions
 from pcfix.report.adjustment import adjustment_sentence, all_notes
-from pcfix.report.comparison import signed_statistics
 from pcfix.report.summary import Summary
 from pcfix.running import threads
 from pcfix.water.index import with_index
@@ -54,7 +53,7 @@ if TYPE_CHECKING:
 
 Plain = dict[str, Any]
 
-RECORD = "run.json"
+COMPARED = "compare"
 REFERENCE_DSM = "reference_dsm.tif"
 COLMAP = ("cameras.bin", "images.bin", "points3D.bin", "georeference.json")
 ADJUSTED = ("report.html", SUMMARY, ENSEMBLE, *(f"colmap/{name}" for name in COLMAP), *MODELS[1:])
@@ -72,13 +71,16 @@ def run(
 ) -> RunResults:
     """Adjust, correct, clean, grid, compare and report; what ``pcfix run`` runs.
 
+    Every step that is not done yet is done. Called again with the same options, a run resumes; if
+    only options of later steps changed, such as the reference, only these are done again. The
+    option `overwrite` replaces a run with other options, and what else is in the folder.
+
     Parameters
     ----------
     input : path, or list of paths
         LAS or LAZ cloud, of one file or many; see `pcfix.correct_file`.
     out_dir : path
-        Folder for all results, made where its parent exists. Called again with the same options it
-        resumes, and a finished run is opened at once.
+        Folder for all results, made where its parent exists.
     options
         See `pcfix.correct_file`. Cameras and water are files or text, as ``run.json`` keeps them.
     say : callable, optional
@@ -98,45 +100,16 @@ def run(
     >>> float(result.depth.max())  # doctest: +SKIP
     12.25
     """
-    given = taken(RunOptions, options, keywords, "run")
-    values = {one.name: getattr(given, one.name) for one in options_of(RunOptions)}
-    for name in ("cameras", "water", "adjusted_from", "gcps"):
-        if not isinstance(values[name], str | os.PathLike | Real | None):
-            raise SettingError(
-                "option.type",
-                f"run: {name} is a {type(values[name]).__name__}. Give a file or text, which"
-                " run.json can keep, or use correct_file.",
-                option=name,
-            )
-        values[name] = None if values[name] is None else str(values[name])
+    options, out_dir = _checked(taken(RunOptions, options, keywords, "run")), Path(out_dir)
     cloud = str(input) if isinstance(input, str | os.PathLike) else tuple(map(str, input))
-    run_all(Request(input=cloud, **values), Path(out_dir), say=say, bar=bar)
-    return RunResults(Path(out_dir))
-
-
-def run_all(
-    request: Request,
-    out_dir: Path,
-    *,
-    say: Callable[[str], None] = lambda text: None,
-    bar: Bar = no_bar,
-) -> Path:
-    """Do every step that is not done yet, and return the path of the report.
-
-    A run with the same request resumes in its folder; if only options of later steps changed, such
-    as the reference, only these steps are done again. The option `overwrite` replaces a cloud that
-    was corrected in another way, and what else is in the folder. `say` gets a line for each step,
-    `bar` shows its progress.
-    """
-    inputs = [path for some in request.files().values() for path in some]
-    run, asked = RunFolder(out_dir, request), request
-    if request.m3c2:
+    given = RunFolder(out_dir, cloud, options)
+    inputs = [path for some in given.files().values() for path in some]
+    if options.m3c2:
         load_py4dgeo()
-    check_one_file(request.source, request)
-    if isinstance(request.source, Tiles):
-        check_folder(run.corrected, request.source.paths)
-    record = _opened(request, out_dir)
-    check_shoreline(request.shoreline, overwrite=asked.overwrite or record.resumes, inputs=inputs)
+    check_one_file(given.source, options)
+    if isinstance(given.source, Tiles):
+        check_folder(given.path_of("corrected"), given.source.paths)
+    record = _opened(given)
 
     def step(
         name: str, title: str, result_file: Path, work: Callable[[Progress | None], Any],
@@ -154,22 +127,19 @@ def run_all(
         return result
 
     outputs = [out_dir / FOLDER / name for name in ADJUSTED]
-    first = step(
-        "adjust", "Adjusting", outputs[0], lambda _: adjust_first(asked, out_dir, inputs), outputs
-    )
+    first = step("adjust", "Adjusting", outputs[0], lambda _: adjust_first(given, inputs), outputs)
     if first["model"] is not None:
         figures = read_json(out_dir / FOLDER / SUMMARY)
         for words in (adjustment_sentence(figures), *all_notes(figures)):
             say(f"{'':<9} {words}")
     elif first["why"]:
         say(f"{'adjust':<9} skipped: {first['why']}")
-    request = request.with_adjusted(out_dir, first)
-    run = RunFolder(out_dir, request)
+    adjusted = given.with_adjusted(first)
 
-    outputs = run.files_of(run.corrected)
-    outputs += [] if request.check_depths is None else [run.regression]
-    outputs += [] if request.shoreline is None else [Path(request.shoreline)]
-    corrected = step("correct", "Correcting", run.corrected, partial(_correct, run), outputs)
+    corrected = step(
+        "correct", "Correcting", adjusted.path_of("corrected"), partial(_correct, adjusted),
+        adjusted.cloud_files("corrected"),
+    )  # fmt: skip
     poses = corrected["poses"]
     if first["absorbed"] is False and poses is not None and poses["absorbed"] is None:
         # the first step has surveys that the correction has not
@@ -177,65 +147,105 @@ def run_all(
         corrected = {**corrected, "poses": {**poses, "absorbed": False, "words": words}}
 
     # the corrected cloud marks which points are below the water
-    how = CleanOptions(overwrite=True, jobs=asked.jobs, scheduler=asked.scheduler)
+    how = CleanOptions(overwrite=True, jobs=options.jobs, scheduler=options.scheduler)
+    cleaned = adjusted.path_of("cleaned")
     step(
-        "clean", "Cleaning", run.cleaned,
+        "clean", "Cleaning", cleaned,
         lambda progress: clean_file(
-            run.corrected_cloud, run.cleaned, options=how, progress=progress
+            adjusted.corrected, cleaned, options=how, progress=progress
         ).as_dict(),
-        run.files_of(run.cleaned),
+        adjusted.cloud_files("cleaned"),
     )  # fmt: skip
     errors = corrected["uncertainty"] is not None
-    cells = isinstance(request.source, RasterBand)
+    cells = isinstance(adjusted.source, RasterBand)
     outputs = maps.raster_files(out_dir, errors=errors, cells=cells)
     step(
         "dsm", "Gridding", outputs[0],
-        lambda progress: maps.write_rasters(run, errors=errors, progress=progress), outputs,
+        lambda progress: maps.write_rasters(adjusted, errors=errors, progress=progress), outputs,
         lambda result: f", cells of {result['resolution_m']:g} m",
     )  # fmt: skip
     compared: Plain = {}
-    if request.reference is not None:
-        found = run.compare / "compare.json"
-        compared = step("compare", "Comparing", found, lambda _: _compare(run))
+    if options.reference is not None:
+        found = out_dir / COMPARED / "compare.json"
+        compared = step("compare", "Comparing", found, lambda _: _compare(adjusted))
     layers = out_dir / "map.gpkg"
     try:
         vectors.check_layers(layers, overwrite=True)
     except SettingError as error:
         say(f"{'map':<9} not written: {error}")
     else:
-        draw = partial(maps.write_map, layers, run, corrected, compared)
+        draw = partial(maps.write_map, layers, adjusted, corrected, compared)
         step("map", "Drawing the map", layers, lambda _: draw())
     step(
         "report", "Writing the report", out_dir / PAGE,
-        lambda _: report_run(run, inputs, first, corrected, compared),
+        lambda _: report_run(adjusted, inputs, first, corrected, compared),
         words=lambda page: f": {page['in_short']}",
     )  # fmt: skip
-    return out_dir / PAGE
+    return RunResults(out_dir)
 
 
-def _opened(request: Request, out_dir: Path) -> Record:
+def _checked(options: RunOptions) -> RunOptions:
+    """Return options that ``run.json`` can hold; SettingError if some exclude each other."""
+    texts = dict[str, Any]()
+    for name in ("cameras", "water", "adjusted_from", "gcps"):
+        value = getattr(options, name)
+        if not isinstance(value, str | os.PathLike | Real | None):
+            raise SettingError(
+                "option.type",
+                f"run: {name} is a {type(value).__name__}. Give a file or text, which run.json can"
+                " keep, or use correct_file.",
+                option=name,
+            )
+        texts[name] = None if value is None else str(value)
+    if options.water is None:
+        raise SettingError("water.missing", "water is missing: give the water surface.")
+    with_index(options)
+    wrong, surveys = "", _surveys(options)
+    if options.adjust == "no" and surveys:
+        wrong = f"{surveys[0]} is for an adjustment only. Remove it, or use auto."
+    elif options.adjust == "yes" and _why_not_adjust(options):
+        wrong = f"{_why_not_adjust(options)}. Remove one of the two options."
+    if wrong:
+        wrong = f"--adjust {options.adjust}: {wrong}"
+        raise SettingError("option.conflict", wrong, option="adjust", value=options.adjust)
+    return replace(options, **texts)
+
+
+def _surveys(options: RunOptions) -> list[str]:
+    """Return the given options that only an adjustment uses."""
+    return [name for name in ("gcps", "gnss", "lens") if getattr(options, name) is not None]
+
+
+def _why_not_adjust(options: RunOptions) -> str:
+    """Return why an adjustment is impossible with the other options; empty if it is possible."""
+    if options.cameras is None:
+        return "there are no cameras to adjust"
+    if options.adjusted_from is not None:
+        return "with adjusted-from the cameras are adjusted already"
+    if options.tide is not None:
+        return "a tide gives each image its own water level, and an adjustment has one"
+    return ""
+
+
+def _opened(run: RunFolder) -> Record:
     """Return the record of a folder, made where it is missing; refuse one of another run."""
-    if not out_dir.parent.is_dir():
-        raise SettingError(
-            "output.no_folder",
-            f"{out_dir}: the folder {out_dir.parent} does not exist. Make it first.",
-            path=out_dir,
-        )
-    out_dir.mkdir(exist_ok=True)
-    record = Record(out_dir / RECORD, request.record(), request.watched(out_dir))
-    if not (request.overwrite or record.resumes) and any(out_dir.iterdir()):
-        changed = ", ".join(record.changed) or "input file, or other files"
+    folder = run.folder
+    if not folder.parent.is_dir():
+        sentence = f"{folder}: the folder {folder.parent} does not exist. Make it first."
+        raise SettingError("output.no_folder", sentence, path=folder)
+    folder.mkdir(exist_ok=True)
+    record = Record(run)
+    if not (run.options.overwrite or record.resumes) and any(folder.iterdir()):
         raise SettingError(
             "run.other",
-            f"{out_dir}: holds a run with another {changed}. Add --overwrite to replace it, or give"
-            " another folder.",
-            path=out_dir,
-            changed=record.changed,
+            f"{folder}: holds a run with other options or input files, or other files. Add"
+            " --overwrite to replace them, or give another folder.",
+            path=folder,
         )
     return record
 
 
-def adjust_first(request: Request, folder: Path, files: list[Path]) -> Plain:
+def adjust_first(run: RunFolder, files: list[Path]) -> Plain:
     """Adjust the cameras of a run into its folder if asked, or if they need it.
 
     The files are inputs of the run, which the adjustment must not replace.
@@ -243,35 +253,36 @@ def adjust_first(request: Request, folder: Path, files: list[Path]) -> Plain:
     Returns `model`, the file or folder with the cameras in that of the adjustment, None without
     one; `why`; and `absorbed`, whether the poses absorbed refraction, None if that is not known.
     """
-    model, why, absorbed = None, "", None
+    model, why, absorbed, options = None, "", None, run.options
     try:
-        why, absorbed = _decide(request)
-        if absorbed or request.adjust == "yes":
-            model = _adjust(request, folder / FOLDER, files)
+        why, absorbed = _decide(run)
+        if absorbed or options.adjust == "yes":
+            model = _adjust(run, files)
     except PcfixError as error:
-        if request.adjust == "yes" or request.only_to_adjust:
+        if options.adjust == "yes" or _surveys(options):
             raise
         why = str(error)  # of a file that cannot be read, which stops the correction too
     return {"model": model, "why": why, "absorbed": absorbed}
 
 
-def _decide(request: Request) -> tuple[str, bool | None]:
+def _decide(run: RunFolder) -> tuple[str, bool | None]:
     """Return why the cameras are adjusted, or not; and whether their poses absorbed refraction.
 
     Without a datum that is not asked. Signs of absorbed refraction do not include the survey with
     which the result is compared: the cloud must not depend on it.
     """
-    if request.adjust != "auto" or request.cameras is None:
-        return ("set by the user" if request.adjust == "yes" else ""), None
-    if request.why_not_adjust:
-        return request.why_not_adjust, None
-    inputs, view = request.part(Inputs), view_of(request.source)
+    options = run.options
+    if options.adjust != "auto" or options.cameras is None:
+        return ("set by the user" if options.adjust == "yes" else ""), None
+    if _why_not_adjust(options):
+        return _why_not_adjust(options), None
+    inputs, view = options.part(Inputs), view_of(run.source)
     # the correction shows the warnings
     with warnings.catch_warnings(action="ignore", category=PcfixWarning):
         cameras = inputs.block(view.crs)[0]
-        if request.gnss is not None:
-            cameras = read_gnss(request.gnss, cameras)
-        elif request.gcps is None and not has_datum(cameras, str(request.cameras)):
+        if options.gnss is not None:
+            cameras = read_gnss(options.gnss, cameras)
+        elif options.gcps is None and not has_datum(cameras, str(options.cameras)):
             return (
                 "the camera file has no GNSS positions better than"
                 f" {MOST_STATED_M:g} m, and neither --gnss nor --gcps is given"
@@ -280,8 +291,8 @@ def _decide(request: Request) -> tuple[str, bool | None]:
         if isinstance(water, WaterDimension):
             return f"the water {water} is known at points of the cloud only", None
         sign = diagnose_inputs(
-            inputs, cameras, view, water, with_index(request).refractive_index, gcps=request.gcps,
-            in_passing=not request.only_to_adjust,
+            inputs, cameras, view, water, with_index(options).refractive_index, gcps=options.gcps,
+            in_passing=not _surveys(options),
         ).decided_by  # fmt: skip
     if sign is None:
         why = "nothing shows whether the poses have absorbed the refraction (--adjust yes adjusts)"
@@ -290,42 +301,42 @@ def _decide(request: Request) -> tuple[str, bool | None]:
     return f"the poses {have} absorbed the refraction: {sign.words}", sign.speaks
 
 
-def _adjust(request: Request, target: Path, files: list[Path]) -> str:
+def _adjust(run: RunFolder, files: list[Path]) -> str:
     """Adjust, and return which of `MODELS` has the cameras."""
+    target, options = run.folder / FOLDER, run.options
     check_folder(target, files, mark=SUMMARY)  # the adjustment replaces it
     given = AdjustOptions(
-        gcps=request.gcps, gnss=request.gnss, lens=request.lens,
-        index=with_index(request).refractive_index, overwrite=True,
+        gcps=options.gcps, gnss=options.gnss, lens=options.lens,
+        index=with_index(options).refractive_index, overwrite=True,
     )  # fmt: skip
-    with threads(request.jobs):
-        adjust_into(target, request.part(Inputs), given, request.source)
+    with threads(options.jobs):
+        adjust_into(target, options.part(Inputs), given, run.source)
     return next(name for name in MODELS if (target / name).exists())
 
 
 def _correct(run: RunFolder, progress: Progress | None) -> Plain:
     """Correct the cloud."""
-    options = replace(run.request, overwrite=True).part(CorrectOptions)
-    if options.check_depths is not None:
-        options = replace(options, save_regression=run.regression)
-    source = run.request.source
-    return vars(correct_file(source, run.corrected, options=options, progress=progress))
+    options = replace(run.options, overwrite=True).part(CorrectOptions)
+    target = run.path_of("corrected")
+    return vars(correct_file(run.source, target, options=options, progress=progress))
 
 
 def _compare(run: RunFolder) -> Plain:
     """Compare the cleaned cloud with the reference, and write a raster of differences."""
-    request, reference = run.request, run.request.surveyed
+    folder = run.folder / COMPARED
     result = compare_clouds(
-        run.cleaned_cloud, reference, out_dir=run.compare, sections=maps.SECTIONS,
-        overwrite=True, **vars(request.part(DistanceOptions)),
+        run.cleaned, run.reference, out_dir=folder, sections=maps.SECTIONS, overwrite=True,
+        **vars(run.options.part(DistanceOptions)),
     )  # fmt: skip
-    if request.has_surface:
-        heights = Path(str(reference))
-        if is_cloud(reference):
-            heights = run.compare / REFERENCE_DSM
+    if run.has_surface:
+        heights = Path(str(run.reference))
+        if is_cloud(run.reference):
+            heights = folder / REFERENCE_DSM
             # the cells are those of the cloud, whatever a warning says
             with warnings.catch_warnings(action="ignore", category=PcfixWarning):
-                grid_dsm(reference, heights, resolution=run.resolution_m, overwrite=True)
-        rasters.write_dod(run.folder / SURFACE, heights, run.dod, overwrite=True)
+                grid_dsm(run.reference, heights, resolution=run.resolution_m, overwrite=True)
+        difference = run.folder / DIFFERENCE
+        rasters.write_dod(run.folder / SURFACE, heights, difference, overwrite=True)
     sections = [
         {"distance_m": one.distance_m, "heights_m": one.heights_m} for one in result.sections
     ]
@@ -344,13 +355,9 @@ class RunResults:
     folder: Path
 
     @cached_property
-    def _steps(self) -> dict[str, Plain]:
-        """The result of each step, from ``run.json``."""
-        steps = read_record(self._file(RECORD))["steps"]
-        if "report" not in steps:
-            sentence = "the run did not finish. Run it again; it resumes."
-            raise bad_file(self.folder, "run.unfinished", sentence)
-        return {name: step["result"] for name, step in steps.items()}
+    def _steps(self) -> Plain:
+        """The result of each step."""
+        return finished_steps(self.folder)
 
     @property
     def report(self) -> Path:
@@ -387,46 +394,19 @@ class RunResults:
         """Vertical uncertainty of the bed at 95 %, shape (y, x), metres, predicted."""
         return rasters.open_array(self._file(maps.UNCERTAINTY))
 
-    def contours(self, interval: float | None = None) -> GeoDataFrame:
-        """Return lines of equal depth, ``depth_m``.
-
-        Parameters
-        ----------
-        interval : float, optional
-            Metres. Default that of ``map.gpkg``, no finer than the depth is known.
-        """
-        if interval is None:
-            return self.layer("depth_contours")
-        if not interval > 0.0:
-            raise SettingError(
-                "option.range", f"interval {interval:g} must be above 0.",
-                option="interval", value=interval, above=0,
-            )  # fmt: skip
-        return vectors.frame_of(maps.contours_layer(self.folder, interval), self.depth.rio.crs)
-
-    @property
-    def waterline(self) -> GeoDataFrame:
-        """Where the water meets the corrected cloud, with its standard error in plan, metres."""
-        return self.layer("waterline")
-
     def layer(self, name: str) -> GeoDataFrame:
-        """Return a layer of ``map.gpkg``: waterline, corrected_area, cross_sections, cameras ..."""
+        """Return a layer of ``map.gpkg``: depth_contours, waterline, corrected_area, cameras ..."""
         return vectors.read_frame(self._file("map.gpkg"), name)
 
     @property
     def tables(self) -> dict[str, DataFrame]:
         """Tables of the comparison by name, metres; empty where there was no reference.
 
-        ``statistics`` of the errors before and after; ``depth_bins`` and ``shore_bins``, errors by
-        depth and by distance from the shore; ``section_01`` and so on, heights along a line.
+        ``depth_bins`` and ``shore_bins``, errors by depth and by distance from the shore;
+        ``section_01`` and so on, heights along a line.
         """
-        if not self.compared:
-            return {}
-        files = sorted((self.folder / "compare").glob("*.csv"))
-        rows = [{"of": name, **figures} for name, figures in signed_statistics(self.compared)]
-        pandas = analysis_library("pandas")
-        statistics = pandas.json_normalize(rows).set_index("of")
-        return {"statistics": statistics, **{one.stem: pandas.read_csv(one) for one in files}}
+        files = sorted((self.folder / COMPARED).glob("*.csv")) if self.compared else []
+        return {one.stem: analysis_library("pandas").read_csv(one) for one in files}
 
     def _file(self, name: str) -> Path:
         path = self.folder / name

@@ -404,7 +404,7 @@ def json_text(content: dict[str, Any]) -> str:
 def check_summary(options: Any, inputs: Iterable[File] = ()) -> None:
     """Refuse small outputs that could not be written, before the work begins."""
     known = list(inputs)
-    for name in ("plot", "summary", "save_regression"):
+    for name in ("plot", "summary"):
         path = getattr(options, name, None)
         if path is not None:
             known.append(files.check_output(path, overwrite=options.overwrite, inputs=known))

@@ -1,33 +1,24 @@
-"""The water surface of a cloud: read, fitted to a shoreline, or found in it; and its shoreline."""
+"""The water surface of a cloud: read, fitted to shoreline points, or found in it."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import shapely
 
 from pcfix.errors import InputError, PcfixWarning, SettingError, coded
 from pcfix.flow.runner import read_ahead
-from pcfix.grid.shoreline import NearWater, Shoreline
 from pcfix.io.clouds import CloudView as CloudView
 from pcfix.io.clouds import Points as Points
 from pcfix.io.clouds import points_of as points_of
 from pcfix.io.las.source import metric_crs, stated_crs
 from pcfix.io.tiles import CloudFiles, open_cloud
-from pcfix.io.vectors import (
-    SHORE_RADIUS_M,
-    Layer,
-    check_layers,
-    is_vector_file,
-    read_shoreline,
-    write_layers,
-)
+from pcfix.io.vectors import SHORE_RADIUS_M, is_vector_file, read_shoreline
 from pcfix.io.water import rasters_of_images, read_image_raster, read_water
 from pcfix.label.labelling import Part
 from pcfix.model import (
@@ -41,7 +32,6 @@ from pcfix.model import (
     WaterRaster,
     WaterSurface,
 )
-from pcfix.options.correct import LEVEL_M
 from pcfix.options.declare import File
 from pcfix.options.shared import WaterOptions
 from pcfix.water.surface import FoundSurface, OwnWater, build_fields, surface_above
@@ -302,41 +292,3 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
     for note in coded("water.points", notes):
         warnings.warn(note, stacklevel=2)
     return replace(found, notes=(*map(str, notes), *found.notes))
-
-
-def check_shoreline(path: File | None, *, overwrite: bool, inputs: Iterable[File] = ()) -> None:
-    """Check that the file can be written, before anything is computed."""
-    if path is not None:
-        check_layers(path, overwrite=overwrite, inputs=inputs)
-
-
-def write_shoreline(
-    path: File, points: NearWater, water: FoundSurface, crs: Any, *, overwrite: bool,
-    sigma_level_m: float | None = None,
-) -> dict[str, Any]:  # fmt: skip
-    """Write the lines of a cloud in its CRS, and return their figures for the summary.
-
-    The standard error of the water's height is `sigma_level_m`, else that of a fit, else `LEVEL_M`.
-    """
-
-    def sigma(xy: FloatArray) -> FloatArray:
-        fitted = water.sigma_at(xy) if sigma_level_m is None else None
-        stated = LEVEL_M if sigma_level_m is None else sigma_level_m
-        return np.full(len(xy), stated) if fitted is None else fitted
-
-    layer = shoreline_layer("shoreline", points.lines(sigma))
-    write_layers(path, [layer], crs, overwrite=overwrite)
-    lengths, sigmas = layer.values["length_m"], layer.values["sigma_m"]
-    length = float(lengths.sum())
-    mean = float(np.sqrt(sigmas**2 @ lengths / length)) if length else None
-    return {"path": str(path), "lines": len(lengths), "length_m": length, "sigma_m": mean}
-
-
-def shoreline_layer(name: str, lines: Sequence[Shoreline], style: str = "") -> Layer:
-    """Return lines as a layer, with level, standard error across the line, and length."""
-    values = {
-        figure: np.array([getattr(one, figure) for one in lines], np.float64)
-        for figure in ("level_m", "sigma_m", "length_m")
-    }
-    geometries = [shapely.linestrings(one.xy) for one in lines]
-    return Layer(name, "LineString", geometries, values, style)

@@ -8,14 +8,13 @@ import numpy as np
 
 from pcfix.errors import plain, shown_once
 from pcfix.flow.runner import check_summary, write_summary
-from pcfix.flow.surfaces import check_shoreline, find_surface, sample_of, view_of, write_shoreline
-from pcfix.grid.shoreline import NearWater
+from pcfix.flow.surfaces import find_surface, sample_of, view_of
 from pcfix.io.files import check_input
 from pcfix.model import FloatArray, WaterDimension
 from pcfix.options.correct import WaterCheckOptions
 from pcfix.options.declare import taken
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, draw_cloud, label_plan, new_figure
-from pcfix.report.text import Plain, RowTable, aligned, filled, shoreline_rows
+from pcfix.report.text import Plain, RowTable, aligned, filled
 from pcfix.water.auto import WaterProposal
 from pcfix.water.fit import ShoreFit
 from pcfix.water.river import RiverFit
@@ -56,24 +55,15 @@ def check_water(
     cloud = given.cloud
     inputs = [] if cloud is None else [cloud]
     check_summary(given, inputs)
-    check_shoreline(given.shoreline, overwrite=given.overwrite, inputs=inputs)
     view = None if cloud is None else view_of(check_input(cloud))
     found = shown_once(lambda: find_surface(spec, given, view), lambda found: found.notes)
-    sample, below, unknown, shoreline = np.zeros((0, 3)), None, None, None
+    sample, below, unknown = np.zeros((0, 3)), None, None
     if view is not None:
         sample = sample_of(view, SAMPLE_POINTS).xyz
         if not isinstance(found.surface, WaterDimension):
             height = surface_above(found.surface, sample, None).height_m
             unknown = float(np.mean(~np.isfinite(height)))
             below = float(np.mean(sample[:, 2] < height))
-    if view is not None and given.shoreline is not None:
-        near = NearWater()
-        for one in view.chunks(found.surface):
-            above = surface_above(found.surface, one.xyz, one.heights)
-            near += NearWater.of(one.xyz, one.xyz[:, 2] - above.height_m)
-        shoreline = write_shoreline(
-            given.shoreline, near, found, view.crs, overwrite=given.overwrite
-        )
     points = None
     if isinstance(found, ShoreFit):
         columns = found.points, found.residual_m, found.accepted
@@ -89,7 +79,6 @@ def check_water(
         "cloud": None if view is None else view.name,
         "share_below": below,  # of the points of the cloud
         "share_unknown": unknown,  # of those without a surface above them
-        "shoreline": shoreline,
         "notes": list(map(str, found.notes)),
     })  # fmt: skip
     write_summary(given, figures, lambda: water_figure(found, sample))
@@ -124,7 +113,6 @@ def water_text(report: WaterReport) -> str:
         words = f"{below:.1f} % of the points of {r['cloud']} are below the surface"
         words += f"; {unknown:.1f} % have no surface above them" if unknown else ""
         rows.append(("Cloud", words))
-    rows += shoreline_rows(r["shoreline"])
     return aligned(f"Water surface ({r['water']}): {r['surface']}", rows, found.notes)
 
 

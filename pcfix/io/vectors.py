@@ -348,9 +348,3 @@ def write_layers(
 def read_frame(path: Path, layer: str) -> GeoDataFrame:
     """Read a layer of a GeoPackage with GeoPandas."""
     return analysis_library("geopandas").read_file(check_input(path), layer=layer)
-
-
-def frame_of(layer: Layer, crs: Any) -> GeoDataFrame:
-    """Return a layer that has not been written yet for GeoPandas."""
-    frame = analysis_library("geopandas").GeoDataFrame
-    return frame(layer.values, geometry=list(layer.geometries), crs=crs)

@@ -45,6 +45,8 @@ if TYPE_CHECKING:
     from rasterio.io import DatasetReader
     from rasterio.transform import Affine
 
+    from pcfix.water.surface import Tin
+
 KINDS = (
     "a level such as 0.37, plane:a,b,c, dim:NAME, a mesh (.obj, .ply) or a raster of heights (.tif)"
 )
@@ -107,7 +109,7 @@ def read_water(
 
 def _mesh(path: Path) -> WaterMesh:
     """Read a mesh that is a height field."""
-    from pcfix.water.surface import build_tin, in_two_sheets
+    from pcfix.water.surface import in_two_sheets
 
     read = _read_obj if path.suffix.lower() == ".obj" else _read_ply
     vertices, triangles = read(path)
@@ -118,17 +120,23 @@ def _mesh(path: Path) -> WaterMesh:
         sentence = "a vertex is missing or not finite. Export it again."
         raise bad_file(path, "water.mesh_damaged", sentence)
     mesh = WaterMesh(vertices, triangles, path.name)
-    try:
-        tin = build_tin(mesh)
-    except GeometryError as error:
-        raise bad_file(path, "water.mesh_flat", str(error)) from None
     # holes, edges of three facets and facets that overlap at one height do not matter
-    double, area_m2 = in_two_sheets(tin)
+    double, area_m2 = in_two_sheets(_tin_of(path, mesh))
     share = float(area_m2[double].sum() / area_m2.sum())
     if share > MOST_OVERLAP:
         sentence = f"{100.0 * share:.0f} % of the mesh is above another part. Export one surface."
         raise bad_file(path, "water.mesh_overlap", sentence, share=share)
     return mesh
+
+
+def _tin_of(path: File, mesh: WaterMesh) -> Tin:
+    """Return the facets of a mesh; an `InputError` if none has an area in plan."""
+    from pcfix.water.surface import build_tin
+
+    try:
+        return build_tin(mesh)
+    except GeometryError as error:
+        raise bad_file(path, "water.mesh_flat", str(error)) from None
 
 
 def _read_obj(path: Path) -> tuple[FloatArray, IntArray]:
@@ -252,6 +260,7 @@ def read_water_raster(
     if len(mesh.triangles) == 0:
         sentence = "has no height near the cloud. Check its CRS and its nodata value."
         raise bad_file(name, "water.raster_empty", sentence)
+    _tin_of(name, mesh)
     return mesh
 
 

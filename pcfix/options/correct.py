@@ -18,7 +18,6 @@ from pcfix.options.shared import (
     OverwriteOption,
     Panel,
     PortOptions,
-    ShorelineOption,
     SummaryOption,
     SurveyOptions,
     TileOptions,
@@ -28,7 +27,6 @@ from pcfix.options.shared import (
 )
 from pcfix.options.steps import DistanceOptions, ReferenceOption
 
-Unsure = Literal["keep", "withhold"]
 Dimensions = Literal["all", "minimal", "none"]
 Method = Literal[
     "auto", "snell", "consistent", "shan", "butler", "murase", "dietrich", "factor", "regression"
@@ -74,32 +72,15 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     """Maximum incidence angle of a ray, from the surface normal; none for no limit. auto: no limit,
     but 35 for snell and the formulas if the cloud was clearly reconstructed without rays at larger
     angles. [deg] [default: auto; must be given for poses without a lens]"""
-    max_cameras: int | None = option(None, with_cameras=True, least=1)
-    """Maximum number of rays per point; those closest to nadir are used. [default: no limit]"""
     occlusion: Literal["auto", "on", "off"] = option("auto", with_cameras=True)
     """Skip cameras from which the cloud occludes the point; auto: if there are oblique images."""
-    exact: bool = option(False)
-    """No effect: every point is solved exactly. The option remains for older scripts."""
     depth_factor: float | str | None = option(
         None, least=1, most=3, needs="method factor", parse=number_or("auto"), metavar="N"
     )
     """Ratio of true to apparent depth; auto: from the height, focal length and base of the cameras.
     [default: the refractive index]"""
-    least_r2: float = option(0.5, least=0, most=1)
-    """Minimum r2 of the fit of --method regression."""
     index_from: str = ""
     """The water of the index, if it was not given as a number; not an option."""
-
-    def check(self) -> None:
-        """Check the method for a single ray."""
-        if self.max_cameras == 1 and self.method not in ("butler", "dietrich"):
-            raise SettingError(
-                "option.range",
-                "max-cameras 1 is not enough: an intersection needs two rays. Only --method butler"
-                " and dietrich can use one.",
-                option="max_cameras",
-                value=1,
-            )
 
     @property
     def needs_cameras(self) -> bool:
@@ -164,9 +145,6 @@ class BudgetOptions(OptionSet, panel=Panel.BUDGET):
 class RefractionOptions(BudgetOptions, MethodOptions, panel=Panel.OUTPUT):
     """All options that affect the correction of points."""
 
-    unsure: Unsure = option("keep", with_cameras=True)
-    """Corrected points whose rays all have incidence angles above 35 deg, without a view list: keep
-    them, or flag them as withheld."""
     deep: bool = option(False, panel=Panel.WATER)
     """Accept depths of more than 60 m, which usually mean a wrong water level."""
 
@@ -178,8 +156,8 @@ class PointsOptions(RefractionOptions, WaterPerImageOption):
 class ScienceOptions(RefractionOptions, panel=Panel.OUTPUT):
     """All options that affect a corrected file; the file records them."""
 
-    uncorrected: Literal["withhold", "keep", "drop"] = option("withhold", basic=True)
-    """Submerged points with fewer than two usable rays: flag, keep or drop them."""
+    uncorrected: Literal["withhold", "keep"] = option("withhold", basic=True)
+    """Submerged points with fewer than two usable rays: flag them as withheld, or keep them."""
     dimensions: Dimensions = option("all")
     """Extra dimensions to write; 'pcfix restore' needs all."""
 
@@ -198,13 +176,10 @@ class RasterOutputs(OptionSet, panel=Panel.OUTPUT):
 
 
 class CorrectOptions(
-    RasterOutputs, BandOption, ShorelineOption, TileOptions, SummaryOption, ScienceOptions,
+    RasterOutputs, BandOption, TileOptions, SummaryOption, ScienceOptions,
     WaterPerImageOption, MaskOption, LandRules, InputOptions, panel=Panel.OUTPUT,
 ):  # fmt: skip
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
-
-    save_regression: File | None = option(None, writes=True, needs="check_depths")
-    """JSON file for the line fitted to --check-depths."""
 
 
 class LabelRules(LandRules, panel=Panel.WATER):
@@ -285,13 +260,11 @@ class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions, panel=Pane
     """LAS or LAZ cloud under the water surface."""
     plot: File | None = option(None, writes=True, basic=True)
     """PNG of points and residuals, or of the evidence for auto."""
-    shoreline: File | None = option(None, writes=True, basic=True, needs="cloud")
-    """GeoPackage (.gpkg) for the shoreline of the cloud, with its standard error."""
 
 
 class RunOptions(
-    BandOption, ReferenceOption, ShorelineOption, TileOptions, DistanceOptions, SurveyedOptions,
-    RefractionOptions, MaskOption, LandRules, SurveyOptions, panel=Panel.OUTPUT,
+    BandOption, ReferenceOption, TileOptions, DistanceOptions, SurveyedOptions, RefractionOptions,
+    MaskOption, LandRules, SurveyOptions, panel=Panel.OUTPUT,
 ):  # fmt: skip
     """The options of ``pcfix run``; ``run.json`` records all that affect its results."""
 

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from contextlib import suppress
 from typing import Literal
 
 from pcfix.options.correct import BudgetOptions
-from pcfix.options.declare import File, OptionSet, numbers, option
+from pcfix.options.declare import OptionSet, numbers, option
 from pcfix.options.shared import IndexOptions, OverwriteOption, Panel, SummaryOption
 
 BlockKind = Literal["nadir", "oblique"]
 BedKind = Literal["shore", "flat", "slope", "steps", "river"]
-
-_MOST_DEPTHS = 100
 
 
 class FlightOptions(OptionSet, panel=Panel.FLIGHT):
@@ -109,23 +105,6 @@ class DemoOptions(OverwriteOption, panel=Panel.OUTPUT):
     """Number of points in each scene."""
 
 
-def _depths(text: str) -> tuple[float, ...]:
-    """Return the depths of a list or of FROM:TO:STEP; one depth stands for five up to it."""
-    if ":" in text:
-        first = last = step = math.nan
-        with suppress(ValueError):
-            first, last, step = (float(word) for word in text.split(":"))
-        count = (last - first) / step + 1.0 + 1e-9 if step > 0.0 else math.nan
-        if not (first <= last and 1.0 <= count < _MOST_DEPTHS + 1):
-            raise ValueError(f"must be FROM:TO:STEP upwards, with at most {_MOST_DEPTHS} depths")
-        found = tuple(round(first + i * step, 9) for i in range(int(count)))
-    else:
-        found = numbers(text)
-    if len(found) == 1:
-        found = tuple(found[0] * share for share in (0.2, 0.4, 0.6, 0.8, 1.0))
-    return found
-
-
 class PlanOptions(OverwriteOption, SummaryOption, BudgetOptions, IndexOptions, panel=Panel.FLIGHT):
     """The options of ``pcfix plan``."""
 
@@ -144,10 +123,8 @@ class PlanOptions(OverwriteOption, SummaryOption, BudgetOptions, IndexOptions, p
     )
     """Focal length, sensor width and sensor height in mm, and number of pixels along the width."""
     depth: tuple[float, ...] = option(
-        (0.5, 1.0, 2.0, 3.0, 5.0), basic=True, above=0, parse=_depths, metavar="M,M"
+        (0.5, 1.0, 2.0, 3.0, 5.0), basic=True, above=0, parse=numbers, metavar="M,M"
     )
-    """Depths of the bed: the greatest, a list, or FROM:TO:STEP. [m]"""
+    """Depths of the bed. [m]"""
     gnss_sigma: float = option(0.03, above=0)
     """Standard deviation of GNSS positions of the images, along each axis. [m]"""
-    plot: File | None = option(None, writes=True, basic=True, panel=Panel.OUTPUT)
-    """PNG of the block and of the errors by depth."""

@@ -162,8 +162,6 @@ class SurveyOptions(ViewOptions, CamerasOptions, NeededOptions, panel=Panel.CAME
     transferred to the adjusted poses."""
     check_depths: File | None = option(None, needs="method regression", panel=Panel.METHOD)
     """Measured depths for --method regression: CSV x,y,depth. [m]"""
-    regression: File | None = option(None, needs="method regression", panel=Panel.METHOD)
-    """Line fitted to another cloud, from --save-regression; replaces --check-depths."""
     tide: File | None = option(None, with_cameras=True, panel=Panel.WATER, needs="water")
     """Tide table, CSV time,level_m: each image gets the water level at its time."""
     image_times: File | None = option(None, with_cameras=True, panel=Panel.WATER, needs="tide")
@@ -215,10 +213,3 @@ class SummaryOption(OptionSet, panel=Panel.OUTPUT):
 
     summary: File | None = option(None, writes=True, basic=True)
     """JSON file for the summary."""
-
-
-class ShorelineOption(OptionSet, panel=Panel.OUTPUT):
-    """The shoreline of the cloud as a file."""
-
-    shoreline: File | None = option(None, writes=True, basic=True, needs="water")
-    """GeoPackage (.gpkg) for the shoreline of the cloud, with its standard error."""

@@ -78,7 +78,6 @@ from pcfix.refract.batch import (
     require_orientation,
     warn_of_unsolved,
 )
-from pcfix.refract.choice import ANY_NUMBER
 from pcfix.refract.rays import line_terms, nearest_point
 from pcfix.refract.tiling import TILE, are_same, corners_of, near_cameras, spatial_order
 
@@ -107,7 +106,6 @@ class Rule(NamedTuple):
     """Which rays count, and what is computed of them."""
 
     least_cosine: float  # of the largest incidence angle, in air at the inner face
-    most: int  # rays per point
     is_consistent: bool
 
 
@@ -157,7 +155,6 @@ def correct_through_port(
     limit = settings.limit_deg
     rule = Rule(
         least_cosine=0.0 if limit is None else float(np.cos(np.radians(limit))),
-        most=settings.max_cameras or ANY_NUMBER,
         is_consistent=settings.method == "consistent",
     )
     sigmas = Sigmas(
@@ -232,11 +229,11 @@ def _correct(
 def _usable(
     candidates: IntArray, point: Vector, rig: Rig, frames: Frames, rule: Rule, through: bool
 ) -> IntArray:
-    """Return the cameras that give a ray, in their order: at most `most`, the steepest.
+    """Return the cameras that give a ray, in their order.
 
     The point is imaged along a straight line, or `through` the port.
     """
-    usable, cosine = np.empty(candidates.size, np.int64), np.empty(candidates.size)
+    usable = np.empty(candidates.size, np.int64)
     window, k = window_of(rig.port), 0
     for c in candidates:
         r, x = rig.rotations[c], minus(point, row_of(rig.centres, c))
@@ -246,13 +243,9 @@ def _usable(
             x = transposed_times(r, w)
         steep = cosine_at_port(window, w)
         if steep > 0.0 and steep >= rule.least_cosine and holds(frames, c, scaled(-1.0, x)):
-            usable[k], cosine[k] = c, steep
+            usable[k] = c
             k += 1
-    if k <= rule.most:
-        return usable[:k]
-    ranked = np.argsort(-cosine[:k], kind="mergesort")[: rule.most]
-    ranked.sort()
-    return usable[ranked]
+    return usable[:k]
 
 
 @device(allocates=True)

@@ -197,18 +197,11 @@ class Batch:
             n=survey.settings.refractive_index,
         )
 
-    def angles_deg(self) -> FloatArray:
-        """Return the smallest and the largest incidence angle of each point's rays, shape (m, 2).
-
-        In air; 90 and 0 where there is no ray.
-        """
-        cosine = np.empty((len(self), 2))
+    def incidence_deg(self) -> FloatArray:
+        """Return the largest incidence angle in air of each point's rays, shape (m,); 0 without."""
+        cosine = np.empty(len(self))
         in_tiles(_incidence, len(self), self.chosen(), cosine)
         return np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
-
-    def seen_flat(self) -> BoolArray:
-        """Return which points have rays beyond `FLAT_DEG` from the normal only."""
-        return np.asarray((self.counts > 0) & (self.angles_deg()[:, 0] > FLAT_DEG))
 
     def result(
         self,
@@ -227,7 +220,7 @@ class Batch:
             ray_count=np.where(moved, self.counts, 0).astype(np.int32),
             ray_miss_m=zero if ray_miss_m is None else np.where(moved, ray_miss_m, 0.0),
             sigma_z_m=zero,
-            incidence_deg=np.where(moved, self.angles_deg()[:, 1], 0.0),
+            incidence_deg=np.where(moved, self.incidence_deg(), 0.0),
             camera_used=used,
         )
 
@@ -254,8 +247,8 @@ def stacked(batches: list[Batch]) -> Batch:
 class Intersection(NamedTuple):
     """The result for m submerged points; see `pcfix.Correction` for the meaning of each.
 
-    Methods leave `sigma_z_m`, `covariance_m2` and `unsure` to `pcfix.refract.methods.correct`,
-    except for some that know a scatter.
+    Methods leave `sigma_z_m` and `covariance_m2` to `pcfix.refract.methods.correct`, except for
+    some that know a scatter.
     """
 
     shift_m: FloatArray
@@ -266,7 +259,6 @@ class Intersection(NamedTuple):
     incidence_deg: FloatArray
     camera_used: BoolArray
     covariance_m2: FloatArray | None = None
-    unsure: BoolArray | None = None
     ambiguity_m: FloatArray | None = None  # of Z, by the choice among groups of depth maps
 
     def take(self, rows: IntArray | BoolArray) -> Intersection:
@@ -285,14 +277,13 @@ class Intersection(NamedTuple):
 
 @kernel
 def _incidence(span: Span, points: Chosen, cosine: FloatArray) -> None:
-    """Write the largest and the smallest cosine of the incidence angles of each point's rays."""
+    """Write the cosine of the largest incidence angle of each point's rays."""
     for i in range(*span):
-        most, least, normal = 0.0, 1.0, normal_above(points, i)
+        least, normal = 1.0, normal_above(points, i)
         for at in range(points.start[i], points.start[i + 1]):
             e = minus(row_of(points.centres, points.camera[at]), row_of(points.xyz, i))
-            along = dot(normal, e) / np.sqrt(dot(e, e))
-            most, least = max(most, along), min(least, along)
-        cosine[i, 0], cosine[i, 1] = most, least
+            least = min(least, dot(normal, e) / np.sqrt(dot(e, e)))
+        cosine[i] = least
 
 
 def require_orientation(cameras: Cameras, who: str, instead: str = "") -> None:

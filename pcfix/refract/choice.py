@@ -34,7 +34,6 @@ MAX_ANGLE_WITHOUT_FRAMES_DEG = 80.0
 """Cameras without a lens have no frame to leave; nobody matches images as flat as this, and a
 block in another CRS is recognised by it."""
 
-ANY_NUMBER = 2**31
 """More rays than a point can have; a view list may name a camera twice."""
 
 
@@ -56,7 +55,6 @@ class Rule(NamedTuple):
     """Which rays count, and how they are refracted."""
 
     least_cosine2: float  # squared cosine of the largest incidence angle
-    most: int  # rays per point
     bend: float  # 1 / n
 
 
@@ -73,12 +71,11 @@ def rig_of(survey: Survey) -> Rig:
 
 def rule_of(survey: Survey) -> Rule:
     """Return the rule for kernels."""
-    settings = survey.settings
     limit = survey.limit_deg
     if limit is None and survey.cameras.lenses is None:
         limit = MAX_ANGLE_WITHOUT_FRAMES_DEG
     least = 0.0 if limit is None else float(np.cos(np.radians(limit)) ** 2)
-    return Rule(least, settings.max_cameras or ANY_NUMBER, 1.0 / settings.refractive_index)
+    return Rule(least, 1.0 / survey.settings.refractive_index)
 
 
 def is_bent(survey: Survey) -> bool:
@@ -309,8 +306,7 @@ def _choose(
     Their frames were tested before if there are marks. On a mesh or raster the incidence angle is
     that at the piercing point.
     """
-    chosen, cosine2 = np.empty(candidates.size, np.int32), np.empty(candidates.size)
-    is_limited = rule.least_cosine2 > 0.0 or rule.most < candidates.size
+    chosen, is_limited = np.empty(candidates.size, np.int32), rule.least_cosine2 > 0.0
     (x, y, z), upward = three(tile, j), three(tile, 4 * TILE + j)
     k = 0
     for at in range(candidates.size):
@@ -326,21 +322,6 @@ def _choose(
             _, normal = pierce(c, tin, fields, lowered, e, h, upward)
             height = max(dot(normal, e), 0.0)
         if height * height >= rule.least_cosine2 * length2:
-            chosen[k], cosine2[k] = at, height * height / length2
+            chosen[k] = at
             k += 1
-    return chosen[: _keep_steepest(chosen, cosine2, k, rule.most)]
-
-
-@device
-def _keep_steepest(chosen: npt.NDArray[np.int32], cosine2: FloatArray, k: int, most: int) -> int:
-    """Bring the `most` steepest of k cameras to the front, in the order of the cameras."""
-    for j in range(most, k):
-        flattest = 0
-        for i in range(1, most):
-            if cosine2[i] <= cosine2[flattest]:  # of equals the later one goes
-                flattest = i
-        if cosine2[j] > cosine2[flattest]:
-            for i in range(flattest, most - 1):
-                chosen[i], cosine2[i] = chosen[i + 1], cosine2[i + 1]
-            chosen[most - 1], cosine2[most - 1] = chosen[j], cosine2[j]
-    return min(k, most)
+    return chosen[:k]

@@ -168,14 +168,14 @@ def butler(batch: Batch) -> Intersection:
 
         h = h_A tan r / tan(asin(sin r / n))
 
-    for one image (``max_cameras=1``); for more images the mean with equal weights. Straight below a
+    for one image; for more images the mean with equal weights. Straight below a
     camera, where that is 0 / 0, it has its limit n h_A. Over all cameras it is also the method of
     Dietrich (2017), "Bathymetric Structure-from-Motion", Earth Surface Processes and Landforms 42,
     355-364, as his program pyBathySfM computes it.
 
     The paper that they name it after (Butler, Lane, Chandler & Porfiri 2002, Photogrammetric Record
     17(99), 419-439) refracts both image rays of a stereo pair and intersects them again, which is
-    `snell` with ``max_cameras=2``.
+    `snell` with two cameras.
 
     Exact where all rays have the same incidence. Slanting rays determine the apparent depth more
     than steep ones, which a mean ignores: where incidences differ, the result is too shallow, by up

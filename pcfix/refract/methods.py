@@ -83,11 +83,7 @@ def _corrected(batch: Batch) -> Intersection:
         pairs, batch = views, replace(batch, views=cameras_of_pairs(views))
 
     def solved(part: Batch, *listed: Views) -> Intersection:
-        known = with_uncertainty(method(part, *listed), part)
-        if survey.settings.unsure == "keep":
-            return known
-        unsure = (known.outcome == Outcome.CORRECTED) & part.seen_flat() & (batch.views is None)
-        return known._replace(unsure=unsure)
+        return with_uncertainty(method(part, *listed), part)
 
     if name in _IN_FRAME and _takes_all_in_frame(batch):
         found = solved(batch)
@@ -114,8 +110,6 @@ def _takes_all_in_frame(batch: Batch) -> bool:
     survey = batch.survey
     return (
         batch.views is None
-        and survey.settings.max_cameras is None
-        and survey.settings.unsure == "keep"
         and survey.learned.occluder is None
         and survey.learned.matcher is None
         and not is_bent(survey)
@@ -143,7 +137,7 @@ def on_land(survey: Survey) -> Survey:
     return replace(
         survey,
         water=WaterPlane(0.0),
-        settings=replace(survey.settings, index=1.0, dimensions="none", unsure="keep"),
+        settings=replace(survey.settings, index=1.0, dimensions="none"),
         level_offset_m=None,
         learned=survey.learned._replace(bed=None),
         parts={},
@@ -178,18 +172,14 @@ def with_rays(batch: Batch, shift_m: FloatArray | None = None) -> Batch:
     occluder = survey.learned.occluder
     matcher = survey.learned.matcher if batch.views is None else None
     seeds = None if survey.settings.method == "consistent" else matcher
-    whole = survey
-    if seeds is not None or occluder is not None:  # the number is limited in the end
-        whole = replace(survey, settings=replace(survey.settings, max_cameras=None))
+    inner = survey
     if matcher is not None:
-        whole = replace(whole, cameras=without_border(survey.cameras))
-    views = chosen_views(replace(batch, survey=whole), shift_m)
+        inner = replace(survey, cameras=without_border(survey.cameras))
+    views = chosen_views(replace(batch, survey=inner), shift_m)
     if occluder is not None:
         views = visible_cameras(batch.xyz, centres, views, occluder)
     if seeds is not None:
         views = steepest_and_partners(batch.xyz, centres, views, seeds)
-    if seeds is not None or whole.settings != survey.settings:
-        views = chosen_views(replace(batch, views=views))
     return replace(batch, views=views)
 
 

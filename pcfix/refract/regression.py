@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from pcfix.errors import GeometryError
 from pcfix.label.labelling import Part
 from pcfix.model import NOISE_CLASSES, FloatArray, IntArray
-from pcfix.sums import MOST, Sums
 from pcfix.water.fit import NearestPoints
 from pcfix.water.surface import is_submerged
 
@@ -37,7 +35,6 @@ class DepthRegression:
     shallowest_m: float  # of their apparent depths; the line is extrapolated beyond
     deepest_m: float
     covariance_m: float = 0.0  # of intercept and slope
-    source: str = ""  # what the line was fitted to
     outliers: tuple[int, ...] = ()  # which check depths, from 0, are too far off the line
     notes: tuple[str, ...] = ()
 
@@ -58,14 +55,15 @@ class DepthRegression:
         more += 2.0 * self.covariance_m * (apparent_m - nearest)
         return np.asarray(np.sqrt(inside**2 + np.maximum(more, 0.0)))
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return it in plain values."""
-        return asdict(self)
-
-    def __str__(self) -> str:
+    @property
+    def words(self) -> str:
+        """The line and its errors in words."""
+        again = "" if self.cv_rmse_m is None else f", cross-validated {self.cv_rmse_m:.3f} m"
         return (
-            f"depth = {self.intercept_m:.3f} m + {self.slope:.3f} x apparent depth"
-            f" ({self.count} check depths, r2 {self.r2:.3f})"
+            f"Regression: depth = {self.intercept_m:.3f} m + {self.slope:.3f} x apparent depth"
+            f" ({self.count} check depths, r2 {self.r2:.3f}); standard errors"
+            f" {self.intercept_se_m:.3f} m and {self.slope_se:.3f}, RMSE {self.rmse_m:.3f} m"
+            f"{again}."
         )
 
 
@@ -157,36 +155,6 @@ def notes_of(count: int, slope: float) -> tuple[str, ...]:
             " Check the water level and the check depths."
         )
     return tuple(notes)
-
-
-LEAST_BEYOND = 0.05
-"""Share of the points beyond the depths of a line from which its own cloud is worth a note."""
-
-
-@dataclass(frozen=True)
-class BeyondRange(Sums):
-    """Counts of apparent depths beyond those that a line was fitted to."""
-
-    count: int
-    beyond: int
-    deepest_m: float = field(metadata=MOST)
-
-    @classmethod
-    def of(cls, apparent_m: FloatArray, line: DepthRegression) -> BeyondRange:
-        """Return the counts of submerged points, shape (m,)."""
-        beyond = (apparent_m < line.shallowest_m) | (apparent_m > line.deepest_m)
-        return cls(len(apparent_m), int(beyond.sum()), float(apparent_m.max(initial=0.0)))
-
-    def notes(self, line: DepthRegression, least: float = 0.0) -> list[str]:
-        """Return a sentence on them if their share is above `least`."""
-        if self.beyond <= least * self.count:
-            return []
-        return [
-            f"The regression was fitted to apparent depths of {line.shallowest_m:.2f} to"
-            f" {line.deepest_m:.2f} m and is extrapolated for"
-            f" {100.0 * self.beyond / self.count:.1f} % of the submerged points (down to"
-            f" {self.deepest_m:.2f} m), where SigmaZ grows."
-        ]
 
 
 NEIGHBOURS = 16

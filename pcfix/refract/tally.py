@@ -136,7 +136,6 @@ class Tally(Sums):
     errors: UncertaintyTally
     points: int = 0
     water_unknown: int = 0
-    unsure: int = 0
     rays: int = 0
     lowest_water_m: float = field(default=np.inf, metadata=LEAST)
     incidence_deg: float = field(default=0.0, metadata=MOST)
@@ -157,7 +156,6 @@ class Tally(Sums):
             errors=UncertaintyTally.of(correction.sigma_z_m[moved], depth),
             points=len(apparent),
             water_unknown=int((~correction.water_known).sum()),
-            unsure=0 if correction.unsure is None else int(correction.unsure.sum()),
             rays=int(correction.ray_count.sum()),
             lowest_water_m=correction.lowest_water_m,
             incidence_deg=float(correction.incidence_deg.max(initial=0.0, where=moved)),
@@ -186,7 +184,6 @@ class Tally(Sums):
             "corrected": self.corrected,
             "uncorrected": self.uncorrected(),
             "water_unknown": self.water_unknown,
-            "unsure": self.unsure,
             "depth_m": self.depth.by_name("min", "mean", "max"),
             "shift_z_m": self.shift.by_name("mean", "p5", "p95"),
             "rays": self.rays,

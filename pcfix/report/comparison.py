@@ -89,12 +89,6 @@ def errors_of(compared: Plain, *kinds: str) -> list[Errors]:
     return rows
 
 
-def signed_statistics(compared: Plain) -> list[tuple[str, Plain]]:
-    """Return name and statistics of every error that has a sign."""
-    signed = errors_of(compared, "vertical", "bed", "land", "m3c2")
-    return [(one.name, one.found.get("statistics", one.found)) for one in signed]
-
-
 def raw_of(compared: Plain) -> Plain:
     """Return the statistics that the cloud's own errors were taken from, before and after."""
     if compared["own"]["of"] == "bed":

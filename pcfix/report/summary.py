@@ -20,7 +20,7 @@ class Summary(Figures):
         """Why no order of S-44 is claimed, as the whole bed may be off; empty if one is."""
         found = self.reconstruction or {}
         if self.settings["method"] == "regression":  # measured depths hold the bed
-            return "the regression is of another cloud" if "regression" in self.settings else ""
+            return ""
         is_sure = found.get("sure", bool(found.get("views_are")))
         if found.get("method") != "consistent" or not is_sure:
             return "the reconstruction type is uncertain, or the method assumes another one"
@@ -32,7 +32,7 @@ class Summary(Figures):
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON; optional parts only if there are any."""
-        optional = ("labelling", "transfer", "unsure", "poses", "shoreline", "fit", "part")
+        optional = ("labelling", "transfer", "poses", "fit", "part")
         values = {
             name: value for name, value in vars(self).items()
             if name != "notes" and not (name in optional and value is None)

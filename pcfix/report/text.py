@@ -41,12 +41,6 @@ UNIT = re.compile(r"(?<=\d) (?=(?:m|cm|px|deg|%)(?:\W|$))")
 
 _PART: RowTable = ()
 _NO_SURFACE = ("No surface", "{water_unknown:,} points have no water surface", "water_unknown")
-_SHORELINE: RowTable = (
-    ("Shoreline", "{shoreline[lines]} lines, {shoreline[length_m]:.1f} m, standard error in plan"
-     " {shoreline[sigma_m]:.2f} m: {shoreline[path]}", "shoreline[lines]"),
-    ("Shoreline", "none: the water does not intersect the cloud; {shoreline[path]} is empty",
-     "!shoreline[lines]"),
-)  # fmt: skip
 _LABELLING: RowTable = (
     ("Mask", "{labelling[outside_mask]:,} points below the surface are outside of it and count as"
      " land", "labelling[water_mask]"),
@@ -66,8 +60,6 @@ _CORRECTED: RowTable = (
     ("Submerged", "{submerged:,} points ({submerged:of points}), {corrected_words}", ""),
     ("", "{count:,} not corrected: {name} ({fate})", "*uncorrected"),
     _NO_SURFACE,
-    ("Withheld", "{unsure:,} corrected points ({unsure:of corrected}) are visible at large"
-     " incidence angles only", "unsure"),
     ("Raster", "{raster[cells_changed]:,} cells changed, {raster[cells_empty]:,} of them have no"
      " height any more", "raster"),
     ("Depth", "{depth_m[min]:.2f} to {depth_m[max]:.2f} m, mean {depth_m[mean]:.2f} m", "depth_m"),
@@ -82,7 +74,6 @@ _CORRECTED: RowTable = (
     ("", "fitted {water_fit[model]}, standard error {water_fit[sigma_level_m]:.3f} m",
      "water_fit"),
     ("", "accepted {water_fit[accepted]} of {water_fit[points]} points", "water_fit[points]"),
-    *_SHORELINE,
     ("Uncertainty", "{uncertainty[tvu_95_m][mean]:.3f} m at 95 % (predicted)", "uncertainty"),
     ("Uncertainty", "not known: without cameras there are no rays", "no_uncertainty"),
     ("Measured", "{measured[tvu_95_m]:.3f} m at 95 %, at {measured[count]:,} points of the bed",
@@ -302,7 +293,7 @@ def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
             check = "cameras may not match the cloud; see the warnings"
         elif not s.fit["fits"]:
             check = "cameras and cloud could not be tested"
-    fates = {"withhold": "not moved, withheld", "keep": "not moved", "drop": "dropped"}
+    fates = {"withhold": "not moved, withheld", "keep": "not moved"}
     corrected = f"{s.corrected:,} corrected ({share(s.corrected, s.submerged)})"
     return filled(_CORRECTED, vars(s) | {
         "fate": fates[s.settings["uncorrected"]],
@@ -317,11 +308,6 @@ def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
         "order": order_sentence(s, measured),
         "check": check,
     })  # fmt: skip
-
-
-def shoreline_rows(found: Plain | None) -> Rows:
-    """Return the length and the standard error of a shoreline, where one was written."""
-    return filled(_SHORELINE, {"shoreline": found})
 
 
 _BUDGET: RowTable = (

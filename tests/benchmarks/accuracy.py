@@ -38,11 +38,11 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 import pcfix
-from pcfix.flow.check_depths import learn_regression
+from pcfix.flow.check_depths import fit_check_depths
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.label.labelling import Part
 from pcfix.model import Views, WaterPlane
-from pcfix.options.correct import BudgetOptions, ScienceOptions
+from pcfix.options.correct import BudgetOptions
 from pcfix.simulate.tracing import piercing_points_of_planes, project
 from pcfix.water.surface import surface_above
 from tests.utils.consistent_twin import least_squares_points
@@ -277,7 +277,7 @@ def regression_of(case: Case, seed: int) -> Any:
             writer = csv.writer(stream)
             writer.writerow(["x", "y", "depth"])
             writer.writerows(np.column_stack([bed[:, :2], depth]).tolist())
-        return learn_regression(path, [part], ScienceOptions())
+        return fit_check_depths(path, [part])
 
 
 SENSITIVITY = {

@@ -49,10 +49,9 @@ OF_RIVER = {
     **{method.split()[0]: f"--method {method}" for method in METHODS},
     "consistent-all": "--method consistent --camera-set all",
     "max-angle": "--max-angle 35",
-    "max-cameras": "--max-cameras 5 --dimensions minimal",
+    "minimal": "--dimensions minimal",
     "dietrich-35": "--method dietrich --max-angle 35 --index 1.337",
     "factor-given": "--method factor --depth-factor 1.4 --dimensions none",
-    "regression-refused": f"--method regression {DEPTHS} --least-r2 0.9999",
     "mvs": "--camera-set mvs",
     "occlusion": "--occlusion on",
     "no-occlusion": "--occlusion off --jobs 1",
@@ -64,14 +63,13 @@ OF_RIVER = {
     ),
     "keep": "--max-angle 1 --uncorrected keep",
     "withhold": "--max-angle 4 --uncorrected withhold",
-    "drop": "--max-angle 4 --uncorrected drop",
     "mask": "--water-mask {inputs}/mask.geojson",
     "quiet": "--quiet",
 }
 OF_A_TENTH = {
     "consistent": "--method consistent",
     "consistent-pairs": "--method consistent --matcher pairs",
-    "consistent-35": "--method consistent --max-angle 35 --max-cameras 8",
+    "consistent-35": "--method consistent --max-angle 35",
     "snell-pairs": "--camera-set mvs --matcher pairs",
     "offset": "--cameras-offset 1,2,0.5 --sensor {shared}/river/sensor.csv",
     "crs": "--cameras-crs EPSG:27700 --angles yaw-pitch-roll",
@@ -147,15 +145,10 @@ OF_ADJUST = {
     "free-datum": "--datum free --lens {inputs}/lens.csv --sigma-image 0.5",
     "not-told-apart": "--free level,tilt,index",
 }
-OF_OBLIQUES = {
-    "default": "",
-    "views": "--views {inputs}/c.vis",
-    "snell": "--method snell",
-    "withhold": "--unsure withhold --occlusion on",
-}
+OF_OBLIQUES = {"default": "", "views": "--views {inputs}/c.vis", "snell": "--method snell"}
 OF_PHOTOS = {"exact": "--dsm {dsm.block/out.tif}", "paper": "--mapping paper --dsm {inputs}/a.las"}
 OF_PLAN = {
-    "nadir": "--height 60 --depth 1:5:1",
+    "nadir": "--height 60 --depth 1,2,3,4,5",
     "obliques": "--height 40 --obliques 30 --overlap 0.7 --depth 3",
 }
 OF_CLEAN = {
@@ -308,7 +301,7 @@ def table() -> dict[str, str]:
     commands["label.respected"] = f"correct {labelled} --respect-classes 41 --summary summary.json"
     commands["restore"] = "restore {clean.default/out.laz} out.laz"
     commands["restore.river"] = "restore {river.sigmas/out.laz} out.las"
-    commands["restore.minimal"] = "restore {river.max-cameras/out.laz} out.las"
+    commands["restore.minimal"] = "restore {river.minimal/out.laz} out.las"
     for path in CAMERAS:
         name = path.replace("/", "-")
         commands[f"cameras.{name}"] = f"cameras {{shared}}/cameras/{path} --summary summary.json"
@@ -323,7 +316,7 @@ def table() -> dict[str, str]:
     views = "--views {inputs}/free.vis --method consistent"
     add("carried", carried, {"snell": "", "views": views})
     tiles = "--cameras {samples}/scene/cameras.csv --water 0.37 --summary summary.json"
-    commands["tiles.correct"] = f"correct {{inputs}}/tiles out {tiles} --shoreline shore.gpkg"
+    commands["tiles.correct"] = f"correct {{inputs}}/tiles out {tiles}"
     commands["tiles.clean"] = "clean {tiles.correct/out} out --summary summary.json"
     commands["tiles.dsm"] = "dsm {tiles.correct/out} out.tif --resolution 2 --what depth"
     commands["tiles.restore"] = "restore {tiles.correct/out} out"
@@ -362,7 +355,7 @@ def pdal_table() -> dict[str, str]:
     more = {
         "options": {"max_angle": 30, "connected": True, "summary": "summary.json", "jobs": 1},
         "consistent": {"method": "consistent", "camera_set": "all", "dimensions": "minimal"},
-        "keep": {"max_cameras": 4, "uncorrected": "keep", "index": "sea", "sigma_waves": 1},
+        "keep": {"uncorrected": "keep", "index": "sea", "sigma_waves": 1},
         "wrong": {"method": "magic"},
         "unknown": {"kamera": 1},
     }

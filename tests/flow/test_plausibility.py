@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import pcfix
 from pcfix.flow.diagnosis import quick_ties
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.plausibility import SAMPLE_POINTS, CloudSample, plausible
+from pcfix.flow.plausibility import CloudSample, plausible
 from pcfix.flow.surfaces import view_of
 from pcfix.io.las.source import read_xyz
 from tests.utils.codes import refused, warned
@@ -57,12 +57,6 @@ def in_radians(block):
     return replace(block.cameras, rotations=up @ np.swapaxes(read, 1, 2))
 
 
-def half_elsewhere(block):
-    centres = block.cameras.centres.copy()
-    centres[::2, :2] += 3.3e6
-    return replace(block.cameras, centres=centres)
-
-
 FAULTS = {
     "47 m too high": lambda b: moved(b, 0, 0, 47),
     "47 m too low": lambda b: moved(b, 0, 0, -47),
@@ -71,13 +65,11 @@ FAULTS = {
     "yaw + 90": lambda b: turned(b, 90),
     "yaw + 180": lambda b: turned(b, 180),
     "40 m beside": lambda b: moved(b, 40, 0, 0),
-    "half of another place": half_elsewhere,
 }
 DOUBTED = {
     "47 m too low": "cameras.no_overlap",
     "yaw + 180": "cameras.yaw",
-    "radians": "cameras.radians",
-    "half of another place": "cameras.far",
+    "radians": "cameras.yaw",
 }
 """Of the sample scene, which has neither tie points nor GNSS positions."""
 UNCHECKED = {
@@ -118,11 +110,7 @@ def test_faults(scene, fault):
 def test_residuals_of_tie_points(with_ties, fault):
     cameras = FAULTS[fault](with_ties) if fault else with_ties.cameras
     found = codes(plausible(cameras, with_ties.xyz, with_ties.ties))
-    if fault is None:
-        assert not found
-    else:
-        far = fault == "half of another place"
-        assert ("cameras.far" if far else "cameras.residuals") in found
+    assert ("cameras.residuals" in found) is bool(fault), found
 
 
 @rendered
@@ -151,7 +139,7 @@ def sample_of(path, above_m):
         water = np.full(len(points.xyz), LEVEL_M + above_m)
         sample += CloudSample.of(points, water, row, view.points)
         row += len(points.xyz)
-    return replace(sample, every=max(1.0, view.points // SAMPLE_POINTS))
+    return sample
 
 
 @pytest.mark.parametrize(("off_m", "found_m"), [(0.0, []), (3.0, [-3.03])])
@@ -187,8 +175,7 @@ def test_real_blocks(name):
     sample = sample_of(RENDERED.parent / cloud, above_m)
     ties = quick_ties(inputs, view.crs)
     block = inputs.block(view.crs)[0]
-    flight = {"file": path, "water_m": level, "every": sample.every}
-    found = plausible(block, sample.xyz, ties, sample.level_doubts(), **flight)
+    found = plausible(block, sample.xyz, ties, sample.level_doubts(), file=path)
     assert not found.doubts
     assert found.fits[0].startswith("100 % of the points")
 
@@ -200,26 +187,6 @@ def test_gnss_positions():
     assert "positions 1.6 m in plan from their GNSS" in plausible(cameras, xyz).fits
     beside = replace(cameras, centres=cameras.centres + np.array([40.0, 0.0, 0.0]))
     assert codes(plausible(beside, xyz)) == ["cameras.no_overlap", "cameras.gnss"]
-
-
-@rendered
-def test_points_per_pixel(with_ties):
-    """A cloud of about a point a pixel, of which some are here."""
-    every = 8.0 * 25.0
-    assert not plausible(with_ties.cameras, with_ties.xyz, every=every).doubts
-    assert "cameras.too_high" in codes(plausible(in_feet(with_ties), with_ties.xyz, every=every))
-
-
-@pytest.mark.parametrize("drone_m", [78.0, 33.0, 130.0])
-def test_recorded_heights(scene, tmp_path, drone_m):
-    """As DJI writes them, beside the camera file; the cameras are 80 m above the water."""
-    (tmp_path / "images").mkdir()
-    for label in scene.cameras.labels:
-        xmp = f'\xff\xd8 <rdf drone-dji:RelativeAltitude="{drone_m:+.2f}" drone-dji:Roll="0">'
-        (tmp_path / "images" / label).write_bytes(xmp.encode("latin-1"))
-    found = plausible(scene.cameras, scene.xyz, file=tmp_path / "cameras.csv", water_m=LEVEL_M)
-    assert codes(found) == ([] if drone_m == 78.0 else ["cameras.flying_height"])
-    assert not any(one.startswith("heights") for one in found.unchecked)
 
 
 def test_great_depths(scene):

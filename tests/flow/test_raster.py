@@ -282,7 +282,6 @@ def test_may_be_depths(tmp_path):
         ("output.suffix", (SCENE / "cloud.laz", "out.tif"), {}),
         ("option.needs", (SCENE / "cloud.laz", "out.laz"), {"depth": "d.tif"}),
         ("option.needs", (SCENE / "cloud.laz", "out.laz"), {"band": 2}),
-        ("option.conflict", ("dsm.tif", "out.tif"), {"uncorrected": "drop"}),
         ("output.is_input", ("dsm.tif", "dsm.tif"), {}),
         ("output.is_input", ("dsm.tif", "out.tif"), {"depth": "out.tif"}),
         ("water.below_cloud", ("dsm.tif", "out.tif"), {"water": -30.0}),

@@ -7,7 +7,6 @@ import shutil
 import sqlite3
 import warnings
 from contextlib import closing, nullcontext
-from dataclasses import replace
 from xml.etree import ElementTree
 
 import laspy
@@ -18,10 +17,10 @@ import shapely
 
 import pcfix
 from pcfix.errors import SettingError
-from pcfix.flow.request import STEPS, Record, Request, request_of
-from pcfix.flow.run import run_all
+from pcfix.flow.run_folder import STEPS, Record, RunFolder
 from pcfix.io import vectors
 from pcfix.io.rasters import values_at
+from pcfix.options.correct import RunOptions
 from pcfix.report.summary import Summary
 from pcfix.report.text import tvu_sentence
 from tests.utils.program import run_pcfix
@@ -204,12 +203,12 @@ def test_file_missing(copied):
 @pytest.mark.usefixtures("undrawn")
 def test_other_request(copied):
     done = run(copied, *WORDS, "--index", "1.33")
-    assert (done.code, done.error.values["changed"]) == ("run.other", ["index"])
+    assert done.code == "run.other"
     done = run(copied, *WORDS, "--index", "1.33", "--overwrite")
     assert (done.returncode, done.stderr) == (0, "")
     assert "already done" not in done.stdout
     record = json.loads((copied / "out" / "run.json").read_text())
-    assert record["request"]["index"] == 1.33
+    assert record["options"]["index"] == 1.33
 
 
 @pytest.mark.parametrize(
@@ -230,12 +229,17 @@ def test_later_option(copied, more, first):
     assert ("Lake &lt;2&gt;" in (copied / "out" / "report.html").read_text()) is (first == "report")
 
 
-def done_again(record):
-    """Return the steps that a record does again."""
+def steps_done(record):
+    """Do the steps of a record that are not done yet, and return their names."""
     return [name for name in STEPS if not record.step(name, [], lambda: None)[1]]
 
 
-def test_files_and_version(finished, tmp_path, monkeypatch):
+def asked(folder, **options):
+    options = {"cameras": str(SCENE / "cameras.csv"), "water": "0.37", **options}
+    return RunFolder(folder, str(SCENE / "cloud.laz"), RunOptions(**options))
+
+
+def test_files_and_version(tmp_path, monkeypatch):
     """What is read with a named file counts: of the same stem, sensor.csv, a project's folder."""
     for name in ("cameras.csv", "sensor.csv"):
         shutil.copy(SCENE / name, tmp_path)
@@ -243,59 +247,43 @@ def test_files_and_version(finished, tmp_path, monkeypatch):
     project.mkdir(parents=True)
     (tmp_path / "project.psx").touch()
     (project / "doc.xml").touch()
-    request = replace(
-        request_of(finished[0] / "run.json"), cameras=str(tmp_path / "cameras.csv"),
-        views=str(tmp_path / "project.psx"),
-    )  # fmt: skip
+    (tmp_path / "out").mkdir()
+    named = {"cameras": str(tmp_path / "cameras.csv"), "views": str(tmp_path / "project.psx")}
 
     def record():
-        watched = request.watched(tmp_path / "out")
-        return Record(tmp_path / "run.json", request.record(), watched)
+        return Record(asked(tmp_path / "out", **named))
 
-    assert done_again(record()) == list(STEPS)
-    assert record().resumes and done_again(record()) == []
+    assert steps_done(record()) == list(STEPS)
+    assert record().resumes and steps_done(record()) == []
     for name in ("sensor.csv", "project.files/0/doc.xml", "cameras.prj"):
         (tmp_path / name).write_text("another")
         assert not record().resumes
-        assert done_again(record()) == list(STEPS)
+        assert steps_done(record()) == list(STEPS)
     (tmp_path / "unread.prj").write_text("another")
-    assert done_again(record()) == []
-    monkeypatch.setattr("pcfix.flow.request.__version__", "9.9")
-    assert record().changed == ["pcfix"] and not record().resumes
+    assert steps_done(record()) == []
+    monkeypatch.setattr("pcfix.flow.run_folder.__version__", "9.9")
+    assert not record().resumes
 
 
-def test_reference_added(finished, tmp_path):
-    request = request_of(finished[0] / "run.json")
-    files = request.files()
+def test_reference_added(tmp_path):
     touched = tmp_path / "lidar.laz"
     shutil.copy(SCENE / "lidar.laz", touched)
 
-    def record(**other):
-        later = {"reference": str(touched), **other}
-        read = {**files, "compare": [touched] if later["reference"] else []}
-        return Record(tmp_path / "run.json", {**request.record(), **later}, read)
+    def record(**options):
+        return Record(asked(tmp_path, **options))
 
-    before = record(reference=None)
+    before = record()
     for name in ("adjust", "correct", "clean", "dsm", "map", "report"):
         before.step(name, [], lambda: None)
-    added = record()
-    assert (added.changed, added.resumes) == (["reference"], True)
-    assert done_again(added) == ["compare", "map", "report"]
+    added = record(reference=str(touched))
+    assert added.resumes
+    assert steps_done(added) == ["compare", "map", "report"]
     os.utime(touched)
-    assert done_again(record()) == ["compare", "map", "report"]
-    for name in ("index", "water", "gnss", "uncorrected"):
-        other = record(**{name: "1.33"})
-        assert not other.resumes
-        assert done_again(other) == list(STEPS)
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_config(finished, tmp_path):
-    done = run(tmp_path, "again", "--config", str(finished[0] / "run.json"))
-    assert (done.returncode, done.stderr) == (0, "")
-    one, other = (laspy.read(p / "cleaned.laz") for p in (finished[0], tmp_path / "again"))
-    np.testing.assert_array_equal(one.points.array, other.points.array)
-    assert request_of(tmp_path / "again" / "run.json") == request_of(finished[0] / "run.json")
+    assert steps_done(record(reference=str(touched))) == ["compare", "map", "report"]
+    for other in ({"index": 1.33}, {"water": "0.4"}):
+        changed = record(reference=str(touched), **other)
+        assert not changed.resumes
+        assert steps_done(changed) == list(STEPS)
 
 
 @pytest.fixture(scope="module")
@@ -365,18 +353,18 @@ def test_tiles(finished, tiled, tmp_path):
 
 @pytest.mark.usefixtures("undrawn")
 def test_without_reference_and_vectors(tmp_path, monkeypatch):
-    request = Request(
-        input=str(SCENE / "cloud.laz"), cameras=str(SCENE / "cameras.csv"), water="0.37"
-    )
     said: list[str] = []
 
     def lacking():
         raise SettingError("library.missing", "Vector files need pyogrio.")
 
     monkeypatch.setattr(vectors, "load_pyogrio", lacking)
-    page = run_all(request, tmp_path / "out", say=said.append)
+    found = pcfix.run(
+        SCENE / "cloud.laz", tmp_path / "out", cameras=SCENE / "cameras.csv", water=0.37,
+        say=said.append,
+    )  # fmt: skip
     assert sum(line.startswith("map       not written: ") for line in said) == 1
-    text = page.read_text()
+    text = found.report.read_text()
     assert "Cross-section" not in text
     assert "<td>Exclusive</td>" not in text
     assert ">predicted</span>" in text and ">measured</span>" not in text
@@ -389,13 +377,12 @@ def test_check_points(tmp_path):
     rows = np.random.default_rng(2).choice(len(lidar), 300, replace=False)
     lines = [f"{x:.3f},{y:.3f},{z:.3f}" for x, y, z in lidar.xyz[rows]]
     (tmp_path / "check.csv").write_text("\n".join(["x,y,z", *lines]))
-    request = Request(
-        input=str(SCENE / "cloud.laz"), cameras=str(SCENE / "cameras.csv"), water="0.37",
-        reference=str(tmp_path / "check.csv"),
-    )  # fmt: skip
     with pytest.warns(pcfix.PcfixWarning):
-        page = run_all(request, tmp_path / "out")
-    assert "check.csv" in page.read_text()
+        found = pcfix.run(
+            SCENE / "cloud.laz", tmp_path / "out", cameras=SCENE / "cameras.csv", water=0.37,
+            reference=tmp_path / "check.csv",
+        )  # fmt: skip
+    assert "check.csv" in found.report.read_text()
     points, values = layer(tmp_path / "out", "check_points")
     assert len(points) > 280
     np.testing.assert_allclose(shapely.get_z(points), values["z_m"])
@@ -410,7 +397,6 @@ def test_refused(tmp_path):
     (tmp_path / "out" / "thesis.txt").write_text("years")
     assert run(tmp_path, *WORDS).code == "run.other"
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["thesis.txt"]
-    for text in ("", "{}", "[]", '{"request": {"watre": 1}, "inputs": [], "steps": {}}'):
-        (tmp_path / "run.json").write_text(text)
-        assert run(tmp_path, "new", "--config", "run.json").code == "run.record"
-    assert not (tmp_path / "new").exists()
+    for text in ("", "{}", "[]", '{"steps": {"correct": {}}}'):
+        (tmp_path / "out" / "run.json").write_text(text)
+        assert run(tmp_path, *WORDS).code == "run.record"

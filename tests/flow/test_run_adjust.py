@@ -15,18 +15,20 @@ import pytest
 
 from pcfix.flow.correct import correct_file
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.request import Request
-from pcfix.flow.run import adjust_first, run_all
+from pcfix.flow.run import adjust_first, run
+from pcfix.flow.run_folder import RunFolder
 from pcfix.model import GnssPositions
+from pcfix.options.correct import RunOptions
 from tests.utils.block_kinds import GSD_M, write_kind
 from tests.utils.clouds import write_las
 from tests.utils.codes import refused, warned
 from tests.utils.program import run_pcfix
 
 
-def first_step(request, folder):
-    inputs = [path for some in request.files().values() for path in some]
-    return adjust_first(request, folder, inputs)
+def first_step(scene, folder, **options):
+    asked = {"cameras": scene.model, "water": "0", **options}
+    given = RunFolder(folder, str(scene.folder / "cloud.las"), RunOptions(**asked))
+    return adjust_first(given, [path for some in given.files().values() for path in some])
 
 
 STEPS = ["adjust", "correct", "clean", "dsm", "compare", "map", "report"]
@@ -37,16 +39,20 @@ class Scene(NamedTuple):
     folder: Path
     truth: np.ndarray
 
-    def request(self, **words):
-        cloud, model = str(self.folder / "cloud.las"), str(self.folder / "model")
-        return Request(input=cloud, cameras=model, water="0", **words)
+    @property
+    def model(self):
+        return str(self.folder / "model")
 
     @property
     def gnss(self):
         return str(self.folder / "gnss.csv")
 
-    def whole(self):
-        return self.request(adjust="yes", gnss=self.gnss, reference=str(self.folder / "truth.las"))
+    def run(self, folder, **options):
+        return run(self.folder / "cloud.las", folder, cameras=self.model, water="0", **options)
+
+    def adjusted(self, folder, said):
+        surveys = {"gnss": self.gnss, "reference": self.folder / "truth.las"}
+        return self.run(folder, adjust="yes", say=said.append, **surveys)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +73,7 @@ def errors_gsd(path, truth):
 @pytest.fixture(scope="module")
 def finished(scene, tmp_path_factory):
     folder, said = tmp_path_factory.mktemp("run") / "out", []
-    run_all(scene.whole(), folder, say=said.append)
+    scene.adjusted(folder, said)
     return folder, said
 
 
@@ -90,20 +96,19 @@ def test_first_step(finished):
     assert "under water" in said[1]
     record = json.loads((folder / "run.json").read_text())
     assert record["steps"]["adjust"]["result"]["model"] == "colmap"
-    assert "gnss.csv" in {one["path"].rsplit("/", 1)[-1] for one in record["inputs"]["adjust"]}
-    assert record["request"]["cameras"].endswith("model")
+    assert record["options"]["cameras"].endswith("model")
 
 
 def test_resumed(scene, finished):
     folder, _ = finished
     said = []
-    run_all(scene.whole(), folder, say=said.append)
+    scene.adjusted(folder, said)
     assert sum("already done" in line for line in said) == len(STEPS)
 
 
 def test_auto(scene, tmp_path, monkeypatch):
     monkeypatch.setattr("pcfix.flow.run._adjust", lambda *_: "colmap")
-    step = first_step(scene.request(gnss=scene.gnss), tmp_path)
+    step = first_step(scene, tmp_path, gnss=scene.gnss)
     assert step["model"] == "colmap"
     assert "tie points under water" in step["why"]
 
@@ -112,7 +117,7 @@ def test_auto(scene, tmp_path, monkeypatch):
 def test_auto_without_datum(scene, tmp_path):
     said = []
     with warned("poses.absorbed"):
-        page = run_all(scene.request(), tmp_path / "out", say=said.append)
+        page = scene.run(tmp_path / "out", say=said.append).report
     with warned("poses.absorbed"):
         correct_file(
             scene.folder / "cloud.las", tmp_path / "plain.laz", cameras=scene.folder / "model",
@@ -140,7 +145,7 @@ def test_datum_of_camera_file(scene, tmp_path, monkeypatch, sigma_m, is_datum):
 
     monkeypatch.setattr(Inputs, "block", with_gnss)
     monkeypatch.setattr("pcfix.flow.run._adjust", lambda *_: "colmap")
-    model = first_step(scene.request(), tmp_path)["model"]
+    model = first_step(scene, tmp_path)["model"]
     assert (model is not None) is is_datum
 
 
@@ -149,14 +154,13 @@ def test_water_dimension(scene, tmp_path):
     las.add_extra_dim(laspy.ExtraBytesParams("w_surf", "f4"))
     las["w_surf"] = np.full(len(las), 0.0, np.float32)
     las.write(tmp_path / "cloud.las")
-    request = replace(
-        scene.request(gnss=scene.gnss), input=str(tmp_path / "cloud.las"), water="dim:w_surf"
-    )
-    step = first_step(request, tmp_path)
+    other = Scene(tmp_path, scene.truth)
+    options = {"cameras": scene.model, "water": "dim:w_surf", "gnss": scene.gnss}
+    step = first_step(other, tmp_path, **options)
     assert step["model"] is None
     assert "w_surf" in step["why"]
     with refused("water.dimension"):
-        first_step(replace(request, adjust="yes"), tmp_path)
+        first_step(other, tmp_path, adjust="yes", **options)
 
 
 @pytest.mark.parametrize(
@@ -168,9 +172,9 @@ def test_water_dimension(scene, tmp_path):
         {"adjust": "yes", "tide": "tide.csv"},
     ],
 )
-def test_conflicts(words):
+def test_conflicts(tmp_path, words):
     with refused("option.conflict", value=words["adjust"]):
-        Request(input="cloud.las", cameras="cameras.csv", water="0", **words)
+        run("cloud.las", tmp_path / "out", cameras="cameras.csv", water="0", **words)
 
 
 def test_command_line(scene, tmp_path):

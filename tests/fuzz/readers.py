@@ -21,14 +21,13 @@ from pcfix.io.clouds import read_cloud
 from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.photographs import read_photograph, size_of
-from pcfix.io.saved import ENSEMBLE, find_members, read_regression, write_members, write_regression
+from pcfix.io.saved import ENSEMBLE, find_members, write_members
 from pcfix.io.tables import read_check_depths
 from pcfix.io.tides import read_image_times, read_tide
 from pcfix.io.tiles import open_cloud
 from pcfix.io.vectors import read_shoreline, read_water_polygons
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.model import Cameras, Lens
-from pcfix.refract.regression import fit_depths
 from tests.flow.test_pose_errors import members_of
 from tests.io import test_ground_control as control
 from tests.io import test_views as views
@@ -291,14 +290,6 @@ def copc(folder: Path) -> Path:
     return write_copc(folder / "cloud.copc.laz", random_cloud(7, count=300, plain=True))
 
 
-def regression(folder: Path) -> Path:
-    rng = np.random.default_rng(4)
-    x = rng.uniform(0.2, 5.0, 20)
-    line = fit_depths(x, 0.05 + 1.4 * x + rng.normal(0, 0.1, 20))
-    write_regression(folder / "line.json", line, overwrite=False)
-    return folder / "line.json"
-
-
 ROWS = [f"{name},{x},{y},{z}" for name, (x, y, z) in zip(LABELS, PLACES.tolist(), strict=True)]
 GNSS = "label,x,y,z,sx,sy,sz\n" + "".join(f"{row},0.1,0.1,0.2\n" for row in ROWS)
 GEO = "EPSG:32632\n" + "\n".join(ROWS).replace(",", " ")
@@ -443,7 +434,6 @@ READERS: dict[str, Reader] = {
         times, pictures=pictures, tide=text("tide.csv", TIDE), times=text("times.csv", TIMES)
     ),
     "depths": one(read_check_depths, table=text("depths.csv", DEPTHS)),
-    "regression": one(read_regression, line=regression),
     "members": Reader(read_members, {"npz": members}),
     "pictures": Reader(
         read_picture, {end: picture(f"a.{end}") for end in ("jpg", "png", "tif")}

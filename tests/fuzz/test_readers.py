@@ -94,7 +94,6 @@ FOUND = {
     "labels that are none": ("members", "npz", "ensemble.npz labels.npy",
         instead(b"(4,)", b"(2,)")),
     "array that is none": ("members", "npz", "ensemble.npz labels.npy", lambda data: b"no array"),
-    "deep brackets of a line": ("regression", "line", "line.json", lambda data: b"[" * 100_000),
     "deep brackets beside a model": ("colmap text", "model", "georeference.json",
         lambda data: b"[" * 100_000),
     "escapes for the terminal": ("gnss", "table", "gnss.csv",

@@ -8,15 +8,13 @@ import pytest
 import shapely
 
 import pcfix
+from pcfix.flow.maps import waterline
 from pcfix.grid import shoreline
 from pcfix.grid.shoreline import NearWater
 from pcfix.io.scenes import write_scene
-from pcfix.io.vectors import read_vectors
 from pcfix.simulate.scene import ORIGIN_M
 from pcfix.simulate.terrain import Terrain
-from tests.utils.program import run_pcfix
 
-pyogrio = pytest.importorskip("pyogrio")
 LEVEL_M, SIGMA_M = 0.37, 0.03
 
 
@@ -52,20 +50,16 @@ def distance_m(ground: Terrain, xy: np.ndarray) -> np.ndarray:
 def test_standard_error(beach, tmp_path, off_m):
     """Also where the level is wrong by its standard error: then by about that over the slope."""
     folder, ground = beach
-    summary = pcfix.correct_file(
+    pcfix.correct_file(
         folder / "cloud.laz", tmp_path / "out.laz", cameras=folder / "cameras.csv",
-        water=LEVEL_M + off_m, sigma_level=SIGMA_M, method="snell", max_angle=None,
-        shoreline=tmp_path / "shore.gpkg",
+        water=LEVEL_M + off_m, method="snell", max_angle=None,
     )  # fmt: skip
-    meta, _, wkb, values = pyogrio.raw.read(tmp_path / "shore.gpkg", layer="shoreline")
-    found = dict(zip(meta["fields"], values, strict=True))
-    lines = shapely.from_wkb(wkb)
-    assert meta["geometry_type"] == "LineString"
-    assert "32633" in str(meta["crs"])
-    assert summary.shoreline["lines"] == len(lines) >= 1
+    layer = waterline(tmp_path / "out.laz", pcfix.WaterPlane(LEVEL_M + off_m), SIGMA_M)
+    assert len(layer.geometries) >= 1
     for line, level, sigma, length in zip(
-        lines, *(found[name] for name in ("level_m", "sigma_m", "length_m")), strict=True
-    ):
+        layer.geometries, *(layer.values[n] for n in ("level_m", "sigma_m", "length_m")),
+        strict=True,
+    ):  # fmt: skip
         distance = distance_m(ground, shapely.get_coordinates(line))
         rms = math.sqrt(np.mean(distance**2))
         assert rms < 2.0 * sigma
@@ -113,17 +107,3 @@ def test_flat_water():
     near = NearWater.of(np.column_stack([x, y, above]), above)
     assert sum(one.length_m for one in near.lines(lambda xy: np.full(len(xy), 0.02))) < 10.0
     assert NearWater().lines(lambda xy: np.zeros(len(xy))) == []
-
-
-def test_command(beach, tmp_path):
-    words = [LEVEL_M, "--cloud", beach[0] / "cloud.laz", "--shoreline", "shore.gpkg"]
-    assert run_pcfix("water", *words, folder=tmp_path).returncode == 0
-    assert len(read_vectors(tmp_path / "shore.gpkg").coordinates) > 10
-    assert run_pcfix("water", 50, *words[1:], "--overwrite", folder=tmp_path).returncode == 0
-    assert not len(pyogrio.raw.read(tmp_path / "shore.gpkg", layer="shoreline")[2])
-    for bad in (
-        ["--cloud", beach[0] / "cloud.laz", "--shoreline", "a.shp"],
-        ["--shoreline", "a.gpkg"],
-        ["--cloud", beach[0] / "cloud.laz", "--shoreline", "no/a.gpkg"],
-    ):
-        assert run_pcfix("water", LEVEL_M, *bad, folder=tmp_path).returncode == 1

@@ -14,7 +14,7 @@ from laspy.vlrs.vlrlist import VLRList
 import pcfix
 from pcfix import PcfixError
 from pcfix.flow.plausibility import CloudSample
-from pcfix.io.las.columns import COLUMNS, UNSURE, UPGRADE
+from pcfix.io.las.columns import COLUMNS, UPGRADE
 from tests.utils.beyond_frames import BEYOND_FRAMES, DEEP
 from tests.utils.clouds import (
     EAST_M,
@@ -419,23 +419,6 @@ class TestUncorrectedPoints:
         np.testing.assert_array_equal(new["withheld"], flag)
         assert trip.back.read_bytes() == trip.source.read_bytes()
 
-    def test_dropped(self, source: Path, why: str) -> None:
-        trip, summary = self.run(source, why, "drop")
-        stuck, rays = self.expected(trip.before, why)
-        keep = correct(source, source.with_stem("keep"), cameras=MISSED[why][0],
-                       uncorrected="keep", **MISSED[why][1])  # fmt: skip
-        whole = read_raw(source.with_stem("keep"))
-        assert keep.dropped == 0
-        np.testing.assert_array_equal(trip.after.points, whole.points[~stuck])
-        np.testing.assert_array_equal(trip.restored.points, trip.before.points[~stuck])
-        # by the angle alone: without a limit all cameras see all points
-        few = [(stuck & (rays == count)).sum() for count in (0, 1)]
-        counts = [0, 0, 0, stuck.sum()] if why == "angle" else [*few, 0, 0]
-        assert sorted(summary.uncorrected.values()) == sorted(counts)
-        assert summary.dropped == stuck.sum()
-        assert summary.submerged == submerged(trip.before).sum()
-        assert summary.corrected == summary.submerged - stuck.sum()
-
 
 @pytest.mark.parametrize("number", [2, 7])
 @pytest.mark.parametrize(
@@ -509,7 +492,7 @@ def test_documented_dimensions() -> None:
     head = "| extra dimension | type | unit | |\n|---|---|---|---|\n"
     rows = [
         re.escape(f"| `{c.name}` | {c.dtype} | {units[c.scale]} |".replace("  ", " "))
-        for c in (*COLUMNS, UNSURE)
+        for c in COLUMNS
     ]
     table = re.compile(re.escape(head) + "".join(f"{row} .+ \\|\n" for row in rows) + "\n")
     root = Path(__file__).parents[2]

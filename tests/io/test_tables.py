@@ -1,13 +1,8 @@
-"""Check depths in tables, and the file of a depth regression."""
+"""Check depths in tables."""
 
-import json
-
-import numpy as np
 import pytest
 
-from pcfix.io.saved import read_regression, write_regression
 from pcfix.io.tables import read_check_depths
-from pcfix.refract.regression import fit_depths
 from tests.utils.codes import refused
 
 pytestmark = pytest.mark.quick
@@ -69,51 +64,3 @@ def test_bad_check_depths(tmp_path, text, code, values):
     path = written(tmp_path, text)
     with refused(code, path=path, **values):
         read_check_depths(path)
-
-
-@pytest.fixture
-def line():
-    rng = np.random.default_rng(4)
-    x = rng.uniform(0.2, 5.0, 20)
-    return fit_depths(x, 0.05 + 1.4 * x + rng.normal(0, 0.1, 20))
-
-
-def test_regression_round_trip(tmp_path, line):
-    write_regression(tmp_path / "line.json", line, overwrite=False)
-    assert read_regression(tmp_path / "line.json") == line
-
-
-def changed(tmp_path, line, **values):
-    path = tmp_path / "line.json"
-    write_regression(path, line, overwrite=False)
-    content = {**json.loads(path.read_text()), **values}
-    path.write_text(json.dumps({k: v for k, v in content.items() if v is not ...}))
-    return path
-
-
-def test_slope_of_hsu_and_wang(tmp_path, line):
-    """They count heights from an origin at 190 mm; the slope is noted, not refused."""
-    values = {"slope": 0.9895, "intercept": -0.0083428, "r2": 0.79, "count": 16}
-    assert len(read_regression(changed(tmp_path, line, **values)).notes) == 1
-
-
-@pytest.mark.parametrize("text", ["slope = 1.4", "[1]", '{"version": 1}'])
-def test_not_a_regression(tmp_path, text):
-    with refused("regression.not_one"):
-        read_regression(written(tmp_path, text, "line.json"))
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        *(("slope", ...), ("cv_rmse", ...), ("slope", "1.4"), ("rmse", True)),
-        *(("intercept", float("nan")), ("slope", 0), ("slope", -1.4), ("slope_se", -0.1)),
-        *(("count", 2), ("count", 3.5), ("deepest", 0.0), ("version", 2), ("unit", "mm")),
-    ],
-)
-def test_bad_regression(tmp_path, line, name, value):
-    is_header = name in ("version", "unit")
-    with refused("regression.version" if is_header else "regression.value") as caught:
-        read_regression(changed(tmp_path, line, **{name: value}))
-    if not is_header:
-        assert caught.value.values["name"] == name

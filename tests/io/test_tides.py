@@ -8,14 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from pcfix.io.tides import (
-    ImageTimes,
-    TideTable,
-    level_offsets,
-    read_altitudes,
-    read_image_times,
-    read_tide,
-)
+from pcfix.io.tides import ImageTimes, TideTable, level_offsets, read_image_times, read_tide
 from tests.utils.codes import refused
 from tests.utils.shared import needs
 
@@ -135,13 +128,3 @@ def test_exif(tmp_path):
     (tmp_path / "five.jpg").write_text("no image")
     with refused("photos.unreadable", path=tmp_path / "five.jpg"):
         read_image_times(tmp_path, ["five"])
-
-
-@pytest.mark.parametrize("text", ['="+30.10"', ">30.10</drone-dji:RelativeAltitude>", "='30.1'"])
-def test_heights_in_images(tmp_path, text):
-    (tmp_path / "a.JPG").write_text(f"<x drone-dji:RelativeAltitude{text} y>")
-    (tmp_path / "b.JPG").write_text("<x drone-dji:AbsoluteAltitude='88.0'>")
-    (tmp_path / "c.txt").write_text("RelativeAltitude='99.0'")
-    for place in (tmp_path, tmp_path / "cameras.csv"):
-        found = read_altitudes(place, ["folder/a", "b", "c"])
-        np.testing.assert_array_equal(found, [30.1, np.nan, np.nan])

@@ -71,7 +71,7 @@ def test_s_eqs_1_to_7_are_method_shan():
 def test_s_eq_1_is_the_depth_of_one_image():
     """Z' = Z [n2 + (n2 - 1) tan2 a]^-1/2: one image alone, which H's eq 1 turns round."""
     one = pcfix.Cameras(("O1",), CENTRES[:1])
-    found = pcfix.correct_points(APPARENT, one, 0.0, index=N, method="butler", max_cameras=1)
+    found = pcfix.correct_points(APPARENT, one, 0.0, index=N, method="butler")
     tan_a = np.hypot(*(APPARENT - CENTRES[0])[:, :2].T) / (CENTRES[0, 2] - APPARENT[:, 2])
     back = found.xyz[:, 2] * (N**2 + (N**2 - 1.0) * tan_a**2) ** -0.5
     assert back == pytest.approx(APPARENT[:, 2], abs=1e-12)

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.io.las.columns import COLUMNS, UNSURE
+from pcfix.io.las.columns import COLUMNS
 from pcfix.io.pdal import STAGE_SOURCE, add_dimension
 from tests.utils.beyond_frames import BEYOND_FRAMES
 from tests.utils.clouds import WATER_M, block, cameras_csv, framed_block, random_cloud, write_cloud
-from tests.utils.half_oblique import write_half_oblique
 
 pytestmark = BEYOND_FRAMES
 
@@ -112,20 +111,6 @@ def test_withheld(tmp_path, keeps, uncorrected):
         np.testing.assert_array_equal(outs["ClassFlags"] & ~np.uint8(4), others)
 
 
-def test_unsure(tmp_path):
-    more = {"method": "snell", "max_angle": "none", "occlusion": "off", "unsure": "withhold"}
-    more |= write_half_oblique(tmp_path)
-    before = laspy.read(tmp_path / "cloud.las")
-    ins = arrays_of(before, add_dimension((*COLUMNS, UNSURE)))
-    outs, report = run("correct", ins, metadata_of(before.header), **more)
-    pcfix.correct_file(tmp_path / "cloud.las", tmp_path / "out.las", **more)
-    las = laspy.read(tmp_path / "out.las")
-    np.testing.assert_array_equal(outs["Unsure"], las.Unsure)
-    np.testing.assert_array_equal(outs["ClassFlags"] >> 2 & 1, las.withheld)
-    (told,) = (node["value"] for node in report["children"] if node["name"] == "unsure")
-    assert told > np.array(las.Unsure).sum() > 0  # some came withheld
-
-
 def test_label(cloud):
     _, ins, metadata = cloud
     outs, report = run("label", ins, metadata, water=WATER_M)
@@ -137,24 +122,18 @@ def test_label(cloud):
 
 
 def test_report(cloud, tmp_path):
-    """The metadata and the summary are those of a file; so is the shoreline."""
+    """The metadata and the summary are those of a file."""
     path, ins, metadata = cloud
-    pyogrio = pytest.importorskip("pyogrio")
     options = {"cameras": str(tmp_path / "cameras.csv"), "water": str(WATER_M), "max_angle": 80.0}
-    names = {"summary": str(tmp_path / "s.json"), "shoreline": str(tmp_path / "stage.gpkg")}
-    _, report = run("correct", ins, metadata, **options, **names)
+    _, report = run("correct", ins, metadata, **options, summary=str(tmp_path / "s.json"))
     found = {node["name"]: node["value"] for node in report["children"]}
-    lines = {"shoreline": tmp_path / "file.gpkg"}
-    summary = pcfix.correct_file(path, tmp_path / "out.las", **options, **lines)
+    summary = pcfix.correct_file(path, tmp_path / "out.las", **options)
     for name in ("points", "submerged", "corrected", "rays", "cameras_used", "water"):
         assert found[name] == getattr(summary, name), name
     assert json.loads(found["shift_z_m"]) == summary.shift_z_m
     written = json.loads((tmp_path / "s.json").read_text())
     assert set(written) == set(summary.as_dict())
     assert written["depth_m"] == summary.depth_m
-    stage, file = (pyogrio.raw.read(tmp_path / f"{door}.gpkg") for door in ("stage", "file"))
-    assert list(stage[2]) == list(file[2])
-    assert json.loads(found["shoreline"])["lines"] == len(stage[2])
 
 
 GOOD = {"cameras": "cameras.csv", "water": WATER_M, "max_angle": 80.0}
@@ -162,13 +141,12 @@ MISTAKES = [
     ({**GOOD, "watre": 1}, None),
     ({"water": 1.0}, "option.missing"),
     ({"cameras": "cameras.csv"}, "option.missing"),
-    ({**GOOD, "max_cameras": "few"}, "option.type"),
+    ({**GOOD, "jobs": "few"}, "option.type"),
     ({**GOOD, "max_angle": True}, "option.type"),
     ({**GOOD, "cameras": ["a"]}, "option.type"),
-    ({**GOOD, "max_cameras": 2.5}, "option.type"),
+    ({**GOOD, "jobs": 2.5}, "option.type"),
     ("cameras.csv", "option.type"),
     ({**GOOD, "max-angle": 30, "max_angle": 30}, "option.twice"),
-    ({**GOOD, "uncorrected": "drop"}, "option.not_in_pdal"),
     ({**GOOD, "water": "dim:w_surf"}, "cloud.dimension_missing"),
     ({**GOOD, "water": "wet"}, "water.spec"),
     ({**GOOD, "index": 1.6}, None),

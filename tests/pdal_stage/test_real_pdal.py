@@ -295,11 +295,8 @@ def test_pipeline_command(tmp_path: Path) -> None:
     write_cloud(tmp_path / "waves.las", 10, plain=True, count=300)
     cameras_csv(tmp_path / "cameras.csv", block())
     good = ["--cameras", "cameras.csv", "--water", "5", "--max-angle", "80"]
-    whole = pipeline_of(tmp_path, "cloud.las", "out.las", *good)
-    assert pipeline_of(tmp_path, "cloud.las", *good, "--stage") == whole["pipeline"][1]
     assert run_pcfix("pipeline", "cloud.las", *good, folder=tmp_path).returncode == 2
     for words in (
-        ["cloud.las", *good, "--stage", "--uncorrected", "drop"],
         ["cloud.las", "out.las", *good, "--index", "1.6"],
         ["cloud.las", "out.las", *good[:2], "--water", "wet"],
         ["cloud.las", "out.las", *good, "--cameras", "none.csv"],

@@ -70,7 +70,7 @@ def test_snell_warned_and_restored(scene, cloud, tmp_path):
     "given",
     [
         {}, {"port": SPEC, "water": 0.0}, {"port": "flat"}, {"port": SPEC, "method": "murase"},
-        {"port": SPEC, "camera_set": "mvs"}, {"port": SPEC, "unsure": "withhold"},
+        {"port": SPEC, "camera_set": "mvs"},
         {"port": SPEC, "connected": True}, {"port": SPEC, "tide": "tide.csv"},
     ],
     ids=str,

@@ -122,19 +122,6 @@ def test_no_points(points, cameras, way):
     assert correct(batch).shift_m.shape == (0, 3)
 
 
-def test_max_cameras(points, cameras):
-    result = snell(points, cameras, 0.0, max_cameras=3)
-    assert result.ray_count.max() == 3
-    views = views_in_frame(points, cameras)
-    for i in range(0, N, 50):
-        mine = views.camera[views.start[i] : views.start[i + 1]]
-        if len(mine) < 3:
-            continue
-        down = points[i] - cameras.centres[mine]
-        angle = np.degrees(np.arctan2(np.hypot(*down[:, :2].T), -down[:, 2]))
-        assert result.incidence_deg[i] == pytest.approx(np.sort(angle)[2], abs=1e-6)
-
-
 def test_max_angle(points, cameras):
     result = snell(points, cameras, 0.0, max_angle=15.0)
     assert 0 < result.incidence_deg.max() <= 15.0 + 1e-6

@@ -1,13 +1,12 @@
 """What a point record holds: LAS point formats, and the extra dimensions of a correction.
 
-The extra dimensions are integers with a scale, so that LAZ packs them well. `COLUMNS` and `UNSURE`
-are all that is said of them: files and PDAL's stage take name, type and unit from them, and a test
-holds the documentation to them.
+The extra dimensions are integers with a scale, so that LAZ packs them well. Files and PDAL's
+stage take their names, types and units from `COLUMNS`, and a test compares the documentation.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
@@ -16,7 +15,7 @@ import numpy.typing as npt
 
 from pcfix.errors import InputError, bad_file
 from pcfix.model import BoolArray, Correction, FloatArray
-from pcfix.options.correct import Dimensions, Unsure
+from pcfix.options.correct import Dimensions
 
 if TYPE_CHECKING:
     import laspy
@@ -65,20 +64,17 @@ COLUMNS = (
     Column("RayCount", "ray_count", "uint16", 1.0, "rays intersected", True),
     Column("SourceClass", "", "uint8", 1.0, "class before the correction"),
 )  # fmt: skip
-UNSURE = Column("Unsure", "unsure", "uint8", 1.0, "withheld: only oblique rays")
-"""Written where such points are withheld."""
 OUTCOME = Column("Outcome", "outcome", "uint8", 1.0, "whether and why not corrected")
 """Written for the cells of rasters; see `pcfix.Outcome`."""
 SHIFTS = ("ShiftX", "ShiftY", "ShiftZ")
 MINIMAL = ("ShiftZ", "RayCount")
 
 
-def columns_for(dimensions: Dimensions, unsure: Unsure) -> tuple[Column, ...]:
-    """Return the columns that ``--dimensions`` and ``--unsure`` ask for."""
+def columns_for(dimensions: Dimensions) -> tuple[Column, ...]:
+    """Return the columns that ``--dimensions`` asks for."""
     if dimensions == "none":
         return ()
-    some = tuple(c for c in COLUMNS if dimensions == "all" or c.name in MINIMAL)
-    return (*some, UNSURE) if unsure == "withhold" else some
+    return tuple(c for c in COLUMNS if dimensions == "all" or c.name in MINIMAL)
 
 
 def column_scale(column: Column, scales: FloatArray) -> float:
@@ -105,13 +101,11 @@ def changes_of(
 ) -> Changes:
     """Return the changes by a correction; with `withhold` also flags for uncorrected points.
 
-    Classes and flags, shape (n,), are those before. What is withheld in the input is neither unsure
-    nor uncorrected here, so that `restore` can distinguish it from what pcfix withheld. Points that
-    are withheld because they could not be transferred have the same mark, a depth.
+    Classes and flags, shape (n,), are those of the input. Points that it withholds are not
+    uncorrected here, so that `restore` can distinguish them from those that pcfix withheld. Points
+    that are withheld because they could not be transferred have the same mark, a depth.
     """
     steps = np.rint(correction.shift_m / scales).astype(np.int64)
-    if correction.unsure is not None:
-        correction = replace(correction, unsure=correction.unsure & ~withheld)
     marked = correction.uncorrected if withhold else correction.submerged
     changed = correction.corrected | (marked & ~withheld)
     values: list[tuple[Column, BoolArray, npt.NDArray[Any]]] = []
@@ -126,7 +120,6 @@ def changes_of(
         value = value if column.least is None else np.maximum(value, column.least)
         values.append((column, changed, value))
     flagged = correction.uncorrected if withhold else np.zeros(len(changed), np.bool_)
-    flagged = flagged if correction.unsure is None else flagged | correction.unsure
     return Changes(steps, flagged, values)
 
 
