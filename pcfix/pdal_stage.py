@@ -1,4 +1,4 @@
-"""The functions of PDAL's ``filters.python``: correct, label, clean and compare.
+"""The functions of PDAL's ``filters.python``: correct, label and clean.
 
 A pipeline imports one of them. PDAL passes options, metadata and the report through the globals of
 the source of the stage::
@@ -50,7 +50,7 @@ COLOURS = ("Red", "Green", "Blue")
 
 def __getattr__(name: str) -> Stage:
     """Return the stage of this name, bound to the globals of the module that imports it."""
-    work = {"correct": _correct, "label": _label, "clean": _clean, "compare": _compare}.get(name)
+    work = {"correct": _correct, "label": _label, "clean": _clean}.get(name)
     if work is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     namespace = sys._getframe(1).f_globals
@@ -163,17 +163,6 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     summary = {**found.as_dict(), "input": NAME, "output": NAME, "seconds": seconds}
     write_summary(options, summary)
     namespace["out_metadata"] = metadata_of(summary)
-
-
-def _compare(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
-    """Compare the cloud, and pass all points on unchanged."""
-    from pcfix.flow.compare import compare_clouds
-    from pcfix.options.steps import StageCompareOptions
-
-    options = _options(namespace, StageCompareOptions)
-    cloud = PdalCloud(ins, namespace.get("metadata"))
-    found = compare_clouds(_view(cloud), options.reference or "", options=options)
-    namespace["out_metadata"] = metadata_of(found.as_dict())
 
 
 def _options(namespace: dict[str, Any], kind: type[Set]) -> Set:

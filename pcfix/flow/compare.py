@@ -14,16 +14,7 @@ from pcfix.compare.match import Match, SurveyCloud, match
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
 from pcfix.io.atomic import all_or_none
-from pcfix.io.clouds import (
-    DIMENSIONS,
-    CloudView,
-    check_same_crs,
-    read_cloud,
-    read_reference,
-    reference_of,
-    survey_cloud,
-)
-from pcfix.io.crs import parse_crs
+from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
 from pcfix.io.files import check_output, scratch_arrays, write_text
 from pcfix.io.tiles import Clouds, band_of, cloud_of, inputs_of
 from pcfix.options.declare import File, taken
@@ -35,11 +26,7 @@ if TYPE_CHECKING:
 
 
 def compare_clouds(
-    cloud: Clouds | CloudView,
-    reference: Clouds,
-    *,
-    options: CompareOptions | None = None,
-    **keywords: Any,
+    cloud: Clouds, reference: Clouds, *, options: CompareOptions | None = None, **keywords: Any
 ) -> Comparison:
     """Compare a cloud with a reference; what ``pcfix compare`` runs.
 
@@ -49,8 +36,7 @@ def compare_clouds(
     Parameters
     ----------
     cloud : path, or list of paths
-        LAS or LAZ, or many as `pcfix.io.tiles.tiles_of` has them; a GeoTIFF of heights; or the view
-        of a cloud in memory.
+        LAS or LAZ, or many as `pcfix.io.tiles.tiles_of` has them; or a GeoTIFF of heights.
         If `correct_file` wrote it with all its dimensions, the apparent points are compared too.
     reference : path, or list of paths
         LAS or LAZ, or many; CSV check points (x, y, z); or a GeoTIFF of heights. At check points
@@ -64,11 +50,10 @@ def compare_clouds(
     started = time.perf_counter()
     given = taken(CompareOptions, options, keywords, "compare_clouds")
     lines = [parse_line(line) if isinstance(line, str) else line for line in given.section]
-    held = cloud if isinstance(cloud, CloudView) else None
-    clouds = [] if isinstance(cloud, CloudView) else [band_of(cloud_of(cloud), given)]
+    compared = band_of(cloud_of(cloud), given)
     also = {name: cloud_of(path) for name, path in given.also}
     surveyed = reference_of(reference)
-    read = (*clouds, surveyed, *also.values())
+    read = (compared, surveyed, *also.values())
     _check_outputs(given, [path for one in read for path in inputs_of(one)])
     if given.m3c2:
         load_py4dgeo()
@@ -76,7 +61,7 @@ def compare_clouds(
     if given.water is not None:
         from pcfix.flow.surfaces import find_surface, view_of  # slow to import
 
-        water = find_surface(given.water, WaterOptions(), held or view_of(clouds[0])).surface
+        water = find_surface(given.water, WaterOptions(), view_of(compared)).surface
     outputs = [path for path in (given.out_dir, given.summary, given.plot) if path is not None]
     near = Path([*outputs, Path(tempfile.gettempdir()) / "pcfix"][0])
     with scratch_arrays(near):  # arrays of large clouds
@@ -86,13 +71,7 @@ def compare_clouds(
             check_same_crs(one.name, one.crs, target.name, target.crs)
             return match(one, target, given.part(CompareRules), given=water is not None)
 
-        if held is None:
-            whole = read_cloud(clouds[0], water)
-        else:
-            crs = None if held.crs is None else parse_crs(str(held.crs), held.name)
-            chunks = held.chunks(water, DIMENSIONS)
-            whole = survey_cloud(held.name, crs, chunks, water, water is not None, held.points)
-        matched, others = matched_to(whole), {}
+        matched, others = matched_to(read_cloud(compared, water)), {}
         for name, further in also.items():  # at the places of the first
             others[name] = replace(matched_to(read_cloud(further, water)), places=matched.places)
         result = figures_of(matched, lines, others)

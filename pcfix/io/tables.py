@@ -288,7 +288,7 @@ def read_table(path: Path, *needed: Sequence[str], spellings: Spellings | None =
 POINT_SPELLINGS = {
     "x": ("x", "easting", "east"),
     "y": ("y", "northing", "north"),
-    "z": ("z", "height", "h", "elevation", "elev", "altitude", "alt", "level"),
+    "z": ("z", "height", "elevation", "elev", "altitude"),
 }
 DEPTH_SPELLINGS = POINT_SPELLINGS | {
     "depth": ("depth", "true_depth", "water_depth", "measured_depth")

@@ -35,6 +35,7 @@ KINDS = "GeoPackage (.gpkg), Shapefile (.shp), GeoJSON, KML, GPX or a table of p
 COLUMNS = tables.POINT_SPELLINGS | {
     "longitude": ("longitude", "lon", "long"),
     "latitude": ("latitude", "lat"),
+    "z": (*tables.POINT_SPELLINGS["z"], "h", "alt", "level"),
 }
 """Names of a column; the first that the header has is used."""
 LAYER_MARK = "|"

@@ -298,12 +298,6 @@ class CompareOptions(BandOption, OverwriteOption, SummaryOption, CompareRules, p
     """PNG of the C2C histograms, with Gauss curves."""
 
 
-class StageCompareOptions(ReferenceOption, CompareOptions):
-    """The options of the PDAL stage ``compare``, whose cloud is not a file."""
-
-    reference: File | None = option(None, basic=True, needed="needed")
-
-
 class ViewerOptions(OverwriteOption, CameraFileOptions, WaterOptions, panel=Panel.OUTPUT):
     """The options of ``pcfix view``."""
 

@@ -181,19 +181,17 @@ def test_label_recipe(tmp_path: Path) -> None:
 
 @needs_pdal
 @pytest.mark.parametrize("point_format", mostly_nightly([2, 7], 7))
-def test_recipe_with_comparison(tmp_path: Path, point_format: int) -> None:
-    """Correct, clean and compare in one pipeline do what the commands do, one after the other."""
+def test_recipe_with_cleaning(tmp_path: Path, point_format: int) -> None:
+    """Correct and clean in one pipeline do what the commands do, one after the other."""
     before = laspy.convert(laspy.read(SCENE / "cloud.laz"), point_format_id=point_format)
     before.write(tmp_path / "cloud.las")
     quick = {"method": "snell", "max-angle": "none"}  # an option's dashes are understood
     args = {"cameras": str(SCENE / "cameras.csv"), "water": 0.37, **quick}
-    compared = {"reference": str(SCENE / "lidar.laz"), "summary": "compared.json"}
     done = pdal(
-        "pipeline", ROOT / "pipelines" / "correct_clean_compare.json",
+        "pipeline", ROOT / "pipelines" / "correct_clean.json",
         f"--readers.las.filename={tmp_path / 'cloud.las'}",
         f"--writers.las.filename={tmp_path / 'out.las'}",
         f"--stage.correct.pdalargs={json.dumps(args)}",
-        f"--stage.compare.pdalargs={json.dumps(compared)}",
         "--metadata", "meta.json", folder=tmp_path,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")
@@ -204,18 +202,8 @@ def test_recipe_with_comparison(tmp_path: Path, point_format: int) -> None:
     cleaned = pcfix.clean_file(tmp_path / "corrected.las", tmp_path / "cleaned.las")
     assert cleaned.noise > 0
     assert_same(tmp_path / "cleaned.las", tmp_path / "out.las")
-    whole = pcfix.compare_clouds(tmp_path / "cleaned.las", SCENE / "lidar.laz").as_dict()
-    found = json.loads((tmp_path / "compared.json").read_text())
-    assert found["counts"] == whole["counts"]
-    for name in ("c2c", "vertical", "bed", "land"):
-        for when in ("after", "before"):
-            one, other = (figures[name][when] for figures in (found, whole))
-            one, other = (f.get("statistics", f) for f in (one, other))
-            for of in ("count", "mean_m", "rmse_m", "nmad_m"):
-                assert one[of] == pytest.approx(other[of], abs=1e-6), (name, when, of)
     report = (tmp_path / "meta.json").read_text()
     assert f'"noise": {cleaned.noise}' in report
-    assert '"c2c": ' in report
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
