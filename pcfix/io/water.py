@@ -28,7 +28,7 @@ from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels
 from pcfix.io.ply import Records, read_header
 from pcfix.io.rasters import Bounds, open_raster, place_of, read_masked
-from pcfix.io.tables import number
+from pcfix.io.tables import METRES, number
 from pcfix.model import (
     FloatArray,
     IntArray,
@@ -185,11 +185,6 @@ MARGIN_M = 100.0
 """Width of the strip around the cloud in which a ray may meet the water."""
 IMPOSSIBLE_M = 9000.0
 """A water surface is not as far from zero: such a height is a nodata value that is not stated."""
-_UNITS_M = {
-    "": None, "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0,
-    "cm": 0.01, "mm": 0.001, "ft": 0.3048, "foot": 0.3048, "feet": 0.3048,
-    "us-ft": 1200.0 / 3937.0, "ftus": 1200.0 / 3937.0, "us survey foot": 1200.0 / 3937.0,
-}  # fmt: skip
 MOST_CELLS, MOST_MESHED = 50_000_000, 2_000_000
 """Cells that are read, for the memory; and cells that become a mesh."""
 ROUGH_DEG = 3.0
@@ -254,8 +249,6 @@ def read_water_raster(
     short = name.replace("\\", "/").rpartition("/")[2]
     if is_grid and np.isfinite(heights).any():
         return WaterRaster(heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), short)
-    if to_cloud is not None and crs is not None:
-        heights /= systems.metres_up(crs)
     mesh = _mesh_of(heights, t, to_cloud or np.asarray, short)
     if len(mesh.triangles) == 0:
         sentence = "has no height near the cloud. Check its CRS and its nodata value."
@@ -296,20 +289,14 @@ def _heights(
     source: DatasetReader, window: Window, crs: CRS | None, name: str
 ) -> tuple[FloatArray, list[PcfixWarning]]:
     """Read part of a raster, metres, NaN for no height; also return notes on what is assumed."""
-    # one unit of the heights is that of the band, else that of the CRS
     unit, notes = (source.units[0] or "").strip(), list[PcfixWarning]()
-    if unit.lower() not in _UNITS_M:
-        sentence = f"its heights are in '{unit}'. Convert them to metres, or correct the unit."
+    # the unit of heights is that of the band, else that of the CRS
+    own_m = 1.0 if unit or crs is None or systems.is_local(crs) else systems.metres_up(crs)
+    if unit.lower() not in METRES or own_m != 1.0:
+        stated = unit or f"the unit of {'' if crs is None else crs.name}"
+        sentence = f"its heights are in {stated}. Convert them to metres."
         raise bad_file(name, "water.raster_unit", sentence, value=unit)
-    unit_m = _UNITS_M[unit.lower()]
-    if unit_m is None and crs is not None and not systems.is_local(crs):
-        unit_m = systems.metres_up(crs)
-        if unit_m != 1.0 and systems.parts(crs)[1] is None:
-            sentence = f"{name}: has no unit of heights; that of its CRS is assumed"
-            sentence += f" ({unit_m:.4f} m)."
-            notes.append(PcfixWarning("water.raster_unit", sentence, unit_m=unit_m))
-    stored = read_masked(source, window=window)
-    heights = (stored * source.scales[0] + source.offsets[0]) * (unit_m or 1.0)
+    heights = read_masked(source, window=window) * source.scales[0] + source.offsets[0]
     if source.nodata is None:
         heights[~(np.abs(heights) <= IMPOSSIBLE_M)] = np.nan
         unknown = int(np.isnan(heights).sum())
