@@ -113,7 +113,7 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
         plan = plan_correction(plan)
         for rows, points in _chunks(cloud, plan.found.surface):
             correction, one = correct_chunk(plan, points, rows.start)
-            results.add(rows, correction, options.uncorrected == "withhold")
+            results.add(rows, correction)
             tally = one if tally is None else tally + one
     summary = finish(plan, task, tally)
     outs.update(results.dimensions)
@@ -171,10 +171,6 @@ def _options(namespace: dict[str, Any], kind: type[Set]) -> Set:
     if not isinstance(given, dict):
         sentence = f"pdalargs: must be an object of options, not {given!r}."
         raise SettingError("option.type", sentence, value=given)
-    twice = next((name for name in given if "-" in name and name.replace("-", "_") in given), None)
-    if twice is not None:
-        sentence = f"pdalargs: {twice} is given twice, with dashes and underscores."
-        raise SettingError("option.twice", sentence, option=twice)
     given = {name.replace("-", "_"): value for name, value in given.items()}
     # PDAL reads and writes rasters
     files = (*options_of(BandOption), *options_of(RasterOutputs))

@@ -341,7 +341,7 @@ def test_corrected_twice(corrected, name):
         ["correct", "cloud.las", "out.las", "--cameras", "cameras.csv"],
         correct("--deeper"),
         correct("--jobs", "few"),
-        correct("--uncorrected", "burn"),
+        correct("--method", "burn"),
         correct("--dimensions", "some"),
         ["restore", "cloud.las"],
         ["refract", "cloud.las"],

@@ -91,19 +91,3 @@ def test_part():
     given = with_index(CorrectOptions(salinity=10.0))
     part = given.part(ScienceOptions)
     assert (part.index, part.index_from) == (given.index, "10 PSU, 15 C, 0.53 um")
-
-
-@pytest.mark.parametrize(
-    ("options", "plain"),
-    [
-        (
-            {"cameras_offset": (319900.125, 4650123.4567, 0.0), "respect_classes": (2, 5)},
-            {"cameras_offset": "319900.125,4650123.4567,0", "respect_classes": "2,5"},
-        ),
-        ({"max_angle": None}, {"max_angle": "none"}),
-    ],
-)
-def test_stage(options, plain):
-    given = CorrectOptions(**options)
-    assert given.plain() == plain
-    assert CorrectOptions(**plain) == given

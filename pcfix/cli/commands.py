@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -188,8 +187,7 @@ def cameras(path: Path, /, *, options: CamerasCheckOptions) -> None:
 
 
 @command(
-    "pcfix water shore.csv --cloud cloud.laz --plot water.png",
-    spec="Water surface, as --water of 'pcfix correct'.",
+    "pcfix water shore.csv --cloud cloud.laz", spec="Water surface, as --water of 'pcfix correct'."
 )
 def water(spec: str, /, *, options: WaterCheckOptions) -> None:
     """Read, fit or detect a water surface, with its standard error."""
@@ -215,18 +213,6 @@ def simulate(out_dir: Path, /, *, options: SimulateOptions, quiet: bool) -> None
         scene = pcfix.simulate_scene(options=options, progress=progress)
         write_scene(scene, out_dir, overwrite=options.overwrite)
     say(f"{out_dir}: {scene.description}", quiet)
-
-
-@command(
-    "pcfix pipeline cloud.laz corrected.laz --cameras cameras.csv --water 0.37",
-    input="LAS or LAZ cloud.",
-    output="LAS or LAZ to write.",
-)
-def pipeline(input: Path, output: Path, /, *, options: CorrectOptions) -> None:
-    """Print the PDAL pipeline equivalent to 'pcfix correct', as JSON."""
-    from pcfix.flow.pipeline import pipeline_for
-
-    say(json.dumps(pipeline_for(input, output, options), indent=2))
 
 
 @command("pcfix plan --height 60 --overlap 0.8 --sidelap 0.7 --depth 1,2,5")

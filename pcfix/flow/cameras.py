@@ -110,7 +110,7 @@ def check_cameras(
     gnss = _gnss(cameras, str(path))
     if view is not None:
         up = 0.0 if gnss is None or inputs.cameras_crs is None else np.nan_to_num(gnss["mean_m"][2])
-        fit = _fit(cameras, view, xyz, quick_ties(inputs, view.crs), up, path)
+        fit = _fit(cameras, view, xyz, quick_ties(inputs, view.crs), up)
     figures = plain({
         "path": path,
         "crs_read": read.crs,
@@ -211,7 +211,6 @@ def _gnss(cameras: Cameras, name: str) -> Plain | None:
 
 def _fit(
     cameras: Cameras, view: CloudView, xyz: FloatArray, ties: TiePoints | None, up_m: float,
-    file: File,
 ) -> Plain:  # fmt: skip
     """Test cameras against a sample of the cloud; `up_m` are they above their GNSS positions.
 
@@ -220,7 +219,7 @@ def _fit(
     """
     visible = np.minimum(cameras_in_sight(xyz, cameras), 3)
     shares = np.bincount(visible, minlength=4) / len(xyz)
-    found = plausible(cameras, xyz, ties, file=file)
+    found = plausible(cameras, xyz, ties)
     verdict = likely_mistake(cameras.centres, xyz.min(axis=0), xyz.max(axis=0), view.crs)
     verdict = verdict or " ".join(map(str, found.doubts))
     if not verdict and abs(up_m) >= UNDULATION_M[0]:

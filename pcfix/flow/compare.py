@@ -50,10 +50,10 @@ def compare_clouds(
     started = time.perf_counter()
     given = taken(CompareOptions, options, keywords, "compare_clouds")
     lines = [parse_line(line) if isinstance(line, str) else line for line in given.section]
-    compared = band_of(cloud_of(cloud), given)
+    source = band_of(cloud_of(cloud), given)
     also = {name: cloud_of(path) for name, path in given.also}
     surveyed = reference_of(reference)
-    read = (compared, surveyed, *also.values())
+    read = (source, surveyed, *also.values())
     _check_outputs(given, [path for one in read for path in inputs_of(one)])
     if given.m3c2:
         load_py4dgeo()
@@ -61,7 +61,7 @@ def compare_clouds(
     if given.water is not None:
         from pcfix.flow.surfaces import find_surface, view_of  # slow to import
 
-        water = find_surface(given.water, WaterOptions(), view_of(compared)).surface
+        water = find_surface(given.water, WaterOptions(), view_of(source)).surface
     outputs = [path for path in (given.out_dir, given.summary, given.plot) if path is not None]
     near = Path([*outputs, Path(tempfile.gettempdir()) / "pcfix"][0])
     with scratch_arrays(near):  # arrays of large clouds
@@ -71,7 +71,7 @@ def compare_clouds(
             check_same_crs(one.name, one.crs, target.name, target.crs)
             return match(one, target, given.part(CompareRules), given=water is not None)
 
-        matched, others = matched_to(read_cloud(compared, water)), {}
+        matched, others = matched_to(read_cloud(source, water)), {}
         for name, further in also.items():  # at the places of the first
             others[name] = replace(matched_to(read_cloud(further, water)), places=matched.places)
         result = figures_of(matched, lines, others)

@@ -56,6 +56,7 @@ from pcfix.refract.regression import DepthRegression
 from pcfix.refract.tally import Tally
 from pcfix.report.summary import Summary
 from pcfix.version import __version__
+from pcfix.water.auto import WaterProposal
 from pcfix.water.checks import as_surface, check_submerged, checked_points, refuse_under_water
 from pcfix.water.index import with_index
 from pcfix.water.surface import FoundSurface
@@ -112,7 +113,6 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
     if is_raster(source.path):
         written = (*columns.COLUMNS, columns.OUTCOME)
     header = output_header(source, "settings", plan.provenance(), written)
-    uncorrected = plan.options.uncorrected
 
     def compute(points: Chunk, row: int) -> tuple[Correction, CloudTally]:
         return correct_chunk(plan, points_of(points, source, plan.found.surface), row)
@@ -123,9 +123,7 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
         # whole steps of the file's own scale, so that 'pcfix restore' gets back every bit
         classes = np.array(new["classification"])
         withheld = np.asarray(new["withheld"]).astype(bool)
-        changes = columns.changes_of(
-            written, correction, classes, withheld, new.scales, withhold=uncorrected == "withhold"
-        )
+        changes = columns.changes_of(written, correction, classes, withheld, new.scales)
         columns.move(new, changes.steps, source.path)
         columns.fill(new, changes)
         new.array["classification"][correction.corrected] = BATHYMETRIC_POINT
@@ -261,12 +259,10 @@ def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
 
 def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> Plausible:
     """Test cameras, cloud and water against each other; warn of what does not fit."""
-    sample, given = tally.sample or CloudSample(), plan.inputs.cameras
-    sought = (plan.found.as_dict() or {}).get("model") == "auto"
-    tested = plausible(
-        plan.cameras, sample.xyz, ties, () if sought else sample.level_doubts(),
-        file="" if isinstance(given, Cameras) else given or "", listed=plan.kind is not None,
-    )  # fmt: skip
+    sample, sought = tally.sample or CloudSample(), isinstance(plan.found, WaterProposal)
+    doubts = () if sought else sample.level_doubts()
+    listed = plan.kind is not None
+    tested = plausible(plan.cameras, sample.rows[:, :3], ties, doubts, listed=listed)
     for warning in tested.doubts:
         warnings.warn(warning, stacklevel=3)
     return tested
@@ -279,7 +275,6 @@ def correct_points(
     *,
     options: RefractionOptions | None = None,
     views: Views | None = None,
-    may_be_submerged: npt.ArrayLike | None = None,
     level_offset_m: npt.ArrayLike | None = None,
     adjusted_from: Cameras | None = None,
     regression: DepthRegression | None = None,
@@ -297,7 +292,7 @@ def correct_points(
         none.
     water : WaterSurface, float, or array of shape (n,)
         The water surface (see `pcfix.read_water`), its level in metres, or its height above
-        each point, NaN where it is unknown.
+        each point, NaN for land (`pcfix.label_points` finds it) and where it is unknown.
     options : RefractionOptions, optional
         Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
         from the surface normal), camera_set, matcher, depth_factor, sigma_image and the other
@@ -306,9 +301,6 @@ def correct_points(
     views : Views, optional
         The view list: the images that contributed to each point, as rows of `adjusted_from` if it
         is given, else of `cameras`. Default: as the option `camera_set` says.
-    may_be_submerged : array of bool, shape (n,), optional
-        The other points are land, even below the surface; `pcfix.label_points` finds them.
-        Default: all.
     level_offset_m : array, shape (k,), optional
         Height of the water above `water` when each image was taken; see
         `pcfix.io.tides.level_offsets`. Each ray is refracted at its own surface; `water` decides
@@ -366,14 +358,7 @@ def correct_points(
     original = cameras if adjusted_from is None else adjusted_from
     if views is not None:
         _check_views(views, xyz, original)
-    classes = np.zeros(len(xyz), np.uint8)
-    if may_be_submerged is not None:
-        allowed = np.asarray(may_be_submerged)
-        if allowed.shape != classes.shape or allowed.dtype != np.bool_:
-            sentence = f"may_be_submerged must be {len(xyz)} booleans, not {allowed.dtype}."
-            raise SettingError("array.shape", sentence, shape=allowed.shape)
-        classes[~allowed] = NOT_SUBMERGED
-    points = Points(xyz, heights, classes, views=views)
+    points = Points(xyz, heights, np.zeros(len(xyz), np.uint8), views=views)
     view = CloudView(
         "xyz", None, *corners(*xyz[:, :2].T), len(xyz), lambda water=None: iter([points])
     )
@@ -386,7 +371,7 @@ def correct_points(
         FoundSurface(surface),
         offset,
         views,
-        Labelling(LabelRules(respect_classes=(NOT_SUBMERGED,))),
+        Labelling(LabelRules()),
         regression,
     )
     plan = plan_correction(plan)
@@ -397,10 +382,6 @@ def correct_points(
     for note in plan.input_notes:
         warnings.warn(note, stacklevel=2)
     return correction
-
-
-NOT_SUBMERGED = 255
-"""The class of points that may not be submerged, for the rules of a labelling."""
 
 
 def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:

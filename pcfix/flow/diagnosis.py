@@ -17,7 +17,7 @@ from pcfix.flow.surfaces import CloudView
 from pcfix.io.gnss_positions import gnss_in_frame_of
 from pcfix.io.ground_control import read_ground_control
 from pcfix.model import Cameras, GnssPositions, TiePoints, WaterSurface
-from pcfix.options.declare import File, OptionSet
+from pcfix.options.declare import File, OptionSet, options_of
 from pcfix.options.shared import (
     DEFAULT_REFRACTIVE_INDEX,
     CameraFileOptions,
@@ -163,6 +163,9 @@ def flags_of(given: OptionSet) -> list[str]:
     """Return the options that `pcfix correct` and `pcfix adjust` have in common, as given."""
     words = []
     for kind in (WaterOptions, CameraFileOptions, ViewOptions, MaskOption):
-        for name, text in given.part(kind).plain().items():
-            words += [f"--{name.replace('_', '-')}", str(text)]
+        for one in options_of(kind):
+            value = getattr(given, one.name, one.default)
+            if isinstance(value, tuple):  # numbers
+                value = ",".join(f"{number:.15g}" for number in value)
+            words += [] if value == one.default else [one.flag, str(value)]
     return words

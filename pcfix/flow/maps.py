@@ -62,7 +62,7 @@ def write_rasters(run: RunFolder, *, errors: bool, progress: Progress | None = N
     By default the cells have 2 to 4 points, or those of a raster are as large as its own. This is
     also written on its own grid. Returns the side of the cells for ``run.json``.
     """
-    folder, cloud, cell_m = run.folder, run.cleaned, run.options.resolution
+    folder, cloud, cell_m = run.folder, run.cloud("cleaned"), run.options.resolution
     source = run.source
     if isinstance(source, RasterBand) and isinstance(cloud, Path):
         write_cells(source, cloud, {"height": folder / CORRECTED})
@@ -130,7 +130,7 @@ def write_map(path: Path, run: RunFolder, corrected: Plain, compared: Plain) -> 
     `corrected` and `compared` are the results of these steps. The height of the water has one
     standard error for all places.
     """
-    folder, cloud, options = run.folder, run.cleaned, run.options
+    folder, cloud, options = run.folder, run.cloud("cleaned"), run.options
     shapes = rasters.outlines(folder / DEPTH, MOST_CELLS)
     area = shapely.area(np.array(shapes, object)) if shapes else np.zeros(0)
     style = vector_style({"area": Symbol("fill", DARK, 0.5)})

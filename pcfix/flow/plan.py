@@ -42,15 +42,10 @@ MOST_BASES, MOST_SPACINGS = 8, 4
 """Limits of the simulated block: farther inside, the geometry repeats."""
 FEWEST_SEEN = 50
 PARTS = {
-    "image": (("sigma_image",),
-              "noise in the images: fly lower, or with more overlap or obliques"),
-    "level": (("sigma_level", "sigma_tilt"),
-              "the water level: measure it better, at the time of the flight"),
-    "waves": (("sigma_waves",), "waves: wait for calmer water"),
-    "index": (("sigma_index",), "the refractive index: measure salinity and temperature"),
-    "poses": (("sigma_centre", "sigma_attitude"), "poses: use RTK or more control points"),
+    "image": ("sigma_image",), "level": ("sigma_level", "sigma_tilt"), "waves": ("sigma_waves",),
+    "index": ("sigma_index",), "poses": ("sigma_centre", "sigma_attitude"),
 }  # fmt: skip
-"""Parts of the error budget: their options, and the remedy."""
+"""Parts of the error budget, and their options."""
 
 
 def plan_flight(
@@ -167,7 +162,7 @@ def _corrected(given: PlanOptions, bed: Block, apparent: FloatArray, part: str =
     off: dict[str, Any] = {}
     if part:
         names = {one.name for one in options_of(BudgetOptions)}
-        off = dict.fromkeys(names.difference(PARTS[part][0]), 0.0)
+        off = dict.fromkeys(names.difference(PARTS[part]), 0.0)
     views, options = Views(bed.start, bed.camera), replace(_refraction(given), **off)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PcfixWarning)
@@ -217,8 +212,6 @@ def plan_text(plan: Figures) -> str:
         for one in plan.depths
     ]  # fmt: skip
     title = f"Standard errors of the corrected bed in cm (refractive index {given['index']:g}):"
-    largest = max(deepest.parts_m, key=deepest.parts_m.get)
-    advice = f"The largest part of the error at {deepest.depth_m:g} m is {PARTS[largest][1]}."
     return "\n".join([
-        aligned(head, flight), "", title, *Table(title, header, errors).lines(), "", advice,
+        aligned(head, flight), "", title, *Table(title, header, errors).lines(),
     ])  # fmt: skip

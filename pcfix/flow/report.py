@@ -12,8 +12,6 @@ import numpy as np
 from pcfix.flow.adjust import FOLDER, SUMMARY
 from pcfix.flow.maps import DEPTH, UNCERTAINTY
 from pcfix.flow.run_folder import SURFACE, RunFolder
-from pcfix.flow.surfaces import view_of
-from pcfix.flow.water import found_picture
 from pcfix.grid.lattice import Lattice
 from pcfix.io.crs import crs_words
 from pcfix.io.files import read_json, sha256, write_bytes, write_text
@@ -67,7 +65,7 @@ def report_run(
     options, summary = run.options, Summary(**corrected)
     rasters = [SURFACE, DEPTH, *([] if summary.uncertainty is None else [UNCERTAINTY])]
     rasters += [DIFFERENCE] if compared and run.has_surface else []
-    with open_cloud(run.cleaned) as source:
+    with open_cloud(run.cloud("cleaned")) as source:
         maps = read_maps(run.folder, rasters, *crs_words(stated_crs(source)))
     if compared:
         figures = evaluation(
@@ -76,8 +74,6 @@ def report_run(
         more |= {"pictures": figures[0], "tables": figures[1]}
     if first["model"] is not None:
         more["verdict"] += f" {adjustment_sentence(read_json(run.folder / FOLDER / SUMMARY))}."
-    if (summary.water_fit or {}).get("model") == "auto":  # the water was sought in the cloud
-        more["pictures"].append(found_picture(run.inputs.surface(view_of(run.source))))
     page = write_report(
         run.folder, summary, run.cameras, maps, inputs,
         project=options.project or "", date=options.date or "", **more,

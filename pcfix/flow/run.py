@@ -152,7 +152,7 @@ def run(
     step(
         "clean", "Cleaning", cleaned,
         lambda progress: clean_file(
-            adjusted.corrected, cleaned, options=how, progress=progress
+            adjusted.cloud("corrected"), cleaned, options=how, progress=progress
         ).as_dict(),
         adjusted.cloud_files("cleaned"),
     )  # fmt: skip
@@ -325,7 +325,7 @@ def _compare(run: RunFolder) -> Plain:
     """Compare the cleaned cloud with the reference, and write a raster of differences."""
     folder = run.folder / COMPARED
     result = compare_clouds(
-        run.cleaned, run.reference, out_dir=folder, sections=maps.SECTIONS, overwrite=True,
+        run.cloud("cleaned"), run.reference, out_dir=folder, sections=maps.SECTIONS, overwrite=True,
         **vars(run.options.part(DistanceOptions)),
     )  # fmt: skip
     if run.has_surface:

@@ -116,30 +116,18 @@ class RunFolder:
 
     def cloud_files(self, name: str) -> list[Path]:
         """Return the files of a cloud of the run: one, or as many as the input has."""
-        path = self.path_of(name)
-        if isinstance(self.source, Tiles):
-            return [path / one.name for one in self.source.paths]
-        return [path]
+        path, tiles = self.path_of(name), self.source
+        return [path / one.name for one in tiles.paths] if isinstance(tiles, Tiles) else [path]
 
     def path_of(self, name: str) -> Path:
         """Return the path of the cloud corrected or cleaned, a folder for many files."""
         return self.folder / (name if isinstance(self.source, Tiles) else f"{name}.laz")
 
-    @cached_property
-    def corrected(self) -> Path | Tiles:
-        """The corrected cloud; it must exist."""
-        return self._cloud("corrected")
-
-    @cached_property
-    def cleaned(self) -> Path | Tiles:
-        """The cleaned cloud; it must exist."""
-        return self._cloud("cleaned")
-
-    def _cloud(self, name: str) -> Path | Tiles:
-        path = self.path_of(name)
+    def cloud(self, name: str) -> Path | Tiles:
+        """Return the cloud corrected or cleaned, which must exist."""
+        path, files = self.path_of(name), self.cloud_files(name)
         with _shown_before():
-            many = isinstance(self.source, Tiles)
-            return tiles_from(str(path), self.cloud_files(name)) if many else path
+            return tiles_from(str(path), files) if isinstance(self.source, Tiles) else path
 
     @property
     def resolution_m(self) -> float:
@@ -156,15 +144,16 @@ class RunFolder:
     def cameras(self) -> Cameras:
         """The cameras in the CRS of the cloud."""
         with _shown_before():
-            return read_blocks(self.inputs, view_of(self.corrected).crs).cameras
+            return read_blocks(self.inputs, view_of(self.cloud("corrected")).crs).cameras
 
     @cached_property
     def water(self) -> WaterSurface:
         """The water surface: as recorded in the corrected cloud, else as requested."""
         with _shown_before():
-            with open_cloud(self.corrected) as source:
+            cloud = self.cloud("corrected")
+            with open_cloud(cloud) as source:
                 stated = own_water(source)
-            return stated or self.inputs.surface(view_of(self.corrected)).surface
+            return stated or self.inputs.surface(view_of(cloud)).surface
 
 
 def _files_of(cloud: CloudFiles) -> list[Path]:

@@ -40,9 +40,6 @@ if TYPE_CHECKING:
     from pcfix.io.views import ViewMatch
 
 
-WATER_CLASSES = (9, 41)
-"""ASPRS: water, and water surface of the topo-bathy profile."""
-
 SAMPLE_POINTS = 2_000_000
 """Points of a cloud that are searched for water, evenly spread."""
 
@@ -236,26 +233,16 @@ def own_water_of(
     return OwnWater(build_fields(heights, k, rest), build_fields(sigma, k)), notes
 
 
-LEAST_CLASSIFIED, MOST_CLASSIFIED = 30, 2_000
-"""Points of the classes of water to which a surface is fitted."""
-
-
 def _found(view: CloudView | None) -> FoundSurface:
-    """Fit a surface to the points that are classified as water, or find it in the others."""
+    """Find the water level in a cloud."""
     from pcfix.water.auto import find_water
-    from pcfix.water.fit import fit_water
 
     if view is None:
         text = "The water surface 'auto' is found in a cloud. Give the cloud too."
         raise SettingError("cloud.missing", text)
-    whole = sample_of(view, SAMPLE_POINTS)
-    whole = whole.take(np.flatnonzero(~np.isin(whole.classes, NOISE_CLASSES)))
-    water = whole.xyz[np.isin(whole.classes, WATER_CLASSES)]
-    if len(water) >= LEAST_CLASSIFIED:
-        fit = fit_water(water[:: -(-len(water) // MOST_CLASSIFIED)])
-        note = f"The surface is fitted to the {len(water):,} points that are classified as water."
-        return replace(fit, notes=(note, *fit.notes))
-    return find_water(whole.xyz, whole.rgb)
+    some = sample_of(view, SAMPLE_POINTS)
+    some = some.take(np.flatnonzero(~np.isin(some.classes, NOISE_CLASSES)))
+    return find_water(some.xyz, some.rgb)
 
 
 def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundSurface:

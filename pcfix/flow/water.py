@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -10,19 +10,13 @@ from pcfix.errors import plain, shown_once
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import find_surface, sample_of, view_of
 from pcfix.io.files import check_input
-from pcfix.model import FloatArray, WaterDimension
+from pcfix.model import WaterDimension
 from pcfix.options.correct import WaterCheckOptions
 from pcfix.options.declare import taken
-from pcfix.report.page import AFTER, BEFORE, WATER, Picture, draw_cloud, label_plan, new_figure
 from pcfix.report.text import Plain, RowTable, aligned, filled
 from pcfix.water.auto import WaterProposal
 from pcfix.water.fit import ShoreFit
-from pcfix.water.river import RiverFit
 from pcfix.water.surface import FoundSurface, surface_above
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 SAMPLE_POINTS = 200_000
 """Points of the cloud that are compared with the water, evenly spread."""
@@ -57,13 +51,12 @@ def check_water(
     check_summary(given, inputs)
     view = None if cloud is None else view_of(check_input(cloud))
     found = shown_once(lambda: find_surface(spec, given, view), lambda found: found.notes)
-    sample, below, unknown = np.zeros((0, 3)), None, None
-    if view is not None:
+    below, unknown = None, None
+    if view is not None and not isinstance(found.surface, WaterDimension):
         sample = sample_of(view, SAMPLE_POINTS).xyz
-        if not isinstance(found.surface, WaterDimension):
-            height = surface_above(found.surface, sample, None).height_m
-            unknown = float(np.mean(~np.isfinite(height)))
-            below = float(np.mean(sample[:, 2] < height))
+        height = surface_above(found.surface, sample, None).height_m
+        unknown = float(np.mean(~np.isfinite(height)))
+        below = float(np.mean(sample[:, 2] < height))
     points = None
     if isinstance(found, ShoreFit):
         columns = found.points, found.residual_m, found.accepted
@@ -81,7 +74,7 @@ def check_water(
         "share_unknown": unknown,  # of those without a surface above them
         "notes": list(map(str, found.notes)),
     })  # fmt: skip
-    write_summary(given, figures, lambda: water_figure(found, sample))
+    write_summary(given, figures)
     return WaterReport(found, figures)
 
 
@@ -114,52 +107,3 @@ def water_text(report: WaterReport) -> str:
         words += f"; {unknown:.1f} % have no surface above them" if unknown else ""
         rows.append(("Cloud", words))
     return aligned(f"Water surface ({r['water']}): {r['surface']}", rows, found.notes)
-
-
-def water_figure(found: FoundSurface, cloud_xyz: FloatArray) -> Figure:
-    """Draw cloud and shoreline in plan, and below the surface along the shoreline points."""
-    figure, (plan, side) = new_figure(8.0, 7.5, nrows=2, height_ratios=[3, 2])
-    title, shown = str(found.surface), cloud_xyz
-    if isinstance(found, WaterProposal):
-        title = f"Water {found.level_m:.3f} ± {found.sigma_level_m:.3f} m"
-        title, shown = f"{title}, confidence {100.0 * found.confidence:.0f} %", found.ground
-    draw_cloud(figure, plan, shown, getattr(found, "level_m", None))
-    if found.points is not None:
-        _draw_shoreline(plan, side, found, found.points)
-    label_plan(plan, 20.0)
-    plan.set_title(title)
-    return figure
-
-
-def _draw_shoreline(plan: Axes, side: Axes, found: FoundSurface, points: FloatArray) -> None:
-    """Draw shoreline points in plan, and their heights along the river or their long side."""
-    if isinstance(found, RiverFit):
-        station, label = np.asarray(found.axis.locate(points[:, :2])[0]), "Down the flow (m)"
-    else:
-        local = points[:, :2] - points[:, :2].mean(axis=0)
-        station = local @ np.linalg.svd(local, full_matrices=False)[2][0]
-        station, label = station - station.min(), "Along the points (m)"
-    order = np.argsort(station)
-    height = found.height_at(points[order, :2])
-    reach = 2.0 * np.asarray(found.sigma_at(points[order, :2]))
-    side.plot(station[order], height, color=WATER, label="surface")
-    look: dict[str, Any] = {"color": WATER, "alpha": 0.3, "label": "95 %"}
-    side.fill_between(station[order], height - reach, height + reach, **look)
-    accepted = found.accepted if isinstance(found, ShoreFit) else np.ones(len(points), np.bool_)
-    for rows, mark, colour, name in (
-        (accepted, "o", AFTER, "accepted"),
-        (~accepted, "x", BEFORE, "rejected"),
-    ):
-        if rows.any():
-            plan.plot(*points[rows, :2].T, mark, color=colour, markersize=4, label=name)
-            side.plot(station[rows], points[rows, 2], mark, color=colour, markersize=4)
-    side.set(xlabel=label, ylabel="Height (m)")
-    side.legend(loc="best")
-    plan.legend(loc="upper right", bbox_to_anchor=(1.0, 1.0))
-
-
-def found_picture(found: FoundSurface) -> Picture:
-    """Return the picture of a surface that was found in the cloud, for the page."""
-    alt = "The shoreline that was found, in plan, and the heights along it."
-    figure = water_figure(found, np.zeros((0, 3)))
-    return Picture("water", "The water level found in the cloud", alt, figure)

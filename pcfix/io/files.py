@@ -37,7 +37,7 @@ LAST_LINES = 3
 def path_of(path: Any) -> Path:
     """Return a path as an object; the address of an object store is refused."""
     if re.match(r"\w{2,}:/", str(path)):  # of s3:// a Path leaves s3:/
-        sentence = "is not a local file. Copy it first, or use 'pcfix pipeline' (PDAL can read it)."
+        sentence = "is not a local file. Copy it first, or use PDAL, which can read it."
         raise bad_file(path, "input.remote", sentence)
     return path if isinstance(path, Path) else Path(path)
 

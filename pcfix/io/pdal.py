@@ -154,13 +154,12 @@ class Results:
             self._added[name].fill(0)
         self._added["Classification"] = cloud.classes.copy()
 
-    def add(self, rows: slice, correction: Correction, withhold: bool) -> None:
+    def add(self, rows: slice, correction: Correction) -> None:
         """Add one chunk."""
         out, cloud, scales, moved = self._added, self._cloud, self._scales, correction.moved
         changes = changes_of(
-            self._columns, correction, cloud.classes[rows], cloud.withheld[rows], scales,
-            withhold=withhold,
-        )  # fmt: skip
+            self._columns, correction, cloud.classes[rows], cloud.withheld[rows], scales
+        )
         for i, axis in enumerate("XYZ"):
             # land keeps its bits, negative zero included
             out[axis][rows][moved] += changes.steps[moved, i] * scales[i]

@@ -25,7 +25,7 @@ from pcfix.options.shared import (
     WaterOptions,
     WaterPerImageOption,
 )
-from pcfix.options.steps import DistanceOptions, ReferenceOption
+from pcfix.options.steps import DistanceOptions
 
 Dimensions = Literal["all", "minimal", "none"]
 Method = Literal[
@@ -156,8 +156,6 @@ class PointsOptions(RefractionOptions, WaterPerImageOption):
 class ScienceOptions(RefractionOptions, panel=Panel.OUTPUT):
     """All options that affect a corrected file; the file records them."""
 
-    uncorrected: Literal["withhold", "keep"] = option("withhold", basic=True)
-    """Submerged points with fewer than two usable rays: flag them as withheld, or keep them."""
     dimensions: Dimensions = option("all")
     """Extra dimensions to write; 'pcfix restore' needs all."""
 
@@ -258,16 +256,16 @@ class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions, panel=Pane
 
     cloud: File | None = option(None, basic=True)
     """LAS or LAZ cloud under the water surface."""
-    plot: File | None = option(None, writes=True, basic=True)
-    """PNG of points and residuals, or of the evidence for auto."""
 
 
 class RunOptions(
-    BandOption, ReferenceOption, TileOptions, DistanceOptions, SurveyedOptions, RefractionOptions,
-    MaskOption, LandRules, SurveyOptions, panel=Panel.OUTPUT,
+    BandOption, TileOptions, DistanceOptions, SurveyedOptions, RefractionOptions, MaskOption,
+    LandRules, SurveyOptions, panel=Panel.OUTPUT,
 ):  # fmt: skip
     """The options of ``pcfix run``; ``run.json`` records all that affect its results."""
 
+    reference: File | None = option(None, basic=True)
+    """LiDAR cloud, CSV check points or GeoTIFF to compare with."""
     resolution: float | None = option(None, basic=True, above=0)
     """Cell size of the rasters. [m] [default: 2 to 4 points a cell]"""
     project: str | None = option(None, basic=True)

@@ -264,26 +264,9 @@ class OptionSet:
         names = [one.name for one in fields(kind) if hasattr(self, one.name)]
         return kind(**{name: getattr(self, name) for name in names})
 
-    def plain(self) -> dict[str, Any]:
-        """Return the options that differ from their defaults, as ``pdalargs`` takes them."""
-        return {
-            one.name: _as_text(one, getattr(self, one.name))
-            for one in options_of(type(self))
-            if getattr(self, one.name) != one.default
-        }
-
     def as_dict(self) -> dict[str, Any]:
         """Return all values in the types of JSON."""
         return dict(plain(self))
-
-
-def _as_text(one: Option, value: Any) -> Any:
-    """Return a value for JSON: several numbers or words as one text with commas."""
-    if value is None:
-        return "none"  # null stands for the default
-    if isinstance(value, tuple) and one.parse is not None:
-        return ",".join(f"{v:.15g}" if isinstance(v, float) else str(v) for v in value)
-    return plain(value)
 
 
 _KNOWN: dict[type, tuple[Option, ...]] = {}

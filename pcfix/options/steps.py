@@ -278,13 +278,6 @@ class CompareRules(DistanceOptions, panel=Panel.FIGURES):
         return not self.c2c_only
 
 
-class ReferenceOption(OptionSet, panel=Panel.OUTPUT):
-    """The reference of a cloud."""
-
-    reference: File | None = option(None, basic=True)
-    """LiDAR cloud, CSV check points or GeoTIFF to compare with."""
-
-
 class CompareOptions(BandOption, OverwriteOption, SummaryOption, CompareRules, panel=Panel.OUTPUT):
     """The options of ``pcfix compare``."""
 

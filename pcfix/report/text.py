@@ -56,9 +56,9 @@ _CORRECTED: RowTable = (
      " poses: {transfer[shift_m][rms]:.3f} m rms, at most {transfer[shift_m][max]:.3f} m, mean Z"
      " {transfer[shift_m][mean_z]:+.3f} m", "transfer"),
     ("", "{transfer[not_transferred]:,} not transferred: {transfer[not_transferred_reason]}"
-     " ({fate})", "transfer[not_transferred]"),
+     " (not moved, withheld)", "transfer[not_transferred]"),
     ("Submerged", "{submerged:,} points ({submerged:of points}), {corrected_words}", ""),
-    ("", "{count:,} not corrected: {name} ({fate})", "*uncorrected"),
+    ("", "{count:,} not corrected: {name} (not moved, withheld)", "*uncorrected"),
     _NO_SURFACE,
     ("Raster", "{raster[cells_changed]:,} cells changed, {raster[cells_empty]:,} of them have no"
      " height any more", "raster"),
@@ -293,10 +293,8 @@ def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
             check = "cameras may not match the cloud; see the warnings"
         elif not s.fit["fits"]:
             check = "cameras and cloud could not be tested"
-    fates = {"withhold": "not moved, withheld", "keep": "not moved"}
     corrected = f"{s.corrected:,} corrected ({share(s.corrected, s.submerged)})"
     return filled(_CORRECTED, vars(s) | {
-        "fate": fates[s.settings["uncorrected"]],
         "corrected_words": "all corrected" if s.corrected == s.submerged else corrected,
         "method": method,
         "rays_per_point": s.rays / max(s.corrected, 1),

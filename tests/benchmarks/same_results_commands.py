@@ -61,8 +61,7 @@ OF_RIVER = {
         "--sigma-image 1 --sigma-level 0.05 --sigma-tilt 0.1 --sigma-index 0.005 --sigma-waves 1"
         " --sigma-centre 0.03 --sigma-attitude 0.01"
     ),
-    "keep": "--max-angle 1 --uncorrected keep",
-    "withhold": "--max-angle 4 --uncorrected withhold",
+    "withhold": "--max-angle 4",
     "mask": "--water-mask {inputs}/mask.geojson",
     "quiet": "--quiet",
 }
@@ -260,7 +259,7 @@ API += """
         for word in inspect.signature(thing).parameters.values():
             print("   ", word.replace(annotation=word.empty), word.kind.name)
 """
-NAMES = "run correct adjust label clean dsm compare cameras water pipeline restore simulate demo"
+NAMES = "run correct adjust label clean dsm compare cameras water restore simulate demo"
 
 
 def table() -> dict[str, str]:
@@ -330,8 +329,6 @@ def table() -> dict[str, str]:
     shown = "--reference {samples}/scene/lidar.laz --cameras {samples}/scene/cameras.csv"
     commands["view"] = f"view {{scene.snell/out.laz}} {shown} --water 0.37 --image out.png"
     commands["qgis-plugin"] = "qgis-plugin out.zip"
-    add("pipeline", f"pipeline {SCENE}", {"scene": "", "more": "--max-angle 40 --connected"})
-    commands["pipeline.river"] = IN_RIVER.replace("correct ", "pipeline ", 1)
     flight = "--block oblique --detection 0.9 --position-noise-m 0.03"
     kinds = {"tracks": "", "river": "--bed river", "oblique": flight}
     kinds["waves"] = "--wave-slope-deg 1 --tilt-percent 0.2 --bed steps --seed 3 --lidar-per-m2 1"
@@ -355,7 +352,7 @@ def pdal_table() -> dict[str, str]:
     more = {
         "options": {"max_angle": 30, "connected": True, "summary": "summary.json", "jobs": 1},
         "consistent": {"method": "consistent", "camera_set": "all", "dimensions": "minimal"},
-        "keep": {"uncorrected": "keep", "index": "sea", "sigma_waves": 1},
+        "sea": {"index": "sea", "sigma_waves": 1},
         "wrong": {"method": "magic"},
         "unknown": {"kamera": 1},
     }

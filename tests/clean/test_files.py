@@ -119,12 +119,11 @@ def test_record(tmp_path: Path) -> None:
     assert np.array_equal(_before(second), aside | again)
 
 
-@pytest.mark.parametrize("uncorrected", ["withhold", "keep"])
-def test_restore_after_cleaning(tmp_path: Path, uncorrected: str) -> None:
+def test_restore_after_cleaning(tmp_path: Path) -> None:
     source = write_cloud(tmp_path / "in.laz", 1)
     steps = [tmp_path / name for name in ("corrected.laz", "cleaned.laz", "restored.laz")]
     cameras = block()
-    pcfix.correct_file(source, steps[0], cameras=cameras, water=WATER_M, uncorrected=uncorrected)
+    pcfix.correct_file(source, steps[0], cameras=cameras, water=WATER_M)
     result = clean_file(steps[0], steps[1], **MANY)
     assert result.not_run == []
     assert result.reasons["below_bed"] > 0

@@ -36,7 +36,6 @@ def options(draw, scene: Scene) -> dict[str, object]:
         "method": method,
         "deep": True,
         "index": draw(st.floats(1.0, 1.5)),
-        "uncorrected": draw(st.sampled_from(["withhold", "keep"])),
         "dimensions": draw(st.sampled_from(["all", "minimal", "none"])),
         "respect_classes": draw(st.sampled_from([(), (2,), (0, 2, 40, 41)])),
         "connected": draw(st.booleans()),

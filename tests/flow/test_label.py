@@ -154,7 +154,7 @@ def test_corrects_what_is_labelled(path, tmp_path, mask, choices):
     )
     submerged = labels == 40
     arrays = pcfix.correct_points(
-        las.xyz, pcfix.read_cameras(cameras), WATER_M, may_be_submerged=submerged
+        las.xyz, pcfix.read_cameras(cameras), np.where(submerged, WATER_M, np.nan)
     )
     np.testing.assert_array_equal(arrays.corrected, np.asarray(out.RayCount) > 0)
     assert result.submerged == submerged.sum() == arrays.submerged.sum()

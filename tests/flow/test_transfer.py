@@ -123,9 +123,6 @@ def test_unseen_points(cloud, old):
     assert np.array_equal(
         np.array(after.classification)[behind], np.array(before.classification)[behind]
     )
-    _, _, after = correct(cloud, cameras=adjusted(old), adjusted_from=old, uncorrected="keep")
-    assert np.array_equal(after.withheld, before.withheld)
-    assert not np.array(after.WaterDepth)[behind].any()
 
 
 @pytest.mark.parametrize("number", [1, 7])

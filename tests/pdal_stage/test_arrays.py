@@ -86,8 +86,7 @@ def test_correct(cloud, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("keeps", ["ClassFlags", "Withheld"])
-@pytest.mark.parametrize("uncorrected", ["keep", "withhold"])
-def test_withheld(tmp_path, keeps, uncorrected):
+def test_withheld(tmp_path, keeps):
     ins = arrays_of(random_cloud(7))
     cameras_csv(tmp_path / "cameras.csv", framed_block(), angles=True)
     (tmp_path / "sensor.csv").write_text("focal,sensor_x,sensor_y\n24,24,9.6\n")
@@ -99,11 +98,10 @@ def test_withheld(tmp_path, keeps, uncorrected):
     ins["Outcome"] = np.zeros(len(was), np.uint8)
     outs, _ = run(
         "correct", ins, None, cameras=str(tmp_path / "cameras.csv"), water=WATER_M,
-        uncorrected=uncorrected,
     )  # fmt: skip
     stuck = outs["Outcome"] > pcfix.Outcome.CORRECTED
     assert stuck.sum() > 0
-    expected = was | stuck if uncorrected == "withhold" else was
+    expected = was | stuck
     if keeps == "Withheld":
         np.testing.assert_array_equal(outs["Withheld"], expected)
     else:
@@ -146,12 +144,11 @@ MISTAKES = [
     ({**GOOD, "cameras": ["a"]}, "option.type"),
     ({**GOOD, "jobs": 2.5}, "option.type"),
     ("cameras.csv", "option.type"),
-    ({**GOOD, "max-angle": 30, "max_angle": 30}, "option.twice"),
     ({**GOOD, "water": "dim:w_surf"}, "cloud.dimension_missing"),
     ({**GOOD, "water": "wet"}, "water.spec"),
     ({**GOOD, "index": 1.6}, None),
     ({**GOOD, "max-angle": 95}, None),
-    ({**GOOD, "uncorrected": "burn"}, None),
+    ({**GOOD, "method": "burn"}, None),
     ({**GOOD, "jobs": 0}, None),
     ({**GOOD, "cameras": "none.csv"}, None),
     ({**GOOD, "water": -40}, None),

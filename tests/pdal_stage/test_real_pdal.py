@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.io.las.columns import COLUMNS
+from pcfix.io.las.columns import COLUMNS, UPGRADE
 from pcfix.io.pdal import CLASS_FLAGS, STAGE_SOURCE, add_dimension
 from tests.utils.clouds import WATER_M, block, cameras_csv, framed_block, random_cloud, write_cloud
 from tests.utils.codes import warned
 from tests.utils.nightly import mostly_nightly
-from tests.utils.program import run_pcfix
 from tests.utils.real_pdal import ROOT, needs_pdal, pdal, python
 from tests.utils.shared import SCENE
 
@@ -35,12 +34,12 @@ def run_pipeline(door: str, job: dict[str, Any] | list[Any], folder: Path) -> An
     return python(EXECUTE, "job.json", folder=folder)
 
 
-def pipeline_of(folder: Path, *words: object) -> dict[str, Any]:
-    """Return what ``pcfix pipeline`` prints."""
-    done = run_pcfix("pipeline", *words, folder=folder)
-    assert (done.returncode, done.stderr) == (0, "")
-    job: dict[str, Any] = json.loads(done.stdout)
-    return job
+def job_of(point_format: int, **options: object) -> list[dict[str, Any]]:
+    """Return a pipeline from cloud.las to stage.las."""
+    writer = {"type": "writers.las", "forward": "all", "minor_version": 4, "extra_dims": "all"}
+    writer |= {"dataformat_id": UPGRADE[point_format], "filename": "stage.las"}
+    stage = stage_of() | {"pdalargs": {"cameras": "cameras.csv", **options}}
+    return [{"type": "readers.las", "filename": "cloud.las"}, stage, writer]
 
 
 def stage_of(**options: object) -> dict[str, Any]:
@@ -76,9 +75,7 @@ def test_stage_and_command(tmp_path: Path, number: int, door: str) -> None:
     write_cloud(tmp_path / "cloud.las", number, plain=True)
     cameras_csv(tmp_path / "cameras.csv", framed_block(), angles=True)
     (tmp_path / "sensor.csv").write_text("focal,sensor_x,sensor_y\n24,24,9.6\n")
-    words = ["cloud.las", "stage.las", "--cameras", "cameras.csv", "--water", WATER_M]
-    job = pipeline_of(tmp_path, *words)
-    done = run_pipeline(door, job, tmp_path)
+    done = run_pipeline(door, job_of(number, water=WATER_M), tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("PcfixWarning" if door == "python" else "warning:") == 1
     with warned("cameras.no_overlap"):
@@ -97,9 +94,7 @@ def test_water_of_a_dimension(tmp_path: Path, door: str) -> None:
     las.w_surf = 12.0 + 0.01 * (np.array(las.x) - np.mean(las.x))
     las.write(tmp_path / "cloud.las")
     cameras_csv(tmp_path / "cameras.csv", block())
-    words = ["cloud.las", "stage.las", "--cameras", "cameras.csv", "--water", "dim:w_surf"]
-    words += ["--max-angle", "80"]
-    done = run_pipeline(door, pipeline_of(tmp_path, *words), tmp_path)
+    done = run_pipeline(door, job_of(7, water="dim:w_surf", max_angle=80.0), tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     pcfix.correct_file(
         tmp_path / "cloud.las", tmp_path / "cli.las",
@@ -202,8 +197,7 @@ def test_recipe_with_cleaning(tmp_path: Path, point_format: int) -> None:
     cleaned = pcfix.clean_file(tmp_path / "corrected.las", tmp_path / "cleaned.las")
     assert cleaned.noise > 0
     assert_same(tmp_path / "cleaned.las", tmp_path / "out.las")
-    report = (tmp_path / "meta.json").read_text()
-    assert f'"noise": {cleaned.noise}' in report
+    assert f'"noise": {cleaned.noise}' in (tmp_path / "meta.json").read_text()
 
 
 @pytest.mark.parametrize("path", RECIPES, ids=lambda path: path.stem)
@@ -276,23 +270,3 @@ def test_fault_of_pcfix(tmp_path: Path) -> None:
     done = python(breaking + SURVIVE, "job.json", WATER_M, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "ZeroDivisionError: a fault" in done.stdout
-
-
-def test_pipeline_command(tmp_path: Path) -> None:
-    write_cloud(tmp_path / "cloud.las", 7, plain=True, count=300)
-    write_cloud(tmp_path / "waves.las", 10, plain=True, count=300)
-    cameras_csv(tmp_path / "cameras.csv", block())
-    good = ["--cameras", "cameras.csv", "--water", "5", "--max-angle", "80"]
-    assert run_pcfix("pipeline", "cloud.las", *good, folder=tmp_path).returncode == 2
-    for words in (
-        ["cloud.las", "out.las", *good, "--index", "1.6"],
-        ["cloud.las", "out.las", *good[:2], "--water", "wet"],
-        ["cloud.las", "out.las", *good, "--cameras", "none.csv"],
-        ["none.las", "out.las", *good],
-        ["cloud.las", "out.txt", *good],
-        ["cloud.las", "out.las", *good, "--water", "500"],
-        ["waves.las", "out.las", *good],
-    ):
-        done = run_pcfix("pipeline", *words, folder=tmp_path)
-        assert (done.returncode, done.stdout) == (1, ""), words
-        assert len(done.stderr.splitlines()) == 1

@@ -10,7 +10,7 @@ from pcfix.report.run import accuracy_tile, notes_of
 
 
 def summary(sigma=0.05, **more):
-    settings = {"sigma_level": None, "index": 1.34, "uncorrected": "keep"}
+    settings = {"sigma_level": None, "index": 1.34}
     given = {
         "uncertainty": {"sigma_z_m": {"mean": sigma}, "tvu_95_m": {"mean": 1.96 * sigma}},
         "settings": settings, "poses": None, "cameras": 2, "uncorrected": {}, "warnings": [],

@@ -6,8 +6,6 @@ import laspy
 import numpy as np
 import pytest
 
-from pcfix.flow.surfaces import CloudView, Points, corners, find_surface
-from pcfix.options.shared import WaterOptions
 from pcfix.water.auto import Cue, Moments, find_water, gain_of, tile_moments
 from tests.utils.codes import refused
 from tests.utils.shared import needs
@@ -69,18 +67,6 @@ def test_repeated_and_shifted():
     raised = find_water(xyz + np.array([0.0, 0.0, 100.0]), rgb=rgb)
     assert first.surface == again.surface and first.sigma_level_m == again.sigma_level_m
     assert raised.level_m == pytest.approx(first.level_m + 100.0, abs=1e-6)
-
-
-def test_water_classes():
-    xyz, _ = shore(5_000)
-    water = xyz[:400] * [1, 1, 0] + [0.0, 0.0, LEVEL_M + 1.0]
-    water[:, 2] += np.random.default_rng(0).normal(0.0, 0.02, len(water))
-    xyz, classes = np.vstack([xyz, water]), np.r_[np.full(len(xyz), 2), np.full(len(water), 9)]
-    chunks = [Points(xyz[rows], None, classes[rows]) for rows in (slice(3_000), slice(3_000, None))]
-    view = CloudView("cloud", None, *corners(*xyz[:, :2].T), len(xyz), lambda _: iter(chunks))
-    found = find_surface("auto", WaterOptions(), view)
-    assert found.level_m == pytest.approx(LEVEL_M + 1.0, abs=0.005)  # m: 5 standard errors
-    assert len(found.points) == len(water)
 
 
 @pytest.mark.parametrize("offset_m", [+5.0, -12.0])

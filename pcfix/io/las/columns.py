@@ -96,18 +96,15 @@ def changes_of(
     classes: npt.NDArray[Any],
     withheld: BoolArray,
     scales: FloatArray,
-    *,
-    withhold: bool,
 ) -> Changes:
-    """Return the changes by a correction; with `withhold` also flags for uncorrected points.
+    """Return the changes by a correction, and flags for uncorrected points.
 
     Classes and flags, shape (n,), are those of the input. Points that it withholds are not
     uncorrected here, so that `restore` can distinguish them from those that pcfix withheld. Points
     that are withheld because they could not be transferred have the same mark, a depth.
     """
     steps = np.rint(correction.shift_m / scales).astype(np.int64)
-    marked = correction.uncorrected if withhold else correction.submerged
-    changed = correction.corrected | (marked & ~withheld)
+    changed = correction.corrected | (correction.uncorrected & ~withheld)
     values: list[tuple[Column, BoolArray, npt.NDArray[Any]]] = []
     for column in columns:
         if column.scale == 0.0:
@@ -119,8 +116,7 @@ def changes_of(
             value = np.rint(value / column.scale)
         value = value if column.least is None else np.maximum(value, column.least)
         values.append((column, changed, value))
-    flagged = correction.uncorrected if withhold else np.zeros(len(changed), np.bool_)
-    return Changes(steps, flagged, values)
+    return Changes(steps, correction.uncorrected, values)
 
 
 def fill(points: laspy.ScaleAwarePointRecord, changes: Changes) -> None:
