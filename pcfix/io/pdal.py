@@ -22,8 +22,6 @@ Metadata: TypeAlias = "dict[str, Any]"
 NAME = "the pipeline's cloud"
 OUTCOME = "Outcome"
 """A dimension with `pcfix.Outcome`, if ``add_dimension`` adds it."""
-STAGE_SOURCE = "from pcfix.pdal_stage import {}"
-"""The source of a stage in a pipeline."""
 CLASS_FLAGS = "ClassFlags=uint8"
 """To be added for PDAL 2.2, where point formats 0 to 5 have no such dimension."""
 _PACKED_FLAGS = 64
