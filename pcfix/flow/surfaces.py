@@ -144,9 +144,13 @@ def find_surface(
         return _fitted(options, water, view)
     if view is None:
         return FoundSurface(read_water(water))
-    found = read_water(water, view.crs, view.bounds)
+    found = read_water(water, view.crs)
     if isinstance(found, WaterMesh):
         _check_near(str(water), found.vertices, view, 0.0)
+    elif isinstance(found, WaterRaster):
+        sides = np.multiply(found.height_m.shape[::-1], found.cell_m) * [1.0, -1.0]
+        corner = np.array([found.left_m, found.top_m])
+        _check_near(str(water), np.array([corner, corner + sides]), view, 0.0)
     return FoundSurface(found)
 
 

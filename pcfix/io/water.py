@@ -14,12 +14,10 @@ import math
 import os
 import warnings
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rasterio.windows import Window
 
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
 from pcfix.io import crs as systems
@@ -27,7 +25,7 @@ from pcfix.io.crs import Points
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels
 from pcfix.io.ply import Records, read_header
-from pcfix.io.rasters import Bounds, open_raster, place_of, read_masked
+from pcfix.io.rasters import open_raster, place_of, read_masked
 from pcfix.io.tables import METRES, number
 from pcfix.model import (
     FloatArray,
@@ -58,9 +56,7 @@ _CORNERS = "vertex_indices", "vertex_index"
 _MOST_VERTICES = 2**31
 
 
-def read_water(
-    spec: float | File, cloud_crs: str | CRS | None = None, bounds: Bounds | None = None
-) -> WaterSurface:
+def read_water(spec: float | File, cloud_crs: str | CRS | None = None) -> WaterSurface:
     """Read the water surface.
 
     Parameters
@@ -79,8 +75,6 @@ def read_water(
             or another raster that GDAL reads: one band of heights, in any CRS.
     cloud_crs : str or CRS, optional
         Projected, metres; rasters are brought to it. Default: that of the raster.
-    bounds : tuple of 4 float, optional
-        West, south, east and north end of the cloud: only this part of a raster is read.
 
     Examples
     --------
@@ -104,7 +98,7 @@ def read_water(
         return _mesh(found)
     if suffix in _NOT_RASTERS:
         raise bad_file(text, "water.format", f"is not a water surface. Give {KINDS}.")
-    return read_water_raster(text, cloud_crs, bounds)
+    return read_water_raster(text, cloud_crs)
 
 
 def _mesh(path: Path) -> WaterMesh:
@@ -181,19 +175,15 @@ def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
     return vertices.numbers(*"xyz"), corner[np.column_stack([first, other, other + 1])]
 
 
-MARGIN_M = 100.0
-"""Width of the strip around the cloud in which a ray may meet the water."""
 IMPOSSIBLE_M = 9000.0
 """A water surface is not as far from zero: such a height is a nodata value that is not stated."""
-MOST_CELLS, MOST_MESHED = 50_000_000, 2_000_000
+MOST_CELLS, MOST_MESHED = 10_000_000, 2_000_000
 """Cells that are read, for the memory; and cells that become a mesh."""
 ROUGH_DEG = 3.0
 """A slope by noise alone that moves a point by more than one percent of its depth."""
 
 
-def read_water_raster(
-    path: File, cloud_crs: str | CRS | None = None, bounds: Bounds | None = None
-) -> WaterRaster | WaterMesh:
+def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRaster | WaterMesh:
     """Read the heights of the water, in the cloud's CRS and metres; warn of what is assumed.
 
     A raster that is turned, or in another CRS, becomes a mesh of the centres of its cells.
@@ -205,9 +195,6 @@ def read_water_raster(
     cloud_crs : str, CRS or None
         Projected, in metres. If the raster or the cloud names no CRS, that of the other is
         assumed.
-    bounds : tuple of 4 float, optional
-        West, south, east and north end of the cloud, metres: only this part, and `MARGIN_M`
-        around it, is read. Default, and if one is not finite: the whole raster.
     """
     name = str(path)
     with open_raster(path) as source:
@@ -223,18 +210,15 @@ def read_water_raster(
         size = source.width, source.height
         at = np.column_stack([*place_of(t, *(share * size).T), np.zeros(5)])
         to_cloud, notes = systems.way_to_cloud(crs, cloud_crs, at, name, heights=True)
-        window = _window(source, bounds, crs, None if to_cloud is None else cloud_crs)
-        if min(window.width, window.height) < 2:
-            sentence = "has fewer than two rows and columns near the cloud. Check its CRS."
-            raise bad_file(name, "water.raster_far", sentence)
-        t = source.window_transform(window)
         is_grid = to_cloud is None and t.b == t.d == 0.0 and t.a > 0.0 > t.e  # north-up
-        cells, most = window.width * window.height, MOST_CELLS if is_grid else MOST_MESHED
-        if cells > most:
-            sentence = f"has {cells:,} cells near the cloud, {most:,} at most. Resample it to"
-            sentence += " coarser cells, north-up in the cloud's CRS."
+        cells, most = size[0] * size[1], MOST_CELLS if is_grid else MOST_MESHED
+        if min(size) < 2 or cells > most:
+            sentence = (
+                f"has {size[0]:,} x {size[1]:,} cells, {most:,} at most. Cut it to the cloud,"
+            )
+            sentence += " or make the cells larger, in the cloud's CRS."
             raise bad_file(name, "water.raster_size", sentence, cells=cells)
-        heights, more = _heights(source, window, crs, name)
+        heights, more = _heights(source, crs, name)
     # noise of the cells, against their neighbours: waves are smooth over a few cells
     around = (heights[:-2, 1:-1] + heights[2:, 1:-1] + heights[1:-1, :-2] + heights[1:-1, 2:]) / 4
     noise = np.abs(heights[1:-1, 1:-1] - around)
@@ -251,44 +235,16 @@ def read_water_raster(
         return WaterRaster(heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), short)
     mesh = _mesh_of(heights, t, to_cloud or np.asarray, short)
     if len(mesh.triangles) == 0:
-        sentence = "has no height near the cloud. Check its CRS and its nodata value."
+        sentence = "has no height. Check its nodata value."
         raise bad_file(name, "water.raster_empty", sentence)
     _tin_of(name, mesh)
     return mesh
 
 
-def _window(
-    source: DatasetReader, bounds: Bounds | None, crs: CRS | None, cloud_crs: str | CRS | None
-) -> Window:
-    """Return the part of a raster around the cloud; its bounds are in `cloud_crs`, if that differs.
-
-    The whole raster without bounds, and where they have no place in its CRS.
-    """
-    from rasterio.errors import RasterioError
-    from rasterio.warp import transform_bounds
-
-    size = np.array([source.width, source.height])
-    first, last = np.zeros(2, np.int64), size
-    if bounds is not None and np.isfinite(bounds).all():
-        box = np.array(bounds) + MARGIN_M * np.array([-1.0, -1.0, 1.0, 1.0])
-        with suppress(RasterioError):
-            if cloud_crs is not None and crs is not None:
-                # in plan; a vertical part is of no use here
-                given = systems.parts(systems.parse_crs(cloud_crs, "the cloud"))[0].to_wkt()
-                own = systems.parts(crs)[0].to_wkt()
-                box = np.array(transform_bounds(given, own, *box))
-            column, row = place_of(~source.transform, box[[0, 0, 2, 2]], box[[1, 3, 1, 3]])
-            cell = np.column_stack([column, row])
-            if np.isfinite(cell).all():
-                first, last = np.clip([cell.min(axis=0) - 2, cell.max(axis=0) + 3], 0, size)
-    (left, top), (right, bottom) = first.astype(int).tolist(), last.astype(int).tolist()
-    return Window(left, top, right - left, bottom - top)
-
-
 def _heights(
-    source: DatasetReader, window: Window, crs: CRS | None, name: str
+    source: DatasetReader, crs: CRS | None, name: str
 ) -> tuple[FloatArray, list[PcfixWarning]]:
-    """Read part of a raster, metres, NaN for no height; also return notes on what is assumed."""
+    """Read a raster, metres, NaN for no height; also return notes on what is assumed."""
     unit, notes = (source.units[0] or "").strip(), list[PcfixWarning]()
     # the unit of heights is that of the band, else that of the CRS
     own_m = 1.0 if unit or crs is None or systems.is_local(crs) else systems.metres_up(crs)
@@ -296,7 +252,7 @@ def _heights(
         stated = unit or f"the unit of {'' if crs is None else crs.name}"
         sentence = f"its heights are in {stated}. Convert them to metres."
         raise bad_file(name, "water.raster_unit", sentence, value=unit)
-    heights = read_masked(source, window=window) * source.scales[0] + source.offsets[0]
+    heights = read_masked(source) * source.scales[0] + source.offsets[0]
     if source.nodata is None:
         heights[~(np.abs(heights) <= IMPOSSIBLE_M)] = np.nan
         unknown = int(np.isnan(heights).sum())

@@ -9,7 +9,6 @@ from rasterio.transform import Affine, from_origin
 
 import pcfix
 from pcfix.io.scenes import write_scene
-from pcfix.io.water import MARGIN_M
 from pcfix.water.surface import surface_above
 from tests.utils.codes import refused, warned
 
@@ -140,19 +139,6 @@ def test_north_up(tmp_path):
     expect_plane(water, places()[np.isfinite(surface_above(water, places()).height_m)])
 
 
-def test_bounds(tmp_path):
-    transform = from_origin(LEFT, TOP, 2.0, 2.0)
-    path = write(tmp_path / "water.tif", tilted(*cells(transform, 600, 700)))
-    west, north = LEFT + 500.0, TOP - 500.0
-    water = pcfix.read_water(path, UTM33, (west, north - 50.0, west + 100.0, north))
-    assert water.height_m.shape[0] * 2.0 < 50.0 + 2 * MARGIN_M + 12.0
-    assert water.height_m.shape[1] * 2.0 < 100.0 + 2 * MARGIN_M + 12.0
-    at = places(50)[:, :] * 0 + [west + 33.3, north - 44.4, 0.0]
-    expect_plane(water, at)
-    with refused("water.raster_far"):
-        pcfix.read_water(path, UTM33, (west + 5000, north, west + 6000, north + 50))
-
-
 @pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:32632", "EPSG:3857"])
 def test_another_crs(tmp_path, crs):
     to = Transformer.from_crs(UTM33, crs, always_xy=True)
@@ -163,9 +149,8 @@ def test_another_crs(tmp_path, crs):
     path = write(
         tmp_path / "w.tif", plane_in(crs, transform, rows=rows, columns=columns), transform, crs
     )
-    bounds = (LEFT, TOP - 300.0, LEFT + 400.0, TOP)
     # the plane is bent by a map of another zone: below 0.1 mm over a cell
-    expect_plane(pcfix.read_water(path, UTM33, bounds), within_m=1e-4)
+    expect_plane(pcfix.read_water(path, UTM33), within_m=1e-4)
 
 
 def turned_by(degrees, left, top):
@@ -227,7 +212,7 @@ FLAT = np.full((20, 20), 10.0)
     ("name", "content", "more", "code"),
     [
         ("rgb.tif", FLAT, {"bands": 3}, "water.raster_bands"),
-        ("row.tif", FLAT[:1], {}, "water.raster_far"),
+        ("row.tif", FLAT[:1], {}, "water.raster_size"),
         ("n.tif", FLAT, {"transform": Affine.identity(), "crs": None}, "water.raster_place"),
         ("large.tif", FLAT, {}, "water.raster_size"),
         ("garbage.tif", b"II*\0nonsense", {}, "raster.damaged"),
