@@ -114,9 +114,9 @@ def read_cloud(
 ) -> SurveyCloud:
     """Read the points that count of a LAS or LAZ cloud, in one file or in many.
 
-    Those of `skip_classes`, and withheld ones, are left out. The `water` is by default what a cloud
-    that pcfix corrected says of its own. An `InputError` if the file is damaged, no point counts,
-    or it lacks the dimension that `water` names.
+    Those of `skip_classes`, and withheld ones, are left out. The `water` is by default the one in
+    the record of a cloud that pcfix corrected. An `InputError` if the file is damaged, no point
+    counts, or it lacks the dimension that `water` names.
     """
     columns: list[npt.NDArray[Any]] = []
     first = 0
@@ -200,7 +200,7 @@ def is_cloud(reference: Path | Tiles) -> bool:
 
 
 def read_reference(reference: Clouds) -> Reference:
-    """Read a reference; the end of its name says what it is.
+    """Read a reference of the kind that the end of its name states.
 
     ``.las``, ``.laz``, and many files of these: all points but those withheld and those of noise or
     water; ``.csv``, ``.txt``: columns x, y, z; ``.tif``, ``.tiff``: the centres of all cells with

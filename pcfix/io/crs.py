@@ -150,9 +150,9 @@ def with_heights(plan: CRS, vertical: CRS) -> CRS:
 
 def crs_text(crs: CRS) -> str:
     """Return the shortest text that names a CRS exactly: its codes, else WKT."""
-    whole = _code(crs)
-    if whole is not None:
-        return ":".join(whole)
+    own = _code(crs)
+    if own is not None:
+        return ":".join(own)
     codes = [_code(part) for part in crs.sub_crs_list]
     known = [code[1] for code in codes if code is not None and code[0] == "EPSG"]
     if crs.is_compound and len(known) == len(codes):
@@ -349,7 +349,7 @@ def way_to_cloud(
     """Return the transformation from a file's CRS to the cloud's, None for none, and notes.
 
     A CRS that is None is not stated; that of the file is ``local`` to use its numbers unchanged.
-    The cloud's is projected, in metres. `heights` says whether z matters.
+    The cloud's is projected, in metres. With `heights` z matters.
     """
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
     if isinstance(crs, str) and crs.strip().lower() == LOCAL:

@@ -1,6 +1,6 @@
 """Rules for every file that pcfix writes, and files that one command leaves for another.
 
-What is written is whole or not at all, and never over another's work.
+A file is written completely or not at all, and replaces another only if the user asks for it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from pcfix.adjust.precision import Members
 
 LAST_LINES = 3
-"""Of what another program says when it fails."""
+"""Lines of the messages of another program that are shown when it fails."""
 
 
 def path_of(path: Any) -> Path:
@@ -101,7 +101,7 @@ def belonging(path: File) -> list[Path]:
     """Return what may be read where a file or folder is named.
 
     Of a folder that is all that it and its folders hold, but hidden files; of a project the same of
-    its folder. With a file go those of its stem, and the sensor beside it, which may be missing.
+    its folder. With a file go those of its stem, and the sensor next to it, which may be missing.
     """
     found = Path(path)
     folder, chosen = found, set[Path]()
@@ -279,7 +279,7 @@ def scratch_arrays(target: Path) -> Iterator[Empty]:
 
 
 ENSEMBLE = "ensemble.npz"
-"""The file beside an adjusted model with the members of its ensemble."""
+"""The file next to an adjusted model with the members of its ensemble."""
 
 
 def write_members(folder: Path, members: Members) -> None:
@@ -288,7 +288,7 @@ def write_members(folder: Path, members: Members) -> None:
 
 
 def find_members(cameras: File) -> tuple[Path, Members] | None:
-    """Return the members beside a camera file, and their file; None if there is none.
+    """Return the members next to a camera file, and their file; None if there is none.
 
     It is in the folder of the adjustment: a model's own folder, or one of the two above it.
     """

@@ -115,10 +115,10 @@ def _write_jpeg(source: Path, path: Path, pixels: Pixels, touched: BoolArray) ->
         if old.mode != "L":
             how["subsampling"] = get_sampling(old)
     Image.fromarray(pixels.squeeze()).save(path, "JPEG", **how)
-    whole, new = jpeglib.read_dct(str(source)), jpeglib.read_dct(str(path))
-    most = whole.samp_factor.max(axis=0)
-    for name, factor in zip(("Y", "Cb", "Cr"), whole.samp_factor, strict=False):
-        blocks = getattr(whole, name)
+    stored, new = jpeglib.read_dct(str(source)), jpeglib.read_dct(str(path))
+    most = stored.samp_factor.max(axis=0)
+    for name, factor in zip(("Y", "Cb", "Cr"), stored.samp_factor, strict=False):
+        blocks = getattr(stored, name)
         if blocks is not None:
             side = 8 * most // factor
             high, wide = blocks.shape[0] * side[0], blocks.shape[1] * side[1]
@@ -127,7 +127,7 @@ def _write_jpeg(source: Path, path: Path, pixels: Pixels, touched: BoolArray) ->
             grid[: part.shape[0], : part.shape[1]] = part
             changed = grid.reshape(-1, side[0], blocks.shape[1], side[1]).any(axis=(1, 3))
             blocks[changed] = getattr(new, name)[changed]
-    whole.write_dct(str(path))
+    stored.write_dct(str(path))
 
 
 def _write_tiff(source: Path, path: Path, pixels: Pixels) -> None:

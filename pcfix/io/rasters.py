@@ -246,8 +246,8 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
                 for _, window in sink.block_windows(1):
                     difference = read_masked(one, window=window) - read_masked(same, window=window)
                     known += int(np.isfinite(difference).sum())
-                    whole = np.where(np.isfinite(difference), difference, NO_HEIGHT)
-                    sink.write(whole.astype(np.float32), 1, window=window)
+                    filled = np.where(np.isfinite(difference), difference, NO_HEIGHT)
+                    sink.write(filled.astype(np.float32), 1, window=window)
             if known == 0:
                 sentence = f"{dsm} and {reference} have no cell in common. Check their CRS."
                 raise GeometryError("raster.no_overlap", sentence, dsm=dsm, reference=reference)

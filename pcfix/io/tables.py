@@ -51,7 +51,7 @@ class Table:
 
     The `header` has the names of the columns, lower case, without units, and `line` each row's line
     number. `place` leads from the role of a column to its number; `unit` is that of each column,
-    `crs` what a comment says, and the header is a comment where `after_hash`.
+    `crs` what a comment states, and the header is a comment where `after_hash`.
     """
 
     path: Path
@@ -164,7 +164,7 @@ def read_lines(path: Path) -> list[str]:
 
 
 def decoded(data: bytes) -> str:
-    """Return a text of UTF-16, if its byte order mark says so, or else of UTF-8 or Latin-1."""
+    """Return a text of UTF-16, if it has a byte order mark, or else of UTF-8 or Latin-1."""
     if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         return data.decode("utf-16", errors="replace")
     try:
@@ -212,7 +212,7 @@ def _delimiter(line: str) -> str | None:
 def _split_unit(text: str, plain: set[str]) -> tuple[str, str]:
     """Return the name of a column and its unit: depth_m, Depth (m), x [m]; `plain` are names.
 
-    Of X/Longitude it is the name that says more.
+    The name of X/Longitude is longitude.
     """
     name, unit = text.strip("# \t\"'").lower(), ""
     if name not in plain and len(name) < _LONGEST_NAME:  # long names take the expression long

@@ -173,8 +173,8 @@ def _listed(path: Path) -> list[Path] | None:
         names = [line for line in lines if line and not line.startswith("#")]
     else:
         return None
-    beside = [path.parent / name for name in names]
-    return [one if one.exists() else path_of(name) for one, name in zip(beside, names, strict=True)]
+    near = [path.parent / name for name in names]
+    return [one if one.exists() else path_of(name) for one, name in zip(near, names, strict=True)]
 
 
 def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:

@@ -167,7 +167,7 @@ def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
     with np.errstate(invalid="ignore"):
         corner = corners.astype(np.int64)
     if (corner != corners).any():
-        sentence = "a face names a vertex by a number that is not whole. Export it again."
+        sentence = "a face names a vertex by a fraction. Export it again."
         raise bad_file(path, "water.mesh_damaged", sentence)
     count = np.maximum(np.diff(start) - 2, 0)
     first = np.repeat(start[:-1], count)
@@ -213,10 +213,8 @@ def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRa
         is_grid = to_cloud is None and t.b == t.d == 0.0 and t.a > 0.0 > t.e  # north-up
         cells, most = size[0] * size[1], MOST_CELLS if is_grid else MOST_MESHED
         if min(size) < 2 or cells > most:
-            sentence = (
-                f"has {size[0]:,} x {size[1]:,} cells, {most:,} at most. Cut it to the cloud,"
-            )
-            sentence += " or make the cells larger, in the cloud's CRS."
+            sentence = f"has {size[0]:,} x {size[1]:,} cells, {most:,} at most. Cut it to the"
+            sentence += " cloud, or make the cells larger, in the cloud's CRS."
             raise bad_file(name, "water.raster_size", sentence, cells=cells)
         heights, more = _heights(source, crs, name)
     # noise of the cells, against their neighbours: waves are smooth over a few cells

@@ -1,7 +1,7 @@
 """Write a LAS or LAZ file: its header from that of its input and the way back, its points.
 
-A VLR says what pcfix did, and what the file was before. Points go chunk by chunk into a file beside
-the target, which is renamed when it is whole.
+A VLR records what pcfix did and the header before. Points go chunk by chunk into a temporary file,
+which is renamed when it is complete.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ USER_ID = "pcfix"
 NOTES = {"settings": 1, "cleaning": 2, "labelling": 3}
 """VLRs of pcfix: one of a correction, and one for each cleaning or labelling."""
 _SEAL = "sha256"
-"""Of the rest of what it says: what is not as it was written leads to another cloud."""
+"""Key of the checksum of the record: a changed record would restore another cloud."""
 
 
 def output_header(
@@ -175,7 +175,7 @@ def _is_extra_bytes(vlr: VLR) -> bool:
 
 
 def is_ours(vlr: VLR) -> bool:
-    """Whether a VLR is the one that says how a file was corrected."""
+    """Whether a VLR is the record of a correction."""
     return bool(vlr.user_id == USER_ID and vlr.record_id == NOTES["settings"])
 
 
@@ -188,13 +188,13 @@ def _seal_of(content: dict[str, Any]) -> str:
 
 
 def own_settings(vlrs: Iterable[VLR]) -> Any:
-    """Return what the VLR of a correction says, None without one; ValueError if it is no JSON."""
+    """Return the record of a correction, None without one; ValueError if it is no JSON."""
     ours = next((vlr for vlr in vlrs if is_ours(vlr)), None)
     return None if ours is None else parse_json(ours.record_data)
 
 
 def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any]:
-    """Return what the VLR of a correction says.
+    """Return the record of a correction.
 
     An `InputError` if there is none, or it is damaged.
     """
