@@ -35,7 +35,7 @@ from pcfix.io.pdal import NAME, Dimensions, PdalCloud, Results, metadata_of
 from pcfix.model import LOW_NOISE, WaterDimension, WaterSurface
 from pcfix.options.correct import RasterOutputs
 from pcfix.options.declare import OptionSet, named, options_of
-from pcfix.options.shared import PartOptions
+from pcfix.options.shared import BandOption
 
 Set = TypeVar("Set", bound=OptionSet)
 
@@ -118,7 +118,7 @@ def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> No
     summary = finish(plan, task, tally)
     outs.update(results.dimensions)
     write_summary(options, summary.as_dict())
-    namespace["out_metadata"] = metadata_of(summary.as_dict(), unpacked=cloud.unpacked)
+    namespace["out_metadata"] = metadata_of(summary.as_dict())
 
 
 def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
@@ -138,7 +138,7 @@ def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     outs["Classification"] = classes
     outs.update(cloud.flags())
     found = {**tally.of_classes(), "labelling": plan.labelling.report(tally)}
-    namespace["out_metadata"] = metadata_of(found, unpacked=cloud.unpacked)
+    namespace["out_metadata"] = metadata_of(found)
 
 
 def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
@@ -162,7 +162,7 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
     seconds = round(time.perf_counter() - started, 3)
     summary = {**found.as_dict(), "input": NAME, "output": NAME, "seconds": seconds}
     write_summary(options, summary)
-    namespace["out_metadata"] = metadata_of(summary, unpacked=cloud.unpacked and not options.drop)
+    namespace["out_metadata"] = metadata_of(summary)
 
 
 def _options(namespace: dict[str, Any], kind: type[Set]) -> Set:
@@ -172,8 +172,8 @@ def _options(namespace: dict[str, Any], kind: type[Set]) -> Set:
         sentence = f"pdalargs: must be an object of options, not {given!r}."
         raise SettingError("option.type", sentence, value=given)
     given = {name.replace("-", "_"): value for name, value in given.items()}
-    # readers choose points, and writers make rasters
-    files = (*options_of(PartOptions), *options_of(RasterOutputs))
+    # PDAL reads and writes rasters
+    files = (*options_of(BandOption), *options_of(RasterOutputs))
     elsewhere = {"port", *(one.name for one in files)}
     known = {one.name: one for one in options_of(kind) if one.name not in elsewhere}
     values = named(given, known.values(), "pdalargs")

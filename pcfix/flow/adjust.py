@@ -32,10 +32,9 @@ from pcfix.io.atomic import temporary_output
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.io.cameras.sensor import read_sensor, write_table
 from pcfix.io.crs import is_topocentric, parse_crs
-from pcfix.io.files import write_text
+from pcfix.io.files import write_members, write_text
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss
 from pcfix.io.ground_control import read_ground_control
-from pcfix.io.saved import write_members
 from pcfix.io.tiles import Clouds, cloud_of
 from pcfix.io.water import write_water_raster
 from pcfix.model import (

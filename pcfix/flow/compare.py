@@ -16,7 +16,7 @@ from pcfix.flow.runner import check_summary, json_text, write_summary
 from pcfix.io.atomic import all_or_none
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
 from pcfix.io.files import check_output, scratch_arrays, write_text
-from pcfix.io.tiles import Clouds, cloud_of, inputs_of, part_of
+from pcfix.io.tiles import Clouds, band_of, cloud_of, inputs_of
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CompareOptions, CompareRules
@@ -50,7 +50,7 @@ def compare_clouds(
     started = time.perf_counter()
     given = taken(CompareOptions, options, keywords, "compare_clouds")
     lines = [parse_line(line) if isinstance(line, str) else line for line in given.section]
-    source = part_of(cloud_of(cloud), given)
+    source = band_of(cloud_of(cloud), given)
     also = {name: cloud_of(path) for name, path in given.also}
     surveyed = reference_of(reference)
     read = (source, surveyed, *also.values())

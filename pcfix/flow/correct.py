@@ -7,7 +7,7 @@ A plan is made for the whole cloud (`pcfix.flow.planning`), each chunk is correc
 from __future__ import annotations
 
 import warnings
-from dataclasses import fields, replace
+from dataclasses import fields
 from itertools import compress
 from typing import Any
 
@@ -25,11 +25,11 @@ from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
 from pcfix.io.cameras.mistakes import likely_mistake
 from pcfix.io.las import columns
-from pcfix.io.las.source import LasSource, centring_steps, part_report
+from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header
 from pcfix.io.raster_cloud import is_raster
 from pcfix.io.tiles import Clouds
-from pcfix.io.views import ViewReport, beside
+from pcfix.io.views import ViewReport
 from pcfix.label.labelling import Labelling
 from pcfix.lens.frames import beside_frames
 from pcfix.model import (
@@ -112,8 +112,7 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
     written = columns.columns_for(plan.options.dimensions)
     if is_raster(source.path):
         written = (*columns.COLUMNS, columns.OUTCOME)
-    steps = centring_steps(source.header)
-    header = output_header(source, "settings", plan.provenance(), written, steps)
+    header = output_header(source, "settings", plan.provenance(), written)
 
     def compute(points: Chunk, row: int) -> tuple[Correction, CloudTally]:
         return correct_chunk(plan, points_of(points, source, plan.found.surface), row)
@@ -121,12 +120,11 @@ def _correcting(plan: Plan, source: LasSource) -> FileWork:
     def apply(points: Chunk, correction: Correction) -> Chunk:
         """Move points, and write their new dimensions, classes and flags."""
         new = columns.convert(points, header.point_format)
-        new.offsets = header.offsets
         # whole steps of the file's own scale, so that 'pcfix restore' gets back every bit
         classes = np.array(new["classification"])
         withheld = np.asarray(new["withheld"]).astype(bool)
         changes = columns.changes_of(written, correction, classes, withheld, new.scales)
-        columns.move(new, changes.steps + np.array(steps), source.path)
+        columns.move(new, changes.steps, source.path)
         columns.fill(new, changes)
         new.array["classification"][correction.corrected] = BATHYMETRIC_POINT
         new["withheld"][:] = (withheld | changes.flagged).astype(np.uint8)
@@ -141,10 +139,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     Warns of what is uncertain.
     """
     options, figures, transfer = plan.options, tally.figures, plan.transfer
-    report = None
-    if tally.views is not None and plan.match is not None:
-        report = replace(tally.views, notes=plan.match.notes)
-    water_notes = _check_counts(plan, tally, report)
+    water_notes = _check_counts(plan, tally, tally.views)
     counts, uncertainty = figures.as_dict(), figures.uncertainty(plan.reconstruction)
     tested, poses, absorbed = None, None, None
     if plan.inputs.port is None:
@@ -165,7 +160,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     reconstruction = plan.reconstruction
     notes = [
         *plan.input_notes,
-        *([] if report is None else report.warnings()),
+        *([] if tally.views is None else tally.views.notes()),
         *coded("cloud.labels", plan.labelling.notes),
         *(() if tested is None else tested.doubts),
         *plan.notes,
@@ -181,11 +176,10 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         cameras_used=len(plan.cameras) - len(unused),
         cameras_unused=unused,  # labels of those without corrected points
         seconds=task.seconds,
-        views=None if report is None else report.as_dict(),
+        views=None if tally.views is None else vars(tally.views),
         warnings=[one.as_dict() for one in notes],
         labelling=plan.labelling.report(tally.labels),
         settings={**options.part(ScienceOptions).as_dict(), **plan.settings},
-        part=part_report(task.source),  # what was read, if not all points were
         water=water,
         water_fit=plan.found.as_dict(),
         uncertainty=uncertainty,
@@ -208,8 +202,7 @@ def _check_counts(plan: Plan, tally: CloudTally, report: ViewReport | None) -> l
     # also leave points without cameras.
     name, figures = plan.view.name, tally.figures
     if report is not None:
-        report.check()
-        for note in report.warnings():
+        for note in report.notes():
             warnings.warn(note, stacklevel=2)
     if plan.transfer is not None and tally.transfer is not None:
         plan.transfer.check(name, tally.transfer)
@@ -408,5 +401,6 @@ def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:
     counts = beside_frames(points, views, cameras)
     if counts.any():
         entries, outside = int(counts.sum()), int(np.count_nonzero(counts))
-        note = PcfixWarning("views.outside", f"views: {beside(entries, outside)}", entries=entries)
+        sentence = f"views: {entries:,} entries of {outside:,} points are ignored: their cameras"
+        note = PcfixWarning("views.outside", f"{sentence} face elsewhere.", entries=entries)
         warnings.warn(note, stacklevel=3)

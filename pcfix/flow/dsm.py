@@ -30,7 +30,7 @@ from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.crs import crs_words, parts
 from pcfix.io.files import check_output, scratch_arrays, write_text
-from pcfix.io.las.source import LasSource, coordinates, metric_crs, part_report
+from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.las.writing import is_ours
 from pcfix.io.styles import raster_style
 from pcfix.io.tiles import CloudFiles, Clouds, cloud_of, inputs_of, open_cloud
@@ -172,7 +172,6 @@ def grid_dsm(
         settings=asdict(rules),
         seconds=task.seconds,
         resolution_is="given" if given.resolution else "chosen",
-        part=part_report(task.source),
     )
     write_summary(given, result.as_dict())
     return result

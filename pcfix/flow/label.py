@@ -24,7 +24,7 @@ from pcfix.flow.surfaces import (
     view_of,
 )
 from pcfix.io.las.columns import convert
-from pcfix.io.las.source import LasSource, part_report
+from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header
 from pcfix.io.tiles import Clouds
 from pcfix.label.labelling import LabelCounts, Labelling, Part, WaterMask
@@ -206,5 +206,4 @@ def _finish(plan: LabelPlan, task: FileTask, counts: LabelCounts) -> Figures:
         labelling=plan.labelling.report(counts),
         seconds=task.seconds,
         warnings=notes,
-        part=part_report(task.source),
     )

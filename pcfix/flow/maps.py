@@ -22,7 +22,7 @@ from pcfix.grid.maps import contours, depth_interval
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
-from pcfix.io.las.source import CloudPart
+from pcfix.io.las.source import RasterBand
 from pcfix.io.styles import Symbol, limits_of, vector_style
 from pcfix.io.tables import read_check_depths
 from pcfix.io.tiles import Tiles
@@ -64,7 +64,7 @@ def write_rasters(run: RunFolder, *, errors: bool, progress: Progress | None = N
     """
     folder, cloud, cell_m = run.folder, run.cloud("cleaned"), run.options.resolution
     source = run.source
-    if isinstance(source, CloudPart) and isinstance(cloud, Path):
+    if isinstance(source, RasterBand) and isinstance(cloud, Path):
         write_cells(source, cloud, {"height": folder / CORRECTED})
         with rasters.open_raster(source.path) as raster:
             cell_m = cell_m or float(raster.res[0])

@@ -15,7 +15,7 @@ import numpy as np
 from pcfix.adjust.transfer import CloudTransfer
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.flow.surfaces import Points
-from pcfix.io.saved import find_members
+from pcfix.io.files import find_members
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, Outcome
 from pcfix.options.declare import File
 from pcfix.refract.batch import Batch, OriginalModel, PoseErrors, Survey

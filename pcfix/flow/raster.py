@@ -41,7 +41,7 @@ from pcfix.io.atomic import all_or_none, scratch_folder, temporary_output
 from pcfix.io.crs import parts
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import OUTCOME, SHIFTS
-from pcfix.io.las.source import CloudPart, coordinates
+from pcfix.io.las.source import RasterBand, coordinates
 from pcfix.io.las.writing import own_settings
 from pcfix.io.raster_cloud import WINDOW_CELLS, HeightRaster, is_raster, open_heights
 from pcfix.io.tiles import Clouds, open_cloud
@@ -139,7 +139,7 @@ def raster_command(
     return result
 
 
-def _check_heights(source: CloudPart, water: WaterSurface) -> None:
+def _check_heights(source: RasterBand, water: WaterSurface) -> None:
     """Warn of a raster that has no height below zero, and next to no water: it may have depths."""
     if not isinstance(water, WaterPlane):
         return
@@ -152,7 +152,7 @@ def _check_heights(source: CloudPart, water: WaterSurface) -> None:
 
 
 def write_cells(
-    source: CloudPart,
+    source: RasterBand,
     cloud: Path,
     targets: Mapping[str, Path],
     report: Callable[[float], None] = lambda share: None,

@@ -64,7 +64,6 @@ def _restoring(plan: None, source: LasSource) -> FileWork:
     with record_errors(source.path):
         names, before = _ours(source, content["settings"]), content["before"]
         identity = before["identity"].encode("latin-1")
-        offset = np.array(before["steps"], np.int64).reshape(3)
         header = restored_header(source, before, names)
 
     def apply(points: Chunk, result: None) -> Chunk:
@@ -77,8 +76,7 @@ def _restoring(plan: None, source: LasSource) -> FileWork:
         points["withheld"][:] = (withheld & ~ours).astype(np.uint8)
         shift = np.column_stack([points.array[name] for name in SHIFTS]).astype(np.int64)
         old = convert(points, header.point_format)
-        old.offsets = header.offsets
-        move(old, -shift - offset, source.path)
+        move(old, -shift, source.path)
         return old
 
     return FileWork(header, lambda points, row: (None, len(points)), apply, identity)

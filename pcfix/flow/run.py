@@ -31,10 +31,9 @@ from pcfix.flow.runner import Bar, Progress, check_folder, no_bar
 from pcfix.flow.surfaces import view_of
 from pcfix.io import rasters, vectors
 from pcfix.io.clouds import is_cloud
-from pcfix.io.files import read_json
+from pcfix.io.files import ENSEMBLE, read_json
 from pcfix.io.gnss_positions import read_gnss
-from pcfix.io.las.source import CloudPart
-from pcfix.io.saved import ENSEMBLE
+from pcfix.io.las.source import RasterBand
 from pcfix.io.tiles import Tiles, check_one_file
 from pcfix.libraries import analysis_library
 from pcfix.model import WaterDimension
@@ -157,7 +156,7 @@ def run(
         adjusted.cloud_files("cleaned"),
     )  # fmt: skip
     errors = corrected["uncertainty"] is not None
-    cells = isinstance(adjusted.source, CloudPart)
+    cells = isinstance(adjusted.source, RasterBand)
     outputs = maps.raster_files(out_dir, errors=errors, cells=cells)
     step(
         "dsm", "Gridding", outputs[0],

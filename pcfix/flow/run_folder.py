@@ -23,10 +23,10 @@ from pcfix.io.rasters import open_raster
 from pcfix.io.tiles import (
     CloudFiles,
     Tiles,
+    band_of,
     cloud_of,
     inputs_of,
     open_cloud,
-    part_of,
     tiles_from,
     tiles_of,
 )
@@ -57,7 +57,7 @@ class RunFolder:
     @cached_property
     def source(self) -> CloudFiles:
         """The cloud, in one file or many, or the cells of a raster."""
-        return tiles_of(self.input) or part_of(Path(str(self.input)), self.options)
+        return tiles_of(self.input) or band_of(Path(str(self.input)), self.options)
 
     @cached_property
     def reference(self) -> Path | Tiles:

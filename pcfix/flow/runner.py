@@ -35,7 +35,7 @@ from pcfix.io.atomic import all_or_none
 from pcfix.io.files import write_bytes, write_text
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix, corrected_identity, las_writer
-from pcfix.io.tiles import Clouds, Tiles, check_one_file, inputs_of, open_cloud, part_of, tiles_of
+from pcfix.io.tiles import Clouds, Tiles, band_of, check_one_file, inputs_of, open_cloud, tiles_of
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.libraries import optional_library
 from pcfix.options.declare import File, options_of
@@ -483,6 +483,6 @@ def file_task(
         known.append(check(path, overwrite=options.overwrite, inputs=known))
     check_summary(options, known)
     if not isinstance(source, Tiles):
-        source = part_of(source, options)
+        source = band_of(source, options)
     jobs = getattr(options, "jobs", None)
     return FileTask(source, Path(output), jobs, progress, started)

@@ -19,7 +19,7 @@ from pcfix.io.clouds import points_of as points_of
 from pcfix.io.las.source import metric_crs, stated_crs
 from pcfix.io.tiles import CloudFiles, open_cloud
 from pcfix.io.vectors import SHORE_RADIUS_M, is_vector_file, read_shoreline
-from pcfix.io.water import rasters_of_images, read_water, read_water_raster
+from pcfix.io.water import rasters_of_images, read_image_raster, read_water
 from pcfix.label.labelling import Part
 from pcfix.model import (
     NOISE_CLASSES,
@@ -144,9 +144,13 @@ def find_surface(
         return _fitted(options, water, view)
     if view is None:
         return FoundSurface(read_water(water))
-    found = read_water(water, view.crs, view.bounds)
+    found = read_water(water, view.crs)
     if isinstance(found, WaterMesh):
         _check_near(str(water), found.vertices, view, 0.0)
+    elif isinstance(found, WaterRaster):
+        sides = np.multiply(found.height_m.shape[::-1], found.cell_m) * [1.0, -1.0]
+        corner = np.array([found.left_m, found.top_m])
+        _check_near(str(water), np.array([corner, corner + sides]), view, 0.0)
     return FoundSurface(found)
 
 
@@ -199,7 +203,7 @@ def own_water_of(
     overlaps, differs = [], list[float]()
     with warnings.catch_warnings():  # those of the first raster are enough
         for image, path in paths.items():
-            heights[image] = raster = read_water_raster(path, view.crs)
+            heights[image] = raster = read_image_raster(path, view.crs)
             warnings.simplefilter("ignore", PcfixWarning)
             # the rasters must overlap the cloud, and have the vertical datum of the common water
             rows, columns = np.nonzero(np.isfinite(raster.height_m))

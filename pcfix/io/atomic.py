@@ -1,6 +1,6 @@
 """Outputs that appear when they are complete.
 
-A file is written under a hidden name beside its target, flushed to the disk, and renamed. What a
+A file is written under a hidden name next to its target, flushed to the disk, and renamed. What a
 killed process leaves is that hidden file; the next command that writes the same target removes it.
 """
 
@@ -28,7 +28,7 @@ _group: ContextVar[tuple[ExitStack, dict[Path, Path]] | None] = ContextVar("_gro
 
 @contextmanager
 def temporary_path(target: Path) -> Iterator[Path]:
-    """Give a hidden path beside a target; whatever is there when the block ends is removed."""
+    """Give a hidden path next to a target; whatever is there when the block ends is removed."""
     folder, name = target.absolute().parent, target.name
     for path in folder.glob(f".{glob.escape(name)}.{8 * '[0-9a-f]'}.part*"):
         _remove(path)  # a killed process left it
@@ -86,7 +86,7 @@ def all_or_none(folder: Path | None = None) -> Iterator[None]:
 
 @contextmanager
 def scratch_folder(target: Path) -> Iterator[Path]:
-    """Give a folder beside a target for intermediate files; it is removed when the block ends."""
+    """Give a folder next to a target for intermediate files; it is removed when the block ends."""
     with temporary_path(target.with_name(f"{target.name}.scratch")) as path:
         with _write_errors(target, path):
             path.mkdir()

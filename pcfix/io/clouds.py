@@ -112,78 +112,62 @@ def read_cloud(
 ) -> SurveyCloud:
     """Read the points that count of a LAS or LAZ cloud, in one file or in many.
 
-    Those of `skip_classes`, and withheld ones, are left out. The `water` is by default what a cloud
-    that pcfix corrected says of its own. An `InputError` if the file is damaged, no point counts,
-    or it lacks the dimension that `water` names.
-    """
-    with open_cloud(path) as source:
-        own = water or own_water(source)
-        names = set(source.header.point_format.extra_dimension_names).intersection(DIMENSIONS)
-        chunks = (
-            points_of(chunk[rows], source, own, names)
-            for chunk in source.chunks()
-            for rows in blocks(len(chunk), FEW_ROWS)
-        )
-        given, crs = water is not None, stated_crs(source)
-        return survey_cloud(str(path), crs, chunks, own, given, len(source), skip_classes)
-
-
-DIMENSIONS = ("WaterDepth", *SHIFTS)
-"""What the dimensions of a correction say of the water, and of where the points were."""
-
-
-def survey_cloud(
-    name: str,
-    crs: CRS | None,
-    chunks: Iterable[Points],
-    water: WaterSurface | None,
-    given: bool,
-    most: int,
-    skip_classes: Sequence[int] = NOISE_CLASSES,
-) -> SurveyCloud:
-    """Return the points that count; the water is `given`, or else what the cloud says of its own.
-
-    There are `most` points at most, with those of `DIMENSIONS` that the cloud has. An `InputError`
-    if none counts.
+    Those of `skip_classes`, and withheld ones, are left out. The `water` is by default the one in
+    the record of a cloud that pcfix corrected. An `InputError` if the file is damaged, no point
+    counts, or it lacks the dimension that `water` names.
     """
     columns: list[npt.NDArray[Any]] = []
-    first = count = 0
-    for points in chunks:
-        known, keep = points.dimensions or {}, points.counts(skip_classes)
-        if not given and "WaterDepth" in known:
-            depth = known["WaterDepth"]
-            above = np.where(depth > 0.0, points.xyz[:, 2] + depth, np.nan)
-        elif water is not None:
-            from pcfix.water.surface import surface_above  # with its compiler, not quick to load
+    first = 0
+    with open_cloud(path) as source:
+        own, crs, most = water or own_water(source), stated_crs(source), len(source)
+        names = {"WaterDepth", *SHIFTS}.intersection(
+            source.header.point_format.extra_dimension_names
+        )
+        for points in _few_points(source, own, names):
+            known, keep = points.dimensions or {}, points.counts(skip_classes)
+            if water is None and "WaterDepth" in known:
+                depth = known["WaterDepth"]
+                above = np.where(depth > 0.0, points.xyz[:, 2] + depth, np.nan)
+            elif own is not None:
+                from pcfix.water.surface import surface_above  # with its compiler, slow to import
 
-            above = surface_above(water, points.xyz, points.heights).height_m
-        else:
-            above = np.full(len(points.xyz), np.nan)
-        bathymetric = kept(keep, points.classes) == BATHYMETRIC_POINT
-        parts = [kept(keep, points.xyz), kept(keep, above), bathymetric]
-        if known.keys() >= set(SHIFTS):
-            parts.append(np.column_stack([known[name] for name in SHIFTS])[keep])
-        columns = columns or [empty((most, *part.shape[1:]), part.dtype) for part in parts]
-        for column, part in zip(columns, parts, strict=True):
-            column[first : first + len(part)] = part
-        first, count = first + len(parts[0]), count + len(points.xyz)
-        release()
+                above = surface_above(own, points.xyz, points.heights).height_m
+            else:
+                above = np.full(len(points.xyz), np.nan)
+            bathymetric = kept(keep, points.classes) == BATHYMETRIC_POINT
+            parts = [kept(keep, points.xyz), kept(keep, above), bathymetric]
+            if known.keys() >= set(SHIFTS):
+                parts.append(np.column_stack([known[name] for name in SHIFTS])[keep])
+            columns = columns or [empty((most, *part.shape[1:]), part.dtype) for part in parts]
+            for column, part in zip(columns, parts, strict=True):
+                column[first : first + len(part)] = part
+            first += len(parts[0])
+            release()
     xyz, water_m, bathymetric, *shifts = (column[:first] for column in columns)
     if first == 0:
         skipped = ", ".join(map(str, skip_classes))
         sentence = f"every point is withheld or in a class that is skipped ({skipped})."
-        raise bad_file(name, "cloud.nothing_left", sentence)
-    exact = given or not mapped(np.isfinite, water_m).any()
+        raise bad_file(path, "cloud.nothing_left", sentence)
+    exact = water is not None or not mapped(np.isfinite, water_m).any()
     return SurveyCloud(
-        name,
+        str(path),
         xyz,
         crs,
-        count - first,
+        most - first,
         shifts[0] if shifts else None,
         bathymetric,
         water_m,
-        water if exact and not isinstance(water, WaterDimension) else None,
+        own if exact and not isinstance(own, WaterDimension) else None,
     )
+
+
+def _few_points(
+    source: LasSource, water: WaterSurface | None, names: Collection[str]
+) -> Iterator[Points]:
+    """Yield the points of a cloud, few at a time."""
+    for chunk in source.chunks():
+        for rows in blocks(len(chunk), FEW_ROWS):
+            yield points_of(chunk[rows], source, water, names)
 
 
 def own_water(source: LasSource) -> WaterSurface | None:
@@ -214,7 +198,7 @@ def is_cloud(reference: Path | Tiles) -> bool:
 
 
 def read_reference(reference: Clouds) -> Reference:
-    """Read a reference; the end of its name says what it is.
+    """Read a reference of the kind that the end of its name states.
 
     ``.las``, ``.laz``, and many files of these: all points but those withheld and those of noise or
     water; ``.csv``, ``.txt``: columns x, y, z; ``.tif``, ``.tiff``: the centres of all cells with

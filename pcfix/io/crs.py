@@ -150,9 +150,9 @@ def with_heights(plan: CRS, vertical: CRS) -> CRS:
 
 def crs_text(crs: CRS) -> str:
     """Return the shortest text that names a CRS exactly: its codes, else WKT."""
-    whole = _code(crs)
-    if whole is not None:
-        return ":".join(whole)
+    own = _code(crs)
+    if own is not None:
+        return ":".join(own)
     codes = [_code(part) for part in crs.sub_crs_list]
     known = [code[1] for code in codes if code is not None and code[0] == "EPSG"]
     if crs.is_compound and len(known) == len(codes):
@@ -164,12 +164,6 @@ def _code(crs: CRS) -> tuple[str, str] | None:
     """Return authority and code that a CRS states; a search for one that fits takes long."""
     given = crs.to_json_dict().get("id")
     return None if given is None else (str(given["authority"]), str(given["code"]))
-
-
-def typed(crs: CRS) -> str:
-    """Return the code of a CRS, or that of an equal one, for messages."""
-    found = _code(crs) or crs.to_authority(min_confidence=70)
-    return ":".join(found) if found else f"'{crs.name}'"
 
 
 def shortened(text: str) -> str:
@@ -296,33 +290,30 @@ def transformation(
     real = [one for one in group.transformers if is_usable(one.description)]
     # of the better operations, the one that lacks the fewest grids
     lacking = [
-        ([grid.short_name for grid in one.grids if not grid.available], one.accuracy)
+        [grid.short_name for grid in one.grids if not grid.available]
         for one in group.unavailable_operations
         if is_usable(one.name)
     ]
-    by_count = sorted((one for one in lacking if one[0]), key=lambda one: len(one[0]))
-    grids, accuracy_m = (by_count or [([], -1.0)])[0]
+    grids: list[str] = min(filter(None, lacking), key=len, default=[])
     names = f"from {source.name} to {target.name}"
-    without = f" without the grid {', '.join(grids)}" if grids else ""
     commands = " && ".join(f"pyproj sync --file {grid}" for grid in grids)
-    install = f"Install it with '{commands}', or set PROJ_NETWORK=ON"
+    why = f"Install the grid with '{commands}', or set PROJ_NETWORK=ON"
+    why = why if grids else "PROJ knows no transformation between them"
     if not real:
-        why = install if grids else "PROJ knows no transformation between them"
         remedy = f"; {instead}." if instead else "."
-        sentence = f"{name}: heights cannot be transformed {names}{without}. {why}{remedy}"
+        sentence = f"{name}: heights cannot be transformed {names}. {why}{remedy}"
         raise HeightsError("crs.heights", sentence, grids=grids)
     step = next((one for one in real if np.isfinite(one.transform(*at.T)).all()), real[0])
     notes: Notes = ()
     if "ballpark geographic" in step.description.lower():
         if grids:
-            sentence = f"cannot be transformed {names}{without}. {install}."
+            sentence = f"cannot be transformed {names}. {why}."
             raise bad_file(name, "crs.grid_missing", sentence, grids=grids)
         sentence = f"{name}: PROJ knows no transformation {names}; their datums are treated as one."
         notes = (PcfixWarning("crs.datum", sentence),)
     elif step.accuracy > SILENT_ACCURACY_M:
         sentence = f"{name}: positions {names} are accurate to about {step.accuracy:g} m."
-        if grids and 0.0 <= accuracy_m < step.accuracy:
-            sentence += f" With the grid {', '.join(grids)} it is {accuracy_m:g} m. {install}."
+        sentence += f" {why}." if grids else ""
         notes = (PcfixWarning("crs.accuracy", sentence, accuracy_m=step.accuracy, grids=grids),)
 
     def forward(xyz: FloatArray) -> FloatArray:
@@ -358,7 +349,7 @@ def way_to_cloud(
     """Return the transformation from a file's CRS to the cloud's, None for none, and notes.
 
     A CRS that is None is not stated; that of the file is ``local`` to use its numbers unchanged.
-    The cloud's is projected, in metres. `heights` says whether z matters.
+    The cloud's is projected, in metres. With `heights` z matters.
     """
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
     if isinstance(crs, str) and crs.strip().lower() == LOCAL:
@@ -394,8 +385,7 @@ def way_to_cloud(
         notes.append(PcfixWarning("crs.heights_assumed", sentence))
     if agree and is_same_numbers(source, cloud, heights=heights):
         return None, tuple(notes)
-    # a search for the code of a CRS takes long
-    plan = "" if agree else typed(parts(source)[0])
+    plan = shortened(crs_text(parts(source)[0]))
     instead = f"or, if the heights agree with the cloud's, give the file's CRS as {plan}"
     forward, more = transformation(source, cloud, at, name, heights=not agree, instead=instead)
     return forward, (*more, *notes)

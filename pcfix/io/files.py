@@ -1,6 +1,6 @@
-"""Rules for every file that pcfix writes, and files for what is larger than memory.
+"""Rules for every file that pcfix writes, and files that one command leaves for another.
 
-What is written is whole or not at all, and never over another's work.
+A file is written completely or not at all, and replaces another only if the user asks for it.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ import subprocess
 import weakref
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,8 +31,11 @@ from pcfix.options.declare import File
 from pcfix.running import Empty, running
 from pcfix.sums import Sums
 
+if TYPE_CHECKING:
+    from pcfix.adjust.precision import Members
+
 LAST_LINES = 3
-"""Of what another program says when it fails."""
+"""Lines of the messages of another program that are shown when it fails."""
 
 
 def path_of(path: Any) -> Path:
@@ -97,7 +101,7 @@ def belonging(path: File) -> list[Path]:
     """Return what may be read where a file or folder is named.
 
     Of a folder that is all that it and its folders hold, but hidden files; of a project the same of
-    its folder. With a file go those of its stem, and the sensor beside it, which may be missing.
+    its folder. With a file go those of its stem, and the sensor next to it, which may be missing.
     """
     found = Path(path)
     folder, chosen = found, set[Path]()
@@ -272,3 +276,40 @@ def scratch_arrays(target: Path) -> Iterator[Empty]:
 
     with running(empty=empty, release=release):
         yield empty
+
+
+ENSEMBLE = "ensemble.npz"
+"""The file next to an adjusted model with the members of its ensemble."""
+
+
+def write_members(folder: Path, members: Members) -> None:
+    """Write members into a folder, as the arrays of `Members`, for ``numpy.load``."""
+    np.savez_compressed(folder / ENSEMBLE, **vars(members))
+
+
+def find_members(cameras: File) -> tuple[Path, Members] | None:
+    """Return the members next to a camera file, and their file; None if there is none.
+
+    It is in the folder of the adjustment: a model's own folder, or one of the two above it.
+    """
+    path = Path(cameras).resolve()
+    places = (at / ENSEMBLE for at in (path, *path.parents[:2]))
+    found = next((place for place in places if place.is_file()), None)
+    if found is None:
+        return None
+    from pcfix.adjust.precision import Members  # not quick to load
+
+    sentence = "is not an ensemble of an adjustment. Adjust again, or remove the file."
+    with refusing(found, "ensemble.damaged", sentence):
+        with np.load(found) as arrays:
+            values = {one.name: np.asarray(arrays[one.name]) for one in fields(Members)}
+        labels, lens_names = (tuple(values.pop(n).tolist()) for n in ("labels", "lens_names"))
+        m, k, p = len(values["turn"]), len(labels), len(lens_names)
+        shapes = {
+            **{"centres": (k, 3), "focal": (k,), "turn": (m, k, 3), "shift_m": (m, k, 3)},
+            **{"lens": (m, k, p), "water": (m, 7)},
+        }
+        for name, shape in shapes.items():
+            if values[name].shape != shape or not np.isfinite(values[name]).all():
+                raise ValueError(name)
+    return found, Members(labels=labels, lens_names=lens_names, **values)

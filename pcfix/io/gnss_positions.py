@@ -12,11 +12,10 @@ from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.cameras import read_cameras, table
 from pcfix.io.cameras.checks import Source
 from pcfix.io.cameras.georeference import adjusted_minus_gnss, is_tied
-from pcfix.io.cameras.odm import read_images
 from pcfix.io.cameras.table import gnss_positions, open_table
 from pcfix.io.crs import METRES, is_topocentric, parse_crs
 from pcfix.io.files import check_input
-from pcfix.io.labels import match_labels, unnamed
+from pcfix.io.labels import match_labels
 from pcfix.io.tables import places
 from pcfix.model import Cameras, GnssPositions
 from pcfix.options.declare import File
@@ -38,19 +37,14 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
     """Return cameras with `gnss`: the GNSS positions of their images, in their own CRS.
 
     They are NaN for images without a position, and standard deviations for positions without one.
-    Warns of images without a position, and of positions of unknown images.
+    Warns of images without a position.
 
-    Parameters
-    ----------
-    path : path
-        A table with the columns image (label, name, ...), x, y, z or longitude, latitude, height
-        and optionally sx, sy, sz (or sigma, or Metashape's accuracies) in metres; Metashape's
-        reference table, a list by exiftool, ODM's ``geo.txt`` or ``images.json``; or any camera
-        file or folder with such positions (see `pcfix.read_cameras`), such as projects of
-        Metashape and ODM. Images may be named with or without folder and extension.
-    cameras : Cameras
-    crs : str, optional
-        Of the positions, instead of that in the file. That of the cameras if none is stated.
+    The file is a table with the columns image (label, name, ...), x, y, z or longitude, latitude,
+    height and optionally sx, sy, sz (or sigma, or Metashape's accuracies) in metres; Metashape's
+    reference table, a list by exiftool, or ODM's ``geo.txt``; or any camera file or folder with
+    such positions (see `pcfix.read_cameras`), such as projects of Metashape and ODM. Images may be
+    named with or without folder and extension. `crs` replaces that in the file; if none is stated,
+    it is that of the cameras.
     """
     source = Path(path) if Path(path).is_dir() else check_input(path)
     if crs is not None:
@@ -59,10 +53,7 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
         sentence = f"is {kind}, which names no images. Make a table with the columns image,"
         sentence += " longitude, latitude, height from it."
         raise bad_file(source, "gnss.no_names", sentence)
-    if source.name == "images.json":
-        _, names = read_images(source, ())
-        listed, _ = read_images(source, tuple(names))
-    elif source.is_dir() or not table.recognises(Source(source)):
+    if source.is_dir() or not table.recognises(Source(source)):
         read = read_cameras(source)
         names, listed = list(read.labels), read.gnss
     else:
@@ -101,18 +92,12 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
         if apart_m > FARTHEST_M:
             sentence = f"its positions are {apart_m / 1e3:,.0f} km from the block. Check their CRS."
             raise bad_file(source, "gnss.far", sentence, apart_m=apart_m)
-    notes = []
-    if known < len(cameras):
-        words = f"{source}: {known} of {len(cameras)} images have a GNSS position."
-        notes.append(PcfixWarning("gnss.images_without", words, path=source, images=known))
-    unknown = [label for label, known in zip(row_of, there, strict=True) if not known]
-    others = unnamed(unknown, cameras.unposed)
-    if others:
-        words = f"{source}: {len(others)} positions of unknown images ({others[0]}) are skipped."
-        notes.append(PcfixWarning("gnss.unknown_images", words, path=source, images=list(others)))
-    for note in notes:
-        warnings.warn(note, stacklevel=2)
-    return replace(cameras, notes=(*cameras.notes, *notes))
+    if known == len(cameras):
+        return cameras
+    words = f"{source}: {known} of {len(cameras)} images have a GNSS position."
+    note = PcfixWarning("gnss.images_without", words, path=source, images=known)
+    warnings.warn(note, stacklevel=2)
+    return replace(cameras, notes=(*cameras.notes, note))
 
 
 def gnss_in_frame_of(cameras: Cameras, name: str = "cameras") -> tuple[GnssPositions, str]:

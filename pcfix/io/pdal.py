@@ -22,12 +22,10 @@ Metadata: TypeAlias = "dict[str, Any]"
 NAME = "the pipeline's cloud"
 OUTCOME = "Outcome"
 """A dimension with `pcfix.Outcome`, if ``add_dimension`` adds it."""
-STAGE_SOURCE = "from pcfix.pdal_stage import {}"
-"""The source of a stage in a pipeline."""
 CLASS_FLAGS = "ClassFlags=uint8"
 """To be added for PDAL 2.2, where point formats 0 to 5 have no such dimension."""
-UNPACKED = "flags_unpacked"
-"""In the metadata of a stage that separated the flags from packed classes."""
+_PACKED_FLAGS = 64
+"""Classes from this number on are the key point and withheld flags of point formats 0 to 5."""
 _WITHHELD_FLAG = 4
 """Bit of ClassFlags, which older PDAL has in place of the dimension Withheld."""
 
@@ -41,8 +39,7 @@ class PdalCloud:
     """The arrays and the metadata of a cloud, with copies of its `classes` and `withheld` flags.
 
     `scales`, shape (3,), and `crs`, as WKT, are those that all input files share, else None.
-    PDAL 2.2 has the flags in ClassFlags, and those of point formats 0 to 5 in the upper bits of
-    Classification, from which they are `unpacked`; later versions have a dimension Withheld.
+    PDAL 2.2 has the flags in ClassFlags, later versions have a dimension Withheld.
     """
 
     def __init__(self, ins: Dimensions, metadata: Metadata | None) -> None:
@@ -57,15 +54,15 @@ class PdalCloud:
             raise _missing("Classification", "uint8")
         self.classes = np.array(ins["Classification"], order="C")
         self._class_flags = np.array(ins["ClassFlags"]) if "ClassFlags" in ins else None
-        self.unpacked = _mentions(_children(metadata, "filters.python"), UNPACKED)
-        is_packed = not self.unpacked and any(int(form) < 6 for form in values[_FORMAT])
-        if is_packed and "Withheld" not in ins:
-            bits = self.classes >> 5
-            self.classes &= 31
-            if self._class_flags is None:  # class 40 does not fit beside flags in Classification
+        if "Withheld" not in ins and any(int(form) < 6 for form in values[_FORMAT]):
+            if self._class_flags is None:
                 raise _missing(*CLASS_FLAGS.split("="))
-            self._class_flags |= bits.astype(self._class_flags.dtype)
-            self.unpacked = True
+            if len(self.classes) and self.classes.max() >= _PACKED_FLAGS:
+                sentence = (
+                    f"{NAME}: has flags in Classification, where PDAL before 2.5 leaves those"
+                )
+                sentence += " of point formats 0 to 5. Convert the cloud to format 6 first."
+                raise SettingError("cloud.packed", sentence)
         if "Withheld" in ins:
             self.withheld = ins["Withheld"] != 0
         elif self._class_flags is not None:
@@ -126,11 +123,6 @@ def _children(metadata: Metadata | None, kind: str) -> list[Metadata]:
     return [child for stage in stages for child in stage.get("children", [])]
 
 
-def _mentions(nodes: list[Metadata], name: str) -> bool:
-    """Whether a node or one below it has a name."""
-    return any(one["name"] == name or _mentions(one.get("children", []), name) for one in nodes)
-
-
 def _missing(dimension: str, kind: str) -> SettingError:
     sentence = f'{NAME}: has no {dimension}. Add "{dimension}={kind}" to add_dimension.'
     return SettingError("cloud.dimension_missing", sentence, dimension=dimension)
@@ -182,11 +174,9 @@ class Results:
         return self._added | self._cloud.flags()
 
 
-def metadata_of(figures: Metadata, *, unpacked: bool = False) -> Metadata:
-    """Return a summary as PDAL's metadata, for later stages also whether flags were unpacked."""
+def metadata_of(figures: Metadata) -> Metadata:
+    """Return a summary as PDAL's metadata."""
     values = {k: v for k, v in figures.items() if k not in ("input", "output") and v is not None}
-    if unpacked:
-        values[UNPACKED] = True
     return node("pcfix", children=[node(name, value) for name, value in values.items()])
 
 

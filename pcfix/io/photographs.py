@@ -1,7 +1,7 @@
-"""Photographs (JPEG, TIFF, PNG), written with all metadata, and sequences of frames.
+"""Photographs (JPEG, TIFF, PNG), and sequences of frames.
 
-A photograph that changes in part keeps its metadata and, in JPEG, its unchanged blocks of pixels,
-which are copied as they are stored.
+A JPEG or TIFF photograph that changes in part keeps its metadata and, in JPEG, its unchanged blocks
+of pixels, which are copied as they are stored.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from pcfix.options.declare import File
 
 JPEG, TIFF, PNG = (".jpg", ".jpeg"), (".tif", ".tiff"), (".png",)
 SUFFIXES = (*JPEG, *TIFF, *PNG)
-_PNG_PIXELS = {b"IHDR", b"PLTE", b"IDAT", b"tRNS", b"IEND"}
 DAMAGED = ("photos.damaged", "is damaged, or not a photograph ({}). Copy it from the camera again.")
 LEAST_FRAMES = 3
 Pixels = npt.NDArray[Any]
@@ -89,7 +88,7 @@ def read_colours(path: Path) -> Pixels:
 
 
 def write_photograph(source: Path, target: Path, pixels: Pixels, touched: BoolArray) -> None:
-    """Write a photograph whose pixels differ from the source where `touched`, with its metadata.
+    """Write a photograph whose pixels differ from the source where `touched`.
 
     Both files have the same suffix; the shapes are (rows, columns, bands) and (rows, columns).
     """
@@ -102,7 +101,7 @@ def write_photograph(source: Path, target: Path, pixels: Pixels, touched: BoolAr
         elif suffix in TIFF:
             _write_tiff(source, path, pixels)
         else:
-            _write_png(source, path, pixels)
+            path.write_bytes(_png(pixels))
 
 
 def _write_jpeg(source: Path, path: Path, pixels: Pixels, touched: BoolArray) -> None:
@@ -116,10 +115,10 @@ def _write_jpeg(source: Path, path: Path, pixels: Pixels, touched: BoolArray) ->
         if old.mode != "L":
             how["subsampling"] = get_sampling(old)
     Image.fromarray(pixels.squeeze()).save(path, "JPEG", **how)
-    whole, new = jpeglib.read_dct(str(source)), jpeglib.read_dct(str(path))
-    most = whole.samp_factor.max(axis=0)
-    for name, factor in zip(("Y", "Cb", "Cr"), whole.samp_factor, strict=False):
-        blocks = getattr(whole, name)
+    stored, new = jpeglib.read_dct(str(source)), jpeglib.read_dct(str(path))
+    most = stored.samp_factor.max(axis=0)
+    for name, factor in zip(("Y", "Cb", "Cr"), stored.samp_factor, strict=False):
+        blocks = getattr(stored, name)
         if blocks is not None:
             side = 8 * most // factor
             high, wide = blocks.shape[0] * side[0], blocks.shape[1] * side[1]
@@ -128,7 +127,7 @@ def _write_jpeg(source: Path, path: Path, pixels: Pixels, touched: BoolArray) ->
             grid[: part.shape[0], : part.shape[1]] = part
             changed = grid.reshape(-1, side[0], blocks.shape[1], side[1]).any(axis=(1, 3))
             blocks[changed] = getattr(new, name)[changed]
-    whole.write_dct(str(path))
+    stored.write_dct(str(path))
 
 
 def _write_tiff(source: Path, path: Path, pixels: Pixels) -> None:
@@ -159,24 +158,9 @@ _TIFF_KEPT = {270, 271, 272, 274, 282, 283, 296, 305, 306, 315, 700, 33432, 3355
 """Texts, resolution, rotation, XMP, GeoTIFF keys, and tags of multispectral cameras."""
 
 
-def _write_png(source: Path, path: Path, pixels: Pixels) -> None:
-    """Write the pixels, and every other chunk of the source."""
-    _, encoded = photo_library("cv2").imencode(".png", pixels)
-    new, old = _chunks(encoded.tobytes()), _chunks(source.read_bytes())
-    beside = [chunk for name, chunk in old if name not in _PNG_PIXELS]
-    head = [chunk for name, chunk in new if name == b"IHDR"]
-    rest = [chunk for name, chunk in new if name != b"IHDR"]
-    path.write_bytes(encoded.tobytes()[:8] + b"".join([*head, *beside, *rest]))
-
-
-def _chunks(data: bytes) -> list[tuple[bytes, bytes]]:
-    """Return the chunks of a PNG, each with its name."""
-    found, at = [], 8
-    while at + 12 <= len(data):
-        length = int.from_bytes(data[at : at + 4], "big")
-        found.append((data[at + 4 : at + 8], data[at : at + 12 + length]))
-        at += 12 + length
-    return found
+def _png(pixels: Pixels) -> bytes:
+    """Return the bytes of a PNG file."""
+    return bytes(photo_library("cv2").imencode(".png", pixels)[1].tobytes())
 
 
 @dataclass(frozen=True)
@@ -273,7 +257,7 @@ def write_calm(target: Path, frames: Frames, pixels: Pixels) -> None:
         everywhere = np.ones(pixels.shape[:2], bool)
         write_photograph(frames.photographs[0], target, pixels, everywhere)
         return
-    write_bytes(target, photo_library("cv2").imencode(".png", pixels)[1].tobytes(), overwrite=True)
+    write_bytes(target, _png(pixels), overwrite=True)
 
 
 def write_spread(target: Path, spread: FloatArray) -> None:

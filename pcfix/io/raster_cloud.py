@@ -20,7 +20,7 @@ from laspy.vlrs.vlr import VLR
 from pcfix.errors import bad_file
 from pcfix.grid.lattice import Window
 from pcfix.io.crs import metres_up
-from pcfix.io.las.source import CloudPart, LasSource, metric_crs
+from pcfix.io.las.source import LasSource, RasterBand, metric_crs
 from pcfix.io.las.writing import NOTES, USER_ID
 from pcfix.io.rasters import NO_HEIGHT, open_raster, place_of, raster_errors, read_masked, slices
 from pcfix.model import FloatArray, IntArray
@@ -160,12 +160,12 @@ def _record_of(source: DatasetReader) -> list[VLR]:
 class RasterSource(LasSource):
     """An open raster as a cloud, of LAS point format 6; see `LasSource`.
 
-    The points of `part` are counted, see `pcfix.io.tiles.part_of`; before that there are none.
+    The points of `part` are counted, see `pcfix.io.tiles.band_of`; before that there are none.
     """
 
-    def __init__(self, part: CloudPart) -> None:
+    def __init__(self, part: RasterBand) -> None:
         """Open; an `InputError` if its band does not contain heights in metres."""
-        self.path, self.part = part.path, part
+        self.path = part.path
         self._stack = ExitStack()
         self.heights = self._stack.enter_context(open_heights(part.path, part.band))
         raster = self.heights.source
@@ -180,7 +180,7 @@ class RasterSource(LasSource):
         header.point_count = part.points
         self.header, self.evlrs = header, []
         self.vlrs = [*header.vlrs, *_record_of(raster)]
-        self.identity, self.points_of_file = bytes(68), raster.width * raster.height
+        self.identity = bytes(68)
         try:
             metric_crs(self)
         except BaseException:
@@ -190,7 +190,7 @@ class RasterSource(LasSource):
     def __exit__(self, *exception: object) -> None:
         self._stack.close()
 
-    def _all_chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
+    def chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
         """Yield the points of each window with any, row by row."""
         for window in self.heights.window.parts(WINDOW_CELLS):
             height = self.heights.read(window)

@@ -230,7 +230,6 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
     The output is a GeoTIFF of one band, float32, with the cells and the CRS of `dsm`; -9999 where
     either has no height. If the cells of the reference differ, it is resampled (bilinear).
     """
-    import rasterio
     from rasterio.enums import Resampling
     from rasterio.vrt import WarpedVRT
 
@@ -242,15 +241,13 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
             source, src_crs=crs, crs=one.crs or crs, transform=one.transform, width=one.width,
             height=one.height, resampling=Resampling.bilinear, dtype="float64", nodata=NO_HEIGHT,
         )  # fmt: skip
-        profile = one.profile | {"count": 1, "driver": "GTiff"}
         with temporary_output(target) as temporary:
-            with same, _written(temporary), rasterio.open(temporary, "w", **profile) as sink:
-                sink.set_band_description(1, "difference")
+            with same, new_raster(temporary, one, one.crs, {"difference": "metre"}) as sink:
                 for _, window in sink.block_windows(1):
                     difference = read_masked(one, window=window) - read_masked(same, window=window)
                     known += int(np.isfinite(difference).sum())
-                    whole = np.where(np.isfinite(difference), difference, NO_HEIGHT)
-                    sink.write(whole.astype(np.float32), 1, window=window)
+                    filled = np.where(np.isfinite(difference), difference, NO_HEIGHT)
+                    sink.write(filled.astype(np.float32), 1, window=window)
             if known == 0:
                 sentence = f"{dsm} and {reference} have no cell in common. Check their CRS."
                 raise GeometryError("raster.no_overlap", sentence, dsm=dsm, reference=reference)

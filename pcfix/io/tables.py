@@ -51,7 +51,7 @@ class Table:
 
     The `header` has the names of the columns, lower case, without units, and `line` each row's line
     number. `place` leads from the role of a column to its number; `unit` is that of each column,
-    `crs` what a comment says, and the header is a comment where `after_hash`.
+    `crs` what a comment states, and the header is a comment where `after_hash`.
     """
 
     path: Path
@@ -164,7 +164,7 @@ def read_lines(path: Path) -> list[str]:
 
 
 def decoded(data: bytes) -> str:
-    """Return a text of UTF-16, if its byte order mark says so, or else of UTF-8 or Latin-1."""
+    """Return a text of UTF-16, if it has a byte order mark, or else of UTF-8 or Latin-1."""
     if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         return data.decode("utf-16", errors="replace")
     try:
@@ -212,7 +212,7 @@ def _delimiter(line: str) -> str | None:
 def _split_unit(text: str, plain: set[str]) -> tuple[str, str]:
     """Return the name of a column and its unit: depth_m, Depth (m), x [m]; `plain` are names.
 
-    Of X/Longitude it is the name that says more.
+    The name of X/Longitude is longitude.
     """
     name, unit = text.strip("# \t\"'").lower(), ""
     if name not in plain and len(name) < _LONGEST_NAME:  # long names take the expression long
@@ -316,23 +316,14 @@ class CheckDepths:
 def read_check_depths(path: File) -> CheckDepths:
     """Read check depths from a table with a header line.
 
-    Parameters
-    ----------
-    path : path
-        Columns in any order, separated by comma, semicolon, tab or space: ``x`` and ``y`` (or
-        easting and northing) in the cloud's CRS, and ``depth``, metres below the water surface
-        that the correction is given, positive down, or ``z``, the height of the bed in the
-        cloud's heights. If both are there, the depth is used. Other columns are ignored, a
-        standard error too: all check depths have the same weight.
+    Its columns are ``x`` and ``y`` (or easting and northing) in the cloud's CRS, and ``depth``,
+    metres below the water surface that the correction is given, positive down, or ``z``, the height
+    of the bed in the cloud's heights. If both are there, the depth is used. Other columns are
+    ignored, a standard error too: all check depths have the same weight.
     """
     source = check_input(path)
     table = read_table(source, ("x", "y", "depth"), ("x", "y", "z"), spellings=DEPTH_SPELLINGS)
     what = "depth" if table.has("depth") else "z"
-    for role in ("x", "y", what):
-        there = [name for name in table.header if name in DEPTH_SPELLINGS[role]]
-        if len(there) > 1:
-            sentence = f"the columns {', '.join(there)} may all be {role}. Remove all but one."
-            raise bad_file(source, "table.column_twice", sentence, columns=there)
     values = table.of(("x", "y", what))
     found = CheckDepths(str(source), values[:, :2], values[:, 2], what == "z", table.line)
     negative = np.flatnonzero(found.value_m < 0.0)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
-from pcfix.io.files import check_input, read_json, refusing
+from pcfix.io.files import check_input, refusing
 from pcfix.io.labels import match_labels
 from pcfix.io.tables import read_table
 from pcfix.model import FloatArray
@@ -53,19 +53,15 @@ def read_image_times(path: File, labels: Sequence[str]) -> ImageTimes:
     Parameters
     ----------
     path : path
-        A table with the columns ``label`` and ``time`` (ISO 8601); a folder with the images,
-        whose EXIF data has DateTimeOriginal, and OffsetTimeOriginal for the zone; ODM's
-        ``images.json`` or ``shots.geojson``, or OpenSfM's ``reconstruction.json``. These last
-        count as UTC; if the images' EXIF data states no zone they hold local time.
+        A table with the columns ``label`` and ``time`` (ISO 8601), or a folder with the images,
+        whose EXIF data has DateTimeOriginal, and OffsetTimeOriginal for the zone.
     labels : sequence of str
         Names of the k images; a folder or an extension may be missing on either side.
     """
     found = Path(path)
     if found.is_dir():
         return _from_exif(found, labels)
-    if check_input(found).suffix.lower() in (".json", ".geojson"):
-        return _from_json(found, labels)
-    table = read_table(found, ("label", "time"))
+    table = read_table(check_input(found), ("label", "time"))
     rows = _rows(table.column("label"), labels, found)
     texts = table.column("time")
     where = [f"line {table.line[row]}" for row in rows]
@@ -89,24 +85,6 @@ def _from_exif(folder: Path, labels: Sequence[str]) -> ImageTimes:
             raise bad_file(file, "image_times.missing", sentence)
         texts.append(text + (f".{fraction}" if fraction.isdecimal() else "") + zone)
     return _times(folder, [f"image {file.name}" for file in chosen], texts)
-
-
-def _from_json(path: Path, labels: Sequence[str]) -> ImageTimes:
-    sentence = f"is not a file of OpenDroneMap or OpenSfM ({{}}). {_USE_TABLE}"
-    with refusing(path, "image_times.not_one", sentence):
-        content = read_json(path)
-        if isinstance(content, dict):  # shots.geojson
-            shots = [one["properties"] for one in content.get("features", ())]
-            pairs = [(one["filename"], one.get("capture_time")) for one in shots]
-        elif content and "shots" in content[0]:  # reconstruction.json
-            items = [item for part in content for item in part["shots"].items()]
-            pairs = [(name, shot.get("capture_time")) for name, shot in items]
-        else:  # images.json, milliseconds
-            pairs = [(one["filename"], float(one.get("utc_time") or 0.0) / 1e3) for one in content]
-        times = {str(name): float(time_s or 0.0) for name, time_s in pairs}
-    known = [name for name, time_s in times.items() if 0.0 < time_s < np.inf]
-    chosen = [known[row] for row in _rows(known, labels, path)]
-    return ImageTimes(np.array([times[name] for name in chosen]), True, str(path))
 
 
 def _rows(names: Sequence[str], labels: Sequence[str], source: Path) -> list[int]:
@@ -162,34 +140,26 @@ def level_offsets(
 ) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
     """Return how much higher than on average the water was at each of k images, metres, and notes.
 
-    The level is linear between the rows of the table, and continues beyond its ends for at most
-    the interval of the two rows there. The average over the images is the level that the user
-    gives.
+    The level is linear between the rows of the table. The average over the images is the level that
+    the user gives.
     """
     clock, name = tide.time_s, tide.name
     if tide.zoned != times.zoned:
         without = times if tide.zoned else tide
         sentence = "its times have no zone, those of the other file have. Add +02:00, or Z for UTC."
         raise bad_file(without.name, "time.zone", sentence)
-    gaps = np.diff(clock)
-    first, last = clock[0] - gaps[0], clock[-1] + gaps[-1]
-    outside = np.flatnonzero((times.time_s < first) | (times.time_s > last))
+    outside = np.flatnonzero((times.time_s < clock[0]) | (times.time_s > clock[-1]))
     if outside.size:
         image, at = labels[outside[0]], float(times.time_s[outside[0]])
         taken = datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M:%S")
         sentence = f"does not cover image {image}, taken at {taken} ({outside.size} of"
-        sentence += f" {len(labels)} images are outside). Check the zones."
+        sentence += f" {len(labels)} images are outside). Add rows, or check the zones."
         raise bad_file(name, "tide.not_covered", sentence, image=image, count=int(outside.size))
+    level = np.interp(times.time_s, clock, tide.level_m)
     row = np.clip(np.searchsorted(clock, times.time_s) - 1, 0, len(clock) - 2)
-    share = (times.time_s - clock[row]) / gaps[row]
-    level = tide.level_m[row] + share * np.diff(tide.level_m)[row]
-    notes = []
-    beyond = int(((share < 0.0) | (share > 1.0)).sum())
-    if beyond:
-        sentence = f"{name}: is extrapolated for {beyond} images beyond its first or last row."
-        notes.append(PcfixWarning("tide.extrapolated", sentence, count=beyond))
-    longest_h = float(gaps[row].max()) / 3600.0
-    if longest_h > LONG_GAP_S / 3600.0:
-        sentence = f"{name}: its rows are up to {longest_h:.1f} h apart; give one each hour."
-        notes.append(PcfixWarning("tide.sparse", sentence, hours=longest_h))
+    longest_s, notes = float(np.diff(clock)[row].max()), list[PcfixWarning]()
+    if longest_s > LONG_GAP_S:
+        hours = longest_s / 3600.0
+        sentence = f"{name}: its rows are up to {hours:.1f} h apart; give one each hour."
+        notes.append(PcfixWarning("tide.sparse", sentence, hours=hours))
     return level - level.mean(), tuple(notes)

@@ -14,7 +14,7 @@ import shapely
 
 from pcfix.errors import InputError, PcfixWarning, SettingError, bad_file
 from pcfix.io.files import path_of, read_json, refusing
-from pcfix.io.las.source import CloudPart, LasSource, coordinates, metric_crs
+from pcfix.io.las.source import LasSource, RasterBand, coordinates, metric_crs
 from pcfix.io.raster_cloud import RasterSource, is_raster
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -59,81 +59,59 @@ class TiledSource(LasSource):
         self.header.scales = np.full(3, tiles.step_m)
         self.header.point_count = len(tiles)
 
-    def chunks(self, part: CloudPart | None = None) -> Iterator[laspy.ScaleAwarePointRecord]:
+    def chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
         """Yield all points."""
         for path in self._tiles.paths:
             with LasSource(path, self._jobs) as source:
                 yield from source.chunks()
 
 
-CloudFiles: TypeAlias = Path | CloudPart | Tiles
+CloudFiles: TypeAlias = Path | RasterBand | Tiles
 
 
 def open_cloud(cloud: CloudFiles, jobs: int | None = None) -> LasSource:
-    """Return the points of a file, of a part of one, or of many; see `LasSource`.
-
-    The points of a raster are its cells.
-    """
+    """Return the points of a file, or of many; see `LasSource`. Those of a raster are its cells."""
     if isinstance(cloud, Tiles):
         return TiledSource(cloud, jobs)
-    if is_raster(cloud):
-        return RasterSource(cloud if isinstance(cloud, CloudPart) else part_of(cloud))
-    path, part = (cloud.path, cloud) if isinstance(cloud, CloudPart) else (cloud, None)
-    return LasSource(path, jobs, part=part)
+    if isinstance(cloud, RasterBand) or is_raster(cloud):
+        return RasterSource(cloud if isinstance(cloud, RasterBand) else band_of(cloud))
+    return LasSource(cloud, jobs)
 
 
-def part_of(path: CloudFiles, options: Any = None) -> Any:
-    """Return the part of a cloud that the options of a command ask for, or else its path.
+def band_of(path: CloudFiles, options: Any = None) -> Any:
+    """Return the band of a raster that the options of a command ask for; of other clouds the path.
 
-    The points of the part, and of any raster, are counted, once for all readers; an `InputError` if
-    there are none.
+    The cells with a height are counted, once for all readers; an `InputError` if there are none.
     """
     if not isinstance(path, Path):
         return path
-    bounds, band = getattr(options, "bounds", None), getattr(options, "band", None)
-    part = CloudPart(path, bounds, getattr(options, "read_resolution", None), band)
-    if band is not None and not is_raster(path):
-        words = "band has an effect only if the input is a raster; omit it."
-        raise SettingError("option.needs", words, option="band", needs="raster")
-    if part.is_whole and not is_raster(path):
+    band = getattr(options, "band", None)
+    if not is_raster(path):
+        if band is not None:
+            words = "band has an effect only if the input is a raster; omit it."
+            raise SettingError("option.needs", words, option="band", needs="raster")
         return path
-    west, south, east, north = bounds or (0.0, 0.0, 1.0, 1.0)
-    if not (west < east and south < north):
-        words = f"bounds {west:g},{south:g},{east:g},{north:g} must be west,south,east,north."
-        raise SettingError("option.range", words, option="bounds")
-    jobs = getattr(options, "jobs", None)
-    with RasterSource(part) if is_raster(path) else LasSource(path, jobs) as source:
-        header, count, ends = source.header, 0, list[FloatArray]()
-        for points in source.chunks(part):
+    one = RasterBand(path, band)
+    with RasterSource(one) as source:
+        count, ends = 0, list[FloatArray]()
+        for points in source.chunks():
             xyz, count = coordinates(points), count + len(points)
             ends += [xyz.min(axis=0), xyz.max(axis=0)]
-    if not count and bounds is None:
-        raise bad_file(path, "raster.empty", "no cell contains a height.")
     if not count:
-        asked, reach = (
-            ",".join(f"{one:.12g}" for one in box)
-            for box in (bounds or (), (*header.mins[:2], *header.maxs[:2]))
-        )
-        sentence = f"has no point within {asked}. The cloud extends over {reach}."
-        raise bad_file(path, "cloud.bounds", sentence)
-    mins, maxs = np.min(ends, axis=0), np.max(ends, axis=0)
-    total = source.points_of_file
-    return replace(part, points=count, points_of_file=total, mins=mins, maxs=maxs)
+        raise bad_file(path, "raster.empty", "no cell contains a height.")
+    return replace(one, points=count, mins=np.min(ends, axis=0), maxs=np.max(ends, axis=0))
 
 
 def check_one_file(cloud: Any, options: Any) -> None:
-    """Refuse options that are about one file, or about many, where it is the other."""
-    many = isinstance(cloud, Tiles)
-    for name in ("bounds", "read_resolution") if many else ("scheduler",):
-        if getattr(options, name, None) is not None:
-            kind = "a single file" if many else "many files (a folder, glob or list of tiles)"
-            sentence = f"{name.replace('_', '-')} works only with {kind}; omit it."
-            raise SettingError("option.one_file", sentence, option=name)
+    """Refuse a scheduler, which shares many files, for one file."""
+    if not isinstance(cloud, Tiles) and getattr(options, "scheduler", None) is not None:
+        sentence = "scheduler needs many files (a folder, glob or list of tiles); omit it."
+        raise SettingError("option.one_file", sentence, option="scheduler")
 
 
 def inputs_of(cloud: Any) -> list[Any]:
     """Return the files of a cloud, one or many."""
-    if isinstance(cloud, CloudPart):
+    if isinstance(cloud, RasterBand):
         return [cloud.path]
     return list(cloud.paths) if isinstance(cloud, Tiles) else [cloud]
 
@@ -195,8 +173,8 @@ def _listed(path: Path) -> list[Path] | None:
         names = [line for line in lines if line and not line.startswith("#")]
     else:
         return None
-    beside = [path.parent / name for name in names]
-    return [one if one.exists() else path_of(name) for one, name in zip(beside, names, strict=True)]
+    near = [path.parent / name for name in names]
+    return [one if one.exists() else path_of(name) for one, name in zip(near, names, strict=True)]
 
 
 def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:

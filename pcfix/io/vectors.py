@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -30,24 +29,15 @@ if TYPE_CHECKING:
 Geometries = npt.NDArray[Any]
 load_pyogrio = partial(optional_library, "pyogrio", "vector", "Read and write vector files")
 
-TEXT_SUFFIXES = (".wkt", ".csv", ".txt")
+TABLES = (".csv", ".txt")
 GDAL_SUFFIXES = (".gpkg", ".shp", ".geojson", ".json", ".kml", ".gpx")
-KINDS = "GeoPackage (.gpkg), Shapefile (.shp), GeoJSON, KML, GPX, WKT (.wkt) or CSV (.csv)"
-COLUMNS = {
-    "x": ("x", "easting", "east", "e"),
-    "y": ("y", "northing", "north", "n"),
-    "longitude": ("longitude", "lon", "long", "lng"),
+KINDS = "GeoPackage (.gpkg), Shapefile (.shp), GeoJSON, KML, GPX or a table of points (.csv)"
+COLUMNS = tables.POINT_SPELLINGS | {
+    "longitude": ("longitude", "lon", "long"),
     "latitude": ("latitude", "lat"),
-    "z": ("z", "height", "h", "altitude", "alt", "elevation", "elev", "level"),
-    "wkt": ("wkt", "geometry", "geom", "wkt_geom"),
+    "z": (*tables.POINT_SPELLINGS["z"], "h", "alt", "level"),
 }
 """Names of a column; the first that the header has is used."""
-_WKT = re.compile(
-    r"\s*((MULTI)?(POINT|LINESTRING|POLYGON)|LINEARRING|GEOMETRYCOLLECTION)"
-    r"\s*(ZM|Z|M)?\s*(\(|EMPTY)",
-    re.IGNORECASE,
-)
-
 LAYER_MARK = "|"
 WGS84, WGS84_3D = "EPSG:4326", "EPSG:4979"
 LONGEST_EDGE_M = 500.0
@@ -83,7 +73,7 @@ class Vectors:
 def is_vector_file(path: File) -> bool:
     """Whether the name of a file, with or without a layer, is one that `read_vectors` reads."""
     file = str(path).partition(LAYER_MARK)[0]
-    return Path(file).suffix.lower() in (*GDAL_SUFFIXES, *TEXT_SUFFIXES)
+    return Path(file).suffix.lower() in (*GDAL_SUFFIXES, *TABLES)
 
 
 def read_vectors(path: File, *, crs: str | None = None) -> Vectors:
@@ -92,18 +82,18 @@ def read_vectors(path: File, *, crs: str | None = None) -> Vectors:
     Parameters
     ----------
     path : path
-        ``.gpkg``, ``.shp``, ``.geojson``, ``.json``, ``.kml``, ``.gpx``; ``.wkt`` with one geometry
-        a line; ``.csv`` or ``.txt`` with the columns x, y and perhaps z, or easting, northing,
-        height, or longitude, latitude, height, or wkt. A layer may follow, if there are several, as
-        QGIS writes it: ``river.gpkg|layername=shore``.
+        ``.gpkg``, ``.shp``, ``.geojson``, ``.json``, ``.kml``, ``.gpx``; ``.csv`` or ``.txt`` with
+        the columns x, y and perhaps z, or easting, northing, height, or longitude, latitude,
+        height. A layer may follow, if there are several, as QGIS writes it:
+        ``river.gpkg|layername=shore``.
     crs : str, optional
         The file's CRS, in place of the one that it states. ``local``: the cloud's.
     """
     file, _, layer = str(path).partition(LAYER_MARK)
     source = check_input(file)
     suffix, name = source.suffix.lower(), str(source)
-    if suffix in TEXT_SUFFIXES:
-        geometries, found = _read_text(source)
+    if suffix in TABLES:
+        geometries, found = _read_points(source)
     elif suffix in GDAL_SUFFIXES:
         geometries, found, name = _read_gdal(source, layer.removeprefix("layername="))
     else:
@@ -181,39 +171,21 @@ def _read_gdal(path: Path, layer: str) -> tuple[Geometries, str | None, str]:
     return geometries, crs, name
 
 
-def _read_text(path: Path) -> tuple[Geometries, str | None]:
-    """Return the geometries of a text file, and the CRS that it names.
+def _read_points(path: Path) -> tuple[Geometries, str | None]:
+    """Return the points of a table, and the CRS that it names; without a height a point is flat.
 
-    A comment ``# crs: EPSG:25830`` above the rest names it; for longitude and latitude it is
-    WGS 84. A point of a table whose height is empty has none.
+    A comment ``# crs: EPSG:25830`` above the header names it; for longitude and latitude it is
+    WGS 84.
     """
-    lines = tables.read_lines(path)
-    numbered = enumerate(lines, start=1)
-    texts = [(n, line) for n, line in numbered if line.strip() and line.lstrip()[0] != "#"]
-    if not texts:
-        raise bad_file(path, "vector.empty", "is empty.")
-    if not _WKT.match(texts[0][1]):
-        kinds = ("x", "y"), ("longitude", "latitude"), ("wkt",)
-        table = tables.read_table(path, *kinds, spellings=COLUMNS)
-        if not table.has("wkt"):
-            # degrees of x and y are those of the CRS
-            table = replace(table, unit=["" if u in tables.DEGREES else u for u in table.unit])
-            in_metres = table.has("x", "y")
-            axes = ("x", "y") if in_metres else ("longitude", "latitude")
-            xyz = np.column_stack([table.of(axes), table.where_there(("z",))])
-            points = np.asarray(shapely.points(xyz))
-            geometries = np.where(np.isfinite(xyz[:, 2]), points, shapely.force_2d(points))
-            return geometries, tables.stated_crs(lines[:20]) or (None if in_metres else WGS84)
-        texts = list(zip(table.line, table.column("wkt"), strict=True))
-    geometries = np.empty(len(texts), dtype=object)
-    for row, (line, text) in enumerate(texts):
-        try:
-            geometries[row] = shapely.from_wkt(text.strip())
-        except (shapely.errors.ShapelyError, ValueError) as error:
-            why = str(error).split(":", 1)[-1].strip()
-            sentence = f"line {line} is not WKT ({why}). Write one complete geometry a line."
-            raise bad_file(path, "vector.wkt", sentence, line=line) from error
-    return geometries, tables.stated_crs(lines[:20])
+    table = tables.read_table(path, ("x", "y"), ("longitude", "latitude"), spellings=COLUMNS)
+    in_map = table.has("x", "y")
+    axes = ("x", "y") if in_map else ("longitude", "latitude")
+    # degrees of x and y are those of the CRS
+    table = replace(table, unit=["" if u in tables.DEGREES else u for u in table.unit])
+    xyz = np.column_stack([table.of(axes), table.where_there(("z",))])
+    points = np.asarray(shapely.points(xyz))
+    geometries = np.where(np.isfinite(xyz[:, 2]), points, shapely.force_2d(points))
+    return geometries, table.crs or (None if in_map else WGS84)
 
 
 class Shoreline(NamedTuple):

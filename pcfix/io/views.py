@@ -11,27 +11,26 @@ source, libs/MVS/PointCloud.cpp). Both name the images whose depth maps were fus
 
 An image number counts in the order of the dense matcher, which the list does not state. COLMAP
 counts the registered images of its sparse model: in some versions in the order of ``images.bin`` or
-``images.txt``, in others by ascending IMAGE_ID, and with rigs by ascending FRAME_ID
-(``Reconstruction::RegImageIds``). OpenMVS counts as its importer does, mostly in the order of
-``images.txt``. So every order that a sparse model next to the list allows is a candidate, then that
-of the given cameras. The geometry decides: nearly every listed camera must have the apparent point
-in its frame. With numbers off by one, a quarter of the cameras of an ordinary block do not.
+``images.txt``, in others by ascending IMAGE_ID (``Reconstruction::RegImageIds``). OpenMVS counts as
+its importer does, mostly in the order of ``images.txt``. So the two orders of a sparse model next
+to the list are candidates, then that of the given cameras. The geometry decides: nearly every
+listed camera must have the apparent point in its frame. With numbers off by one, a quarter of the
+cameras of an ordinary block do not.
 
 A row of the cloud gets the list of the same row if its position agrees to a fraction of the point
 spacing, else the list of the nearest point within a tolerance. This is as strict, because on a real
 dense cloud points 5 cm apart hardly have a camera in common. A list without positions is matched by
-row number. Then the numbers of points must agree, and the geometry is tested chunk by chunk.
+row number. Then the numbers of points must agree, and the geometry is tested at the first points.
 """
 
 from __future__ import annotations
 
-import struct
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -43,11 +42,10 @@ from pcfix.io.crs import Points
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels
 from pcfix.io.ply import Header, Property, Records, read_header
-from pcfix.lens.frames import beside_frames
 from pcfix.lens.imaging import straight_images
 from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, Views
 from pcfix.options.declare import File
-from pcfix.sums import LEAST, MOST, SAME, Sums
+from pcfix.sums import LEAST, SAME, Sums
 
 _HEAD = 8
 _IMAGES, _WEIGHTS = "view_indices", "view_weights"
@@ -59,7 +57,6 @@ MARGIN = 0.02
 """Of the frame's sides: other lens models or adjustments move an edge by less."""
 SAMPLE_POINTS = 20_000
 _PLACES = (".", "sparse", "sparse/0")
-_FRAME_HEAD, _DATA = struct.Struct("<II7dI"), struct.Struct("<iIQ")
 _SAME = 0.05
 """A fraction of the spacing within which two positions are those of one point."""
 _ROUNDING = 1.01 * np.sqrt(3.0)
@@ -69,13 +66,11 @@ _MANY = 0.1
 _NEIGHBOURS = 20_000
 
 
-@dataclass(frozen=True, eq=False)
-class ImageOrder:
+class ImageOrder(NamedTuple):
     """One meaning of the image numbers."""
 
-    what: str  # its source
+    source: str
     camera: npt.NDArray[np.int32]  # (images,), rows of `Cameras`, -1 without one
-    unposed: tuple[str, ...] = ()  # images without a row
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +87,6 @@ class ViewList:
     what: str  # the kind of file
     listed: Views  # of n points; a camera is an int32, the file's number of the image
     xyz: FloatArray | None = None  # (n, 3), frame of the file, then of the cameras
-    resolution_m: float = 0.0  # how far off a position can be, from the type of its numbers
-    notes: tuple[PcfixWarning, ...] = ()
     orders: tuple[ImageOrder, ...] = ()  # possible meanings of a number, until geometry decides
     share_seen: float | None = None
     tolerance_spacings: float = 0.05
@@ -120,8 +113,8 @@ def read_views(path: File, cameras: Cameras, *, to_cloud: Points | None = None) 
     ----------
     path : path
         COLMAP's ``fused.ply.vis``, or the dense PLY file of OpenMVS with its ``view_indices``. For
-        COLMAP the ``fused.ply`` will do if the list is beside it. Images are counted as in a
-        sparse model beside the list, or as the cameras are, whichever the geometry confirms.
+        COLMAP the ``fused.ply`` will do if the list is next to it. Images are counted as in a
+        sparse model next to the list, or as the cameras are, whichever the geometry confirms.
     cameras : Cameras
         In the cloud's frame.
     to_cloud : callable, optional
@@ -155,7 +148,7 @@ def track_views(
     start = np.concatenate([[0], np.cumsum(np.bincount(pairs[:, 0], minlength=len(rows)))])
     order = ImageOrder("the cameras of the tie points", np.arange(len(cameras), dtype=np.int32))
     views = ViewList(
-        path, "tie points", Views(start, pairs[:, 1]), xyz=tie_points.xyz[rows], orders=(order,),
+        path, "tie points", Views(start, pairs[:, 1]), tie_points.xyz[rows], (order,),
         tolerance_spacings=2.0,
     )  # fmt: skip
     return _placed(views, cameras, to_cloud)
@@ -167,11 +160,11 @@ def _placed(views: ViewList, cameras: Cameras, to_cloud: Points | None) -> ViewL
         return views
     xyz = views.xyz if to_cloud is None else to_cloud(views.xyz)
     xyz = np.ascontiguousarray(xyz, np.float64)
-    return fitted(replace(views, xyz=xyz), cameras, xyz, np.arange(len(views)))
+    return fitted(replace(views, xyz=xyz), cameras, xyz)
 
 
 def _colmap(path: Path) -> ViewList:
-    """Read ``fused.ply.vis``, and the positions from the PLY file beside it, if there is one."""
+    """Read ``fused.ply.vis``, and positions from the PLY file next to it, if it fits."""
     with path.open("rb") as stream:
         count = int.from_bytes(stream.read(_HEAD), "little")
     lists = Header(str(path), "<", "lists", count, (Property(_IMAGES, "u4", "u4"),), (), _HEAD)
@@ -181,17 +174,13 @@ def _colmap(path: Path) -> ViewList:
     if not count or records is None or _HEAD + records.end < path.stat().st_size:
         sentence = f"is no complete COLMAP view list of {count:,} points. {_REMEDY}"
         raise bad_file(path, "views.damaged", sentence, points=count)
-    raw = ViewList(path, "COLMAP view list", _listed(path, records))
+    listed = _listed(path, records)
     bare = path.with_suffix("")
     ply = bare if bare.suffix.lower() == ".ply" else bare.with_suffix(".ply")
-    if not ply.is_file():
-        return raw
-    vertices = read_header(ply).records
-    if vertices == count:
-        xyz, resolution_m = _positions(Records(ply, read_header(ply)))
-        return replace(raw, xyz=xyz, resolution_m=resolution_m)
-    sentence = f"{ply}: has {vertices:,} points, the list {count:,}. Its positions are not used."
-    return replace(raw, notes=(PcfixWarning("views.other_points", sentence, path=ply),))
+    xyz = None
+    if ply.is_file() and (header := read_header(ply)).records == count:
+        xyz = _positions(Records(ply, header))
+    return ViewList(path, "COLMAP view list", listed, xyz)
 
 
 def _openmvs(path: Path) -> ViewList:
@@ -200,7 +189,7 @@ def _openmvs(path: Path) -> ViewList:
     if header.item(_IMAGES, is_list=True) is None:
         raise bad_file(path, "views.no_lists", f"its points have no {_IMAGES}. {_REMEDY}")
     vertices = Records(path, header)
-    listed, (xyz, resolution_m) = _listed(path, vertices), _positions(vertices)
+    listed, xyz = _listed(path, vertices), _positions(vertices)
     if header.item(_WEIGHTS, is_list=True) is not None:
         start, weight = vertices.lists(_WEIGHTS)
         is_positive = ((weight >= 0.0) & (weight < np.inf)).all()
@@ -208,24 +197,20 @@ def _openmvs(path: Path) -> ViewList:
             sentence = f"its {_WEIGHTS} are not one positive number for each image. {_REMEDY}"
             raise bad_file(path, "views.weights", sentence)
         listed = replace(listed, weight=weight.astype(np.float32))
-    return ViewList(path, "OpenMVS point cloud", listed, xyz, resolution_m)
+    return ViewList(path, "OpenMVS point cloud", listed, xyz)
 
 
-def _positions(vertices: Records) -> tuple[FloatArray, float]:
-    """Return the vertices of a PLY file, and how coarse the type of their numbers is, metres."""
+def _positions(vertices: Records) -> FloatArray:
+    """Return the vertices of a PLY file, shape (n, 3)."""
     header = vertices.header
     if header.records == 0 or None in (header.item(axis, is_list=False) for axis in "xyz"):
         sentence = f"has no points with x, y and z. {_REMEDY}"
         raise bad_file(header.name, "views.no_positions", sentence)
     xyz = vertices.numbers(*"xyz")
-    finite = np.isfinite(xyz).all(axis=1)
-    if not finite.all():
-        row = int(np.argmin(finite))
-        sentence = f"vertex {row:,} has no finite position. Export the points again."
-        raise bad_file(header.name, "views.not_finite", sentence, row=row)
-    single = header.item("x", is_list=False) == "f4"
-    step = float(np.spacing(np.float32(np.abs(xyz).max()))) if single else 0.0
-    return xyz, step
+    if not np.isfinite(xyz).all():
+        sentence = "a vertex has no finite position. Export the points again."
+        raise bad_file(header.name, "views.not_finite", sentence)
+    return xyz
 
 
 def _listed(path: Path, records: Records) -> Views:
@@ -243,69 +228,40 @@ def _listed(path: Path, records: Records) -> Views:
 
 def image_orders(raw: ViewList, cameras: Cameras) -> tuple[ImageOrder, ...]:
     """Return the orders that the image numbers may follow, the most likely first."""
-    found = []
-    for place in _PLACES:
-        with suppress(InputError, OSError, struct.error, ValueError, IndexError, KeyError):
-            for what, names in _orders(raw.path.parent / place):  # a damaged model is skipped
-                row = match_labels(names, cameras.labels)[0].astype(np.int32)
-                unposed = tuple(name for name, r in zip(names, row, strict=True) if r < 0)
-                found.append(ImageOrder(what, row, unposed))
-    found.append(ImageOrder("the cameras as given", np.arange(len(cameras), dtype=np.int32)))
+    orders, folder = list[ImageOrder](), raw.path.parent
+    models = [folder / place / name for place in _PLACES for name in ("images.bin", "images.txt")]
+    for model in filter(Path.is_file, models):
+        with suppress(InputError):  # a damaged model is skipped
+            images = read_images(model, points=False)
+            by_id = sorted(images, key=lambda one: one.identifier)
+            for source, some in ((f"{model}", images), (f"{model} by IMAGE_ID", by_id)):
+                row = match_labels([one.name for one in some], cameras.labels)[0]
+                orders.append(ImageOrder(source, row.astype(np.int32)))
+    orders.append(ImageOrder("the cameras as given", np.arange(len(cameras), dtype=np.int32)))
     most = int(raw.listed.camera.max(initial=-1))
-    fitting = [order for order in found if most < len(order.camera)]
+    fitting = [order for order in orders if most < len(order.camera)]
     if not fitting:
-        largest = max(found, key=lambda order: len(order.camera))
-        sentence = f"names image {most} (from 0); {largest.what} has {len(largest.camera)}. Put the"
-        sentence += " sparse model next to the list."
+        largest = max(orders, key=lambda order: len(order.camera))
+        sentence = f"names image {most} (from 0); {largest.source} has {len(largest.camera)}. Put"
+        sentence += " the sparse model next to the list."
         raise bad_file(raw.path, "views.image_number", sentence, value=most)
     known = [order for order in fitting if (order.camera >= 0).any()]
     if not known:
-        sentence = f"no image of {fitting[0].what} is among the cameras. Give those of this block."
+        sentence = f"no image of {fitting[0].source} is among the cameras. Give this block's."
         raise bad_file(raw.path, "views.other_block", sentence)
     return tuple(known)
 
 
-def _orders(model: Path) -> list[tuple[str, list[str]]]:
-    """Return the orders of the images of a sparse model, and their names.
-
-    See https://colmap.github.io/format.html for ``frames.bin``, which models with rigs have.
-    """
-    paths = [model / f"images.{suffix}" for suffix in ("bin", "txt")]
-    path = next((path for path in paths if path.is_file()), None)
-    if path is None:
-        return []
-    images = read_images(path, points=False)
-    name = {image.identifier: image.name for image in images}
-    orders = []
-    if (model / "frames.bin").is_file():
-        data, at, frames = (model / "frames.bin").read_bytes(), _HEAD, {}
-        for _ in range(*struct.unpack_from("<Q", data)):
-            frame_id, *_, count = _FRAME_HEAD.unpack_from(data, at)
-            at += _FRAME_HEAD.size
-            entries = [_DATA.unpack_from(data, at + _DATA.size * i) for i in range(count)]
-            at += _DATA.size * count
-            frames[frame_id] = sorted(
-                (sensor, image) for kind, sensor, image in entries if not kind
-            )
-        by_frame = [name[image] for i in sorted(frames) for _, image in frames[i] if image in name]
-        if len(by_frame) == len(images):
-            orders.append((f"the frames of {model}", by_frame))
-    orders.append((f"the images of {model}", [image.name for image in images]))
-    orders.append((f"the images of {model} by IMAGE_ID", [name[i] for i in sorted(name)]))
-    return [(what, names) for what, names in orders if names]
-
-
-def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -> ViewList:
+def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray) -> ViewList:
     """Choose the order of images with which the listed cameras see the points.
 
-    The apparent points, shape (m, 3), are in the frame of the cameras; `rows`, shape (m,), are
-    theirs of the list.
+    The apparent points, shape (m, 3), are the first of the list, in the frame of the cameras.
     """
     if cameras.rotations is None or cameras.lenses is None:
         return replace(views, orders=views.orders[:1])
-    step = max(1, len(rows) // SAMPLE_POINTS)
-    some = views.listed.take(rows[::step])
-    points = np.repeat(xyz[::step], np.diff(some.start), axis=0)
+    rows = np.arange(0, len(xyz), max(1, len(xyz) // SAMPLE_POINTS))
+    some = views.listed.take(rows)
+    points = np.repeat(xyz[rows], np.diff(some.start), axis=0)
     sizes = np.array([(lens.width, lens.height) for lens in cameras.lenses])
     shares = []
     for order in views.orders:
@@ -317,7 +273,7 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -
             inside = (image_xy >= -MARGIN * size) & (image_xy <= (1.0 + MARGIN) * size)
             shares.append((float(np.mean(inside.all(axis=1))), order))
     if not shares:
-        return views
+        return replace(views, orders=views.orders[:1])
     share, best = max(shares, key=lambda pair: pair[0])
     if share < LEAST_SHARE:
         sentence = f"only {100 * share:.0f} % of the listed cameras have their point in the frame."
@@ -327,7 +283,7 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray, rows: IntArray) -
 
 
 class ViewMatch:
-    """A view list and the cloud whose points it gives cameras; `notes` are warnings on the two.
+    """A view list and the cloud whose points it gives cameras.
 
     A match by position may be off by `tolerance_m`; it is None where rows are matched by number.
     """
@@ -339,12 +295,12 @@ class ViewMatch:
 
         The cloud's coordinates are rounded to `step_m`, the scale of a LAS file.
         """
-        self.view_list, self._cameras, self.notes = views, cameras, list(views.notes)
+        self.view_list, self._cameras = views, cameras
         self.tolerance_m: float | None = None
         self._tree: Any = None  # a cKDTree of the list's positions, when one is needed
         if views.xyz is not None:
-            # a match may be off by the rounding of both files, or by a share of the spacing
-            rounding_m = _ROUNDING * (step_m / 2 + views.resolution_m)
+            # a match may be off by the rounding of the cloud, or by a share of the spacing
+            rounding_m = _ROUNDING * step_m / 2.0
             self.tolerance_m = max(rounding_m, views.tolerance_spacings * views.spacing_m)
             self._same_m = max(rounding_m, _SAME * views.spacing_m)
         elif points != len(views):
@@ -359,39 +315,32 @@ class ViewMatch:
         """
         one = copy(self)
         if self.view_list.xyz is None:  # else the positions of the list decided it
-            one.view_list = fitted(self.view_list, self._cameras, xyz, np.arange(len(xyz)))
+            one.view_list = fitted(self.view_list, self._cameras, xyz)
         return one
 
     def views_of(self, xyz: FloatArray, first_row: int) -> tuple[Views, ViewReport]:
-        """Return the cameras of a chunk's points, and the counts of the matches, without notes.
+        """Return the cameras of a chunk's points, and the counts of the matches.
 
         The points, shape (n, 3), are apparent ones in the frame of the cameras, from the cloud's
-        `first_row` on. One without a match has no cameras. A list that is matched by row number is
-        refused if its cameras do not see the points.
+        `first_row` on. One without a match has no cameras. The match is settled.
         """
         views = self.view_list
         report = ViewReport(f"{views.what} {views.path}", len(views), tolerance_m=self.tolerance_m)
         if views.xyz is None:
             row = np.arange(first_row, first_row + len(xyz))
-            views = fitted(views, self._cameras, xyz, row)
             report.by_row = len(row)
         else:
             row = self._rows(xyz, first_row, views.xyz, report)
-        order, matched = views.orders[0], np.flatnonzero(row >= 0)
+        matched = np.flatnonzero(row >= 0)
         some = views.listed.take(row[matched])
-        camera = order.camera[some.camera].astype(np.int64)
+        camera = views.orders[0].camera[some.camera].astype(np.int64)
         posed = camera >= 0
         start = np.zeros(len(row) + 1, np.int64)
         start[matched + 1] = np.diff(np.concatenate([[0], np.cumsum(posed)])[some.start])
         weight = None if some.weight is None else some.weight[posed]
-        listed = Views(np.cumsum(start), camera[posed], weight, some.kind)
-        outside = beside_frames(xyz, listed, self._cameras)
         report.share_seen = views.share_seen
-        report.unposed = order.unposed
         report.entries, report.unposed_entries = int(posed.sum()), int((~posed).sum())
-        report.outside_entries = int(outside.sum())
-        report.outside_points = int(np.count_nonzero(outside))
-        return listed, report
+        return Views(np.cumsum(start), camera[posed], weight, some.kind), report
 
     def _rows(
         self, xyz: FloatArray, first_row: int, listed: FloatArray, report: ViewReport
@@ -414,7 +363,6 @@ class ViewMatch:
         row[rest] = np.where(found, nearest, -1)
         report.by_position = int(np.count_nonzero(found))
         report.unmatched = len(rest) - report.by_position
-        report.farthest_m = float(away[found].max()) if found.any() else None
         return row
 
 
@@ -428,51 +376,26 @@ class ViewReport(Sums):
     tolerance_m: float | None = field(default=None, metadata=SAME)  # of a match by position
     by_row: int = 0
     by_position: int = 0
-    farthest_m: float | None = field(default=None, metadata=MOST)  # of these, from its list
     unmatched: int = 0
     entries: int = 0  # cameras of all lists that were matched
     unposed_entries: int = 0  # images without a pose, which are ignored
-    outside_entries: int = 0  # cameras that cannot have imaged their point, which are ignored
-    outside_points: int = 0  # points that these are listed for
-    unposed: tuple[str, ...] = field(default=(), metadata=SAME)  # that a list may name
-    notes: list[PcfixWarning] = field(default_factory=list, metadata=SAME)
 
-    @property
-    def points(self) -> int:
-        """Points of the cloud so far."""
-        return self.by_row + self.by_position + self.unmatched
+    def notes(self) -> list[PcfixWarning]:
+        """Return notes on points without a list, on ignored images and on an untested order.
 
-    def check(self) -> None:
-        """Refuse a list that gave no point of the cloud a camera."""
-        if self.points and self.entries == 0:
-            sentence = f"{self.source}: has none of the cloud's {self.points:,} points. Give the"
+        Refuse a list that gave no point of the cloud a camera.
+        """
+        points = self.by_row + self.by_position + self.unmatched
+        if points and self.entries == 0:
+            sentence = f"{self.source}: has none of the cloud's {points:,} points. Give the"
             sentence += " list of this cloud, or the offset of its coordinates (--cameras-offset)."
-            values = {"points": self.points, "listed": self.list_points}
-            raise InputError("views.no_match", sentence, **values)
-
-    def warnings(self) -> list[PcfixWarning]:
-        """Return warnings on points without a list and on images that are ignored."""
+            raise InputError("views.no_match", sentence, points=points, listed=self.list_points)
         found: dict[str, str] = {}
-        if self.unmatched > _MANY * self.points:
-            sentence = f"lacks {self.unmatched:,} of the cloud's {self.points:,} points."
-            found["views.unmatched"] = sentence
+        if self.unmatched > _MANY * points:
+            found["views.unmatched"] = f"lacks {self.unmatched:,} of the cloud's {points:,} points."
         if self.share_seen is None and self.entries:
-            sentence = "the order of its images is untested: no camera frames."
-            found["views.order_untested"] = sentence
+            found["views.order_untested"] = "the order of its images is untested: no camera frames."
         if self.unposed_entries:
-            named = f", such as {', '.join(self.unposed[:3])}" if self.unposed else ""
-            sentence = f"{self.unposed_entries:,} entries without a pose{named} are ignored."
+            sentence = f"{self.unposed_entries:,} entries of images without a pose are ignored."
             found["views.unposed"] = sentence
-        if self.outside_entries:
-            found["views.not_in_frame"] = beside(self.outside_entries, self.outside_points)
-        notes = (PcfixWarning(code, f"{self.source}: {one}") for code, one in found.items())
-        return [*self.notes, *notes]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        return {name: value for name, value in vars(self).items() if name != "notes"}
-
-
-def beside(entries: int, points: int) -> str:
-    """Return the sentence on cameras that cannot have imaged the points they are listed for."""
-    return f"{entries:,} entries of {points:,} points are ignored: their cameras face elsewhere."
+        return [PcfixWarning(code, f"{self.source}: {one}") for code, one in found.items()]

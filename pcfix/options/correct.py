@@ -17,7 +17,6 @@ from pcfix.options.shared import (
     NeededOptions,
     OverwriteOption,
     Panel,
-    PartOptions,
     PortOptions,
     SummaryOption,
     SurveyOptions,
@@ -183,7 +182,7 @@ class RasterOutputs(OptionSet, panel=Panel.OUTPUT):
 
 
 class CorrectOptions(
-    RasterOutputs, PartOptions, TileOptions, SummaryOption, ScienceOptions,
+    RasterOutputs, BandOption, TileOptions, SummaryOption, ScienceOptions,
     WaterPerImageOption, MaskOption, LandRules, InputOptions, panel=Panel.OUTPUT,
 ):  # fmt: skip
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
@@ -219,7 +218,7 @@ class StageLabelOptions(LabelRules, MaskOption, NeededOptions):
     """The options of the PDAL stage ``label``, which writes no files."""
 
 
-class LabelOptions(PartOptions, TileOptions, SummaryOption, StageLabelOptions):
+class LabelOptions(BandOption, TileOptions, SummaryOption, StageLabelOptions):
     """The options of ``pcfix label``."""
 
 

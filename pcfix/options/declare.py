@@ -2,8 +2,8 @@
 
 An option is a field of an `OptionSet` with its help below it::
 
-    read_resolution: float | None = option(None, above=0)
-    \"\"\"Size of a square with one point. [m] [default: all levels]\"\"\"
+    resolution: float | None = option(None, above=0)
+    \"\"\"Size of a cell. [m] [default: from the point spacing]\"\"\"
 
 The text is the help, with the unit, and with the default in words if its value is not clear enough.
 A class holds the options of one subject. The class of a command inherits from those that it needs,

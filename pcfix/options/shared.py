@@ -16,7 +16,7 @@ class Panel(StrEnum):
     """The panels of the help, in order."""
 
     NEED = "What you need"
-    INPUT = "Part of the cloud"
+    INPUT = "Raster input"
     FLIGHT = "Flight"
     CAMERA = "Camera"
     WATER = "Water"
@@ -64,7 +64,7 @@ class NeededOptions(WaterOptions, panel=Panel.NEED):
 
     water: Any = option(None, basic=True, metavar="SPEC", needed="needed", instead="port")
     """Water surface: a level (0.37), plane:a,b,c, dim:NAME, a mesh (.obj, .ply), a raster (.tif),
-    shoreline points (.csv, .gpkg, .shp, .geojson, .wkt), or auto."""
+    shoreline points (.csv, .gpkg, .shp, .geojson), or auto."""
 
 
 class WaterPerImageOption(OptionSet, panel=Panel.WATER):
@@ -98,7 +98,7 @@ class MaskOption(OptionSet, panel=Panel.WATER):
     """The area in which points may be submerged."""
 
     water_mask: File | None = option(None, basic=True)
-    """Polygons (.gpkg, .shp, .geojson, .wkt) inside which points may be submerged. [default:
+    """Polygons (.gpkg, .shp, .geojson) inside which points may be submerged. [default:
     everywhere]"""
 
 
@@ -184,18 +184,6 @@ class BandOption(OptionSet, panel=Panel.INPUT):
 
     band: int | None = option(None, least=1)
     """Band with the heights, if the input is a raster with several."""
-
-
-class PartOptions(BandOption, panel=Panel.INPUT):
-    """The part of a cloud to read; see `pcfix.io.las.source`."""
-
-    bounds: tuple[float, float, float, float] | None = option(
-        None, parse=numbers, metavar="X,Y,X,Y"
-    )
-    """Read only the points in this box (west, south, east, north). [m] [default: all]"""
-    read_resolution: float | None = option(None, above=0)
-    """Read only the coarse levels of a COPC file, about one point in each square of this side. [m]
-    [default: all levels]"""
 
 
 class OverwriteOption(OptionSet, panel=Panel.OUTPUT):

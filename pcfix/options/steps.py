@@ -20,7 +20,6 @@ from pcfix.options.shared import (
     NeededOptions,
     OverwriteOption,
     Panel,
-    PartOptions,
     SummaryOption,
     TileOptions,
     WaterOptions,
@@ -161,7 +160,7 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
             )
 
 
-class DsmOptions(PartOptions, OverwriteOption, SummaryOption, DsmRules, panel=Panel.OUTPUT):
+class DsmOptions(BandOption, OverwriteOption, SummaryOption, DsmRules, panel=Panel.OUTPUT):
     """The options of ``pcfix dsm``."""
 
     hillshade: File | None = option(None, writes=True)

@@ -39,11 +39,7 @@ WIDTH = 100
 UNIT = re.compile(r"(?<=\d) (?=(?:m|cm|px|deg|%)(?:\W|$))")
 """The space between a number and its unit."""
 
-_PART: RowTable = (
-    ("Read", "a part of {part[of]:,} points", "part"),
-    ("", "within {part[bounds]:.12g}", "part[bounds]"),
-    ("", "at a resolution of {part[read_resolution]:g} m", "part[read_resolution]"),
-)
+_PART: RowTable = ()
 _NO_SURFACE = ("No surface", "{water_unknown:,} points have no water surface", "water_unknown")
 _LABELLING: RowTable = (
     ("Mask", "{labelling[outside_mask]:,} points below the surface are outside of it and count as"

@@ -63,7 +63,6 @@ OF_RIVER = {
     ),
     "withhold": "--max-angle 4",
     "mask": "--water-mask {inputs}/mask.geojson",
-    "mask-wkt": "--water-mask {inputs}/mask.wkt",
     "quiet": "--quiet",
 }
 OF_A_TENTH = {
@@ -419,8 +418,6 @@ def river(folder, data, rng):
     to_geojson(folder / "shore.geojson", [{"type": "Point", "coordinates": p} for p in xyz], crs)
     box, hole = square(338416, 272916, 16), square(338420, 272920, 4)
     to_geojson(folder / "mask.geojson", [{"type": "Polygon", "coordinates": [box, hole]}], crs)
-    rings = [", ".join(f"{a} {b}" for a, b in ring) for ring in (box, hole)]
-    (folder / "mask.wkt").write_text(f"POLYGON (({rings[0]}), ({rings[1]}))")
     mesh = [row.split() for row in (data / "water_surface.obj").read_text().splitlines()]
     corners = [" ".join(row[1:]) for row in mesh if row[:1] == ["v"]]
     faces = [[int(c.split("/")[0]) - 1 for c in row[1:]] for row in mesh if row[:1] == ["f"]]

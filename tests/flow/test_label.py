@@ -36,12 +36,14 @@ def path(tmp_path):
 
 @pytest.fixture
 def mask(tmp_path):
-    """Return a lake with an island, as WKT in the CRS of `random_cloud`."""
-    return wkt(tmp_path / "lake.wkt", LAKE.difference(ISLAND))
+    """Return a lake with an island, in the CRS of `random_cloud`."""
+    return write_area(tmp_path / "lake.geojson", LAKE.difference(ISLAND))
 
 
-def wkt(path, area, srid=32633):
-    path.write_text(f"# crs: EPSG:{srid}\n{area.wkt}\n")
+def write_area(path, area, srid=32633):
+    pytest.importorskip("pyogrio")
+    crs = {"type": "name", "properties": {"name": f"urn:ogc:def:crs:EPSG::{srid}"}}
+    path.write_text(json.dumps({**shapely.geometry.mapping(area), "crs": crs}))
     return path
 
 
@@ -182,7 +184,7 @@ def test_separate_pools(tmp_path):
     ],
 )
 def test_masks_refused(path, tmp_path, area, code):
-    bad = wkt(tmp_path / "mask.wkt", area)
+    bad = write_area(tmp_path / "mask.geojson", area)
     with refused(code):
         label_file(path, tmp_path / "out.las", water=WATER_M, water_mask=bad)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["in.las", "mask.wkt"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["in.las", "mask.geojson"]

@@ -13,7 +13,7 @@ from pcfix.adjust.precision import Members
 from pcfix.adjust.transfer import CloudTransfer
 from pcfix.flow.pose_errors import variances
 from pcfix.flow.surfaces import Points
-from pcfix.io.saved import ENSEMBLE, write_members
+from pcfix.io.files import ENSEMBLE, write_members
 from pcfix.model import Cameras, Lens, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Survey

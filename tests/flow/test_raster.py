@@ -218,17 +218,6 @@ def test_as_cloud(tmp_path):
     np.testing.assert_array_equal(np.asarray(las["Outcome"]), bay()[row, column] < LEVEL_M)
 
 
-def test_bounds(tmp_path):
-    """Cells outside of the bounds stay as they are."""
-    dsm = write(tmp_path / "dsm.tif", bay())
-    box = (EAST + 20.0, NORTH - 30.0, EAST + 30.0, NORTH)
-    summary = pcfix.correct_file(dsm, tmp_path / "out.tif", bounds=box, **FACTORED)
-    before, after = heights(dsm), heights(tmp_path / "out.tif")
-    moved = np.isfinite(before) & (before != after)
-    assert np.flatnonzero(moved.any(axis=0)).tolist() == list(range(40, 60))
-    assert summary.part["points"] == np.isfinite(before[:, 40:60]).sum()
-
-
 def test_bands(tmp_path):
     """One band of several, by its number; transparent cells have no height."""
     high, alpha = np.full((60, 80), 300.0), np.where(np.isnan(bay()), 0.0, 255.0)
@@ -295,8 +284,6 @@ def test_may_be_depths(tmp_path):
         ("option.needs", (SCENE / "cloud.laz", "out.laz"), {"band": 2}),
         ("output.is_input", ("dsm.tif", "dsm.tif"), {}),
         ("output.is_input", ("dsm.tif", "out.tif"), {"depth": "out.tif"}),
-        ("cloud.not_copc", ("dsm.tif", "out.tif"), {"read_resolution": 1.0}),
-        ("cloud.bounds", ("dsm.tif", "out.tif"), {"bounds": "0,0,1,1"}),
         ("water.below_cloud", ("dsm.tif", "out.tif"), {"water": -30.0}),
         ("cloud.rasters", (["dsm.tif", "other.tif"], "out"), {}),
     ],

@@ -79,7 +79,7 @@ def test_view_list(tmp_path):
     one = pcfix.correct_file(merged, tmp_path / "merged.las", **given)
     many = pcfix.correct_file(folder, tmp_path / "out", **given)
     assert many.reconstruction == one.reconstruction
-    names = ("by_row", "by_position", "unmatched", "entries", "farthest_m")
+    names = ("by_row", "by_position", "unmatched", "entries")
     assert [many.views[name] for name in names] == [one.views[name] for name in names]
     here, there = records(tmp_path / "merged.las"), records(*tiles_in(tmp_path / "out"))
     # the depth maps about a point are those of its chunk: to the last digit for nearly all

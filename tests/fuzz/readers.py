@@ -5,7 +5,6 @@ import json
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -19,13 +18,13 @@ from pcfix.io.cameras import read_tie_points
 from pcfix.io.cameras.colmap import FILE as FILE_OF_PLACE
 from pcfix.io.cameras.colmap import place_text, write_colmap
 from pcfix.io.clouds import read_cloud
+from pcfix.io.files import ENSEMBLE, find_members, write_members
 from pcfix.io.gnss_positions import read_gnss
 from pcfix.io.ground_control import read_ground_control
 from pcfix.io.photographs import read_photograph, size_of
-from pcfix.io.saved import ENSEMBLE, find_members, write_members
 from pcfix.io.tables import read_check_depths
 from pcfix.io.tides import read_image_times, read_tide
-from pcfix.io.tiles import open_cloud, part_of
+from pcfix.io.tiles import open_cloud
 from pcfix.io.vectors import read_shoreline, read_water_polygons
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.model import Cameras, Lens
@@ -151,7 +150,6 @@ def odm_shots(folder: Path) -> Path:
 
 IMAGE = {"latitude": 46.9, "longitude": 9.0, "altitude": 90.0, "utc_time": 1e12}
 IMAGE |= {"gps_xy_stddev": 2.0, "gps_z_stddev": 3.0}
-ODM_IMAGES = text("images.json", [{"filename": one} | IMAGE for one in LABELS])
 
 
 def opensfm_tracks(folder: Path) -> Path:
@@ -351,10 +349,7 @@ def read_picture(path: Path) -> Iterator[Any]:
 
 def read_points(path: Path) -> Iterator[Any]:
     yield read_cloud(path)
-    part = {"bounds": (456_000.0, 5_432_000.0, 456_060.0, 5_432_090.0), "read_resolution": None}
-    if "copc" in path.name:
-        part["read_resolution"] = 5.0
-    with open_cloud(part_of(path, SimpleNamespace(**part)), 1) as source:
+    with open_cloud(path, 1) as source:
         yield sum(len(points) for points in source.chunks())
 
 
@@ -424,7 +419,6 @@ READERS: dict[str, Reader] = {
     ),
     "vectors": Reader(read_lines, {
         "csv": text("shore.csv", LINE), "geojson": text("water.geojson", SHAPE),
-        "wkt": text("a.wkt", "POLYGON Z ((0 0 1, 9 0 1, 9 9 1, 0 0 1))\nPOINT (3 4)\n"),
         "gpkg": vector("water.gpkg"), "shp": vector("water.shp"),
     }),
     "control": one(
@@ -434,11 +428,10 @@ READERS: dict[str, Reader] = {
     ),
     "gnss": one(
         lambda path: read_gnss(path, cameras()),
-        table=text("gnss.csv", GNSS), geo=text("geo.txt", GEO), images=ODM_IMAGES,
+        table=text("gnss.csv", GNSS), geo=text("geo.txt", GEO)
     ),
     "tides": one(
-        times, pictures=pictures, tide=text("tide.csv", TIDE), times=text("times.csv", TIMES),
-        images=ODM_IMAGES,
+        times, pictures=pictures, tide=text("tide.csv", TIDE), times=text("times.csv", TIMES)
     ),
     "depths": one(read_check_depths, table=text("depths.csv", DEPTHS)),
     "members": Reader(read_members, {"npz": members}),

@@ -1,33 +1,17 @@
-"""Parts of a cloud, and COPC files, which another library writes."""
+"""COPC files, which another library writes."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import laspy
-import numpy as np
 import pytest
 
 import pcfix
-from pcfix.io.las import source as las_source
-from pcfix.io.tiles import open_cloud, part_of
-from pcfix.options.shared import PartOptions
-from tests.utils.clouds import (
-    EAST_M,
-    NORTH_M,
-    SIDE_M,
-    WATER_M,
-    block,
-    random_cloud,
-    read_raw,
-    write_cloud,
-)
+from tests.utils.clouds import WATER_M, block, random_cloud, read_raw, write_cloud
 from tests.utils.codes import refused
 from tests.utils.copc import write_copc
 
 pytest.importorskip("copclib")
-WEST, SOUTH = EAST_M + 0.2 * SIDE_M, NORTH_M + 0.2 * SIDE_M
-BOX = (WEST, SOUTH, WEST + 40.0, SOUTH + 50.0)
 SNELL: dict[str, Any] = {"water": WATER_M, "method": "snell", "max_angle": None}
 
 
@@ -39,65 +23,16 @@ def cloud(path: Path) -> Path:
     return path
 
 
-def inside(las: laspy.LasData) -> np.ndarray:
-    x, y = np.array(las.x), np.array(las.y)
-    return (x >= BOX[0]) & (x <= BOX[2]) & (y >= BOX[1]) & (y <= BOX[3])
-
-
-def rows(path: Path) -> list[bytes]:
-    return sorted(map(bytes, laspy.read(path).points.array))
-
-
-@pytest.mark.parametrize(
-    ("name", "chunk"), [("cloud.las", 1_000_000), ("cloud.laz", 150), ("cloud.copc.laz", 150)]
-)
-def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, chunk: int) -> None:
+@pytest.mark.parametrize("chunk", [1_000_000, 150])
+def test_all_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
+    """The points of a COPC file are corrected as those of a LAS file."""
     monkeypatch.setattr("pcfix.io.las.source.CHUNK_POINTS", chunk)
-    source = cloud(tmp_path / name)
-    before = laspy.read(source)
-    summary = pcfix.correct_file(
-        source, tmp_path / "part.laz", cameras=block(), bounds=BOX,
-        summary=tmp_path / "part.json", **SNELL,
-    )  # fmt: skip
-    expected = {"points": int(inside(before).sum()), "of": 2000, "bounds": list(BOX),
-                "read_resolution": None}  # fmt: skip
-    assert summary.part == json.loads((tmp_path / "part.json").read_text())["part"] == expected
-    assert summary.points == len(laspy.read(tmp_path / "part.laz")) == expected["points"]
-    pcfix.correct_file(source, tmp_path / "whole.laz", cameras=block(), **SNELL)
-    whole = laspy.read(tmp_path / "whole.laz").points.array[inside(before)]
-    assert rows(tmp_path / "part.laz") == sorted(map(bytes, whole))
-    ours = next(v for v in laspy.read(tmp_path / "part.laz").vlrs if v.user_id == "pcfix")
-    assert json.loads(ours.record_data)["part"] == expected
-    pcfix.restore_file(tmp_path / "part.laz", tmp_path / "back.laz")
-    assert rows(tmp_path / "back.laz") == sorted(map(bytes, before.points.array[inside(before)]))
-
-
-def test_only_nodes_within_are_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source, unpacked = cloud(tmp_path / "tree.copc.laz"), []
-    name = "decompress_points_with_chunk_table"
-    of = getattr(las_source.lazrs, name)
-    monkeypatch.setattr(las_source.lazrs, name, lambda *a: unpacked.append(len(a[3])) or of(*a))
-    with open_cloud(part_of(source, PartOptions(bounds=BOX))) as found:
-        points = np.concatenate([one.array for one in found.chunks()])
-    assert len(points) == len(found) == inside(laspy.read(source)).sum()
-    nodes = 1 + 8 + 64  # of three levels, at most
-    assert 0 < sum(unpacked) / 2 < nodes / 2
-
-
-@pytest.mark.parametrize("resolution", [100.0, 20.0, 3.0])
-@pytest.mark.parametrize("box", [None, BOX])
-def test_coarse_levels(tmp_path: Path, resolution: float, box: Any) -> None:
-    source = cloud(tmp_path / "tree.copc.laz")
-    summary = pcfix.label_file(
-        source, tmp_path / "part.las", water=WATER_M, bounds=box, read_resolution=resolution
-    )
-    corners = None if box is None else laspy.copc.Bounds(np.array(box[:2]), np.array(box[2:]))
-    with laspy.CopcReader.open(source) as reader:
-        expected = reader.query(bounds=corners, resolution=resolution)
-    found = laspy.read(tmp_path / "part.las")
-    np.testing.assert_array_equal(np.sort(found.gps_time), np.sort(expected["gps_time"]))
-    assert summary.part is not None
-    assert (summary.part["points"], summary.part["of"]) == (len(expected), 2000)
+    tables = []
+    for name in ("cloud.las", "tree.copc.laz"):
+        out = tmp_path / f"{name}.out.laz"
+        pcfix.correct_file(cloud(tmp_path / name), out, cameras=block(), **SNELL)
+        tables.append(sorted(map(bytes, laspy.read(out).points.array)))
+    assert tables[0] == tables[1]
 
 
 def test_output_has_no_index(tmp_path: Path) -> None:
@@ -112,21 +47,4 @@ def test_copc_output(tmp_path: Path, suffix: str) -> None:
     source = write_cloud(tmp_path / "cloud.laz", 7)
     with refused("output.copc"):
         pcfix.label_file(source, tmp_path / f"out{suffix}", water=WATER_M)
-    assert list(tmp_path.iterdir()) == [source]
-
-
-@pytest.mark.parametrize(
-    ("options", "code"),
-    [
-        ({"bounds": (0, 0, 1, 1)}, "cloud.bounds"),
-        ({"read_resolution": 1.0}, "cloud.not_copc"),
-        ({"bounds": "1,2,3"}, "option.count"),
-        ({"bounds": (2, 0, 1, 1)}, "option.range"),
-        ({"read_resolution": 0.0}, "option.range"),
-    ],
-)
-def test_bad_parts(tmp_path: Path, options: dict[str, Any], code: str) -> None:
-    source = write_cloud(tmp_path / "cloud.laz", 7)
-    with refused(code):
-        pcfix.label_file(source, tmp_path / "out.las", water=WATER_M, **options)
     assert list(tmp_path.iterdir()) == [source]

@@ -103,9 +103,12 @@ FAR = {
 }
 
 
-@pytest.mark.parametrize("name", FAR)
+@pytest.mark.parametrize("name", [*FAR, "a.tif"])
 def test_water_elsewhere(tmp_path, path, name):
-    (tmp_path / name).write_text(FAR[name])
+    level = WaterRaster(np.full((50, 50), 15.0), 0.0, 50.0, (1.0, 1.0), "")
+    write_water_raster(tmp_path / "a.tif", level, None)
+    if name in FAR:
+        (tmp_path / name).write_text(FAR[name])
     with refused("water.no_overlap") as caught:
         pcfix.label_file(path, tmp_path / "b.las", water=tmp_path / name)
     assert caught.value.values["apart_m"] == pytest.approx(np.max([EAST_M, NORTH_M]), rel=2e-3)

@@ -56,7 +56,6 @@ BAD = [
     ('x,y,depth\n1,2,"' + "1" * 200_000, "table.not_csv", {}),
     ("x,y,depth_cm\n1,2,300\n", "table.unit", {"column": "depth", "value": "cm"}),
     ("x,y,depth (ft)\n1,2,3\n", "table.unit", {"value": "ft"}),
-    ("x,easting,y,depth\n1,1,2,3\n", "table.column_twice", {"columns": ["x", "easting"]}),
 ]
 
 

@@ -66,8 +66,6 @@ def test_formats(tmp_path, suffix):
         (("Id;Easting;Northing;Height", "a;725448;4369128;2.25", "b;725460;4369140;2.31"), None),
         (("x [m]\ty [m]\tz [m]", "725448\t4369128\t2.25", "725460\t4369140\t2.31"), None),
         (("# crs: EPSG:25830", "x y z", "725448 4369128 2.25", "725460 4369140 2.31"), UTM30),
-        (("wkt,id", '"POINT Z (725448 4369128 2.25)",1', '"POINT Z(725460 4369140 2.31)",2'), None),
-        (("POINT Z (725448 4369128 2.25)", "", "POINT Z (725460 4369140 2.31)"), None),
     ],
 )  # fmt: skip
 def test_text(tmp_path, lines, crs):
@@ -111,11 +109,10 @@ def test_crs_of_geojson(tmp_path):
 BAD = [
     ("a.gpkg", "x", "vector.damaged", {}),
     ("a.geojson", '{"type":"FeatureCollection","features":[]}', "vector.empty", {}),
-    ("a.csv", "", "vector.empty", {}),
+    ("a.csv", "", "table.column_missing", {}),
     ("a.csv", "a,b\n1,2\n", "table.column_missing", {}),
     ("a.csv", "x,y,z\n1,2,low\n", "table.number", {"column": "z", "value": "low"}),
     ("a.csv", "# crs: EPSG:999999\nx,y\n1,2\n", "crs.unknown", {"value": "EPSG:999999"}),
-    ("a.wkt", "POINT(1 2)\nPOINT(1\n", "vector.wkt", {"line": 2}),
     ("a.dxf", "", "vector.format", {}),
 ]
 
@@ -150,8 +147,8 @@ def test_degrees_to_metres(tmp_path):
 
 def test_long_edges(tmp_path):
     """The middle of an edge along a parallel is off the straight line on the map."""
-    polygon = "POLYGON((-0.4 39,0 39,0 39.4,-0.4 39.4,-0.4 39))"
-    path = write_text(tmp_path / "a.wkt", "# crs: EPSG:4326", polygon)
+    polygon = shapely.Polygon([(-0.4, 39), (0, 39), (0, 39.4), (-0.4, 39.4)])
+    path = write(tmp_path / "a.gpkg", [polygon], crs="EPSG:4326", kind="Polygon")
     area = read_water_polygons(path, UTM30).geometries[0]
     x, y = Transformer.from_crs("EPSG:4326", UTM30, always_xy=True).transform(-0.2, 39.0)
     assert area.exterior.distance(shapely.Point(x, y)) < 0.01
@@ -201,8 +198,8 @@ def test_heights_need_a_grid(tmp_path):
     shore = read_shoreline(path, "EPSG:25830+5782", crs="EPSG:4326")
     assert shore.xyz[0, 2] == 51.0
     assert codes(shore) == codes(read_shoreline(path, UTM30)) == ["crs.heights_assumed"]
-    polygon = "POLYGON Z((0 39 1,1 39 1,1 40 1,0 39 1))"
-    mask = write_text(tmp_path / "b.wkt", "# crs: EPSG:4979", polygon)
+    polygon = shapely.Polygon([(0, 39, 1), (1, 39, 1), (1, 40, 1)])
+    mask = write(tmp_path / "b.gpkg", [polygon], crs="EPSG:4979", kind="Polygon Z")
     read_water_polygons(mask, "EPSG:25831+5782")  # a mask has no heights
 
 
@@ -222,7 +219,7 @@ def test_shoreline(tmp_path, monkeypatch):
         "GEOMETRYCOLLECTION (MULTIPOINT ((50 50),(51 51)), POINT Z (52 52 9))",
     )
     monkeypatch.setattr(vectors, "SPACING_M", 2.0)
-    shore = read_shoreline(write_text(tmp_path / "a.wkt", *lines))
+    shore = read_shoreline(write(tmp_path / "a.gpkg", shapely.from_wkt(lines)))
     rows = shore.xyz.tolist()
     measured = [row for row in rows if not np.isnan(row[2])]
     assert sorted(measured) == [[0, 0, 1], [10, 0, 2], [52, 52, 9]]
@@ -249,14 +246,13 @@ def test_mask(tmp_path):
 
 
 def test_repaired_mask(tmp_path):
-    path = write_text(
-        tmp_path / "a.wkt",
+    shapes = (
         "POLYGON((0 0,10 10,10 0,0 10,0 0))",
         "POLYGON((20 0,30 0,30 10,20 10,20 0),(28 4,32 4,32 6,28 6,28 4))",
         "POLYGON((50 0,60 0,60 10,50 10,50 0))",
         "POINT(1 2)",
     )
-    found = read_water_polygons(path)
+    found = read_water_polygons(write(tmp_path / "a.gpkg", shapely.from_wkt(shapes)), UTM30)
     assert found.geometries[0].is_valid
     assert found.geometries[0].area == pytest.approx(50.0 + 96.0 + 100.0)  # the hole stays a hole
     assert codes(found) == ["mask.repaired"]

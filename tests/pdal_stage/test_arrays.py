@@ -10,7 +10,7 @@ import pytest
 
 import pcfix
 from pcfix.io.las.columns import COLUMNS
-from pcfix.io.pdal import STAGE_SOURCE, add_dimension
+from pcfix.io.pdal import add_dimension
 from tests.utils.beyond_frames import BEYOND_FRAMES
 from tests.utils.clouds import WATER_M, block, cameras_csv, framed_block, random_cloud, write_cloud
 
@@ -51,7 +51,7 @@ def metadata_of(header):
 
 def run(function, ins, metadata, **options):
     namespace = {"pdalargs": options, "metadata": metadata}
-    exec(STAGE_SOURCE.format(function), namespace)
+    exec(f"from pcfix.pdal_stage import {function}", namespace)
     outs = {}
     assert namespace[function](ins, outs) is True
     return outs, namespace.get("out_metadata")
@@ -162,7 +162,7 @@ def test_mistakes(cloud, tmp_path, monkeypatch, capsys, options, code):
     _, ins, metadata = cloud
     monkeypatch.chdir(tmp_path)
     namespace = {"pdalargs": options, "metadata": metadata}
-    exec(STAGE_SOURCE.format("correct"), namespace)
+    exec("from pcfix.pdal_stage import correct", namespace)
     stdout, flags = sys.stdout, sys.getdlopenflags()
     before = sorted(tmp_path.iterdir())
     outs = {}
@@ -214,4 +214,4 @@ def test_imports():
     )
     assert done.stdout == "[]\n"
     with pytest.raises(ImportError):
-        exec(STAGE_SOURCE.format("corect"), {})
+        exec("from pcfix.pdal_stage import corect", {})

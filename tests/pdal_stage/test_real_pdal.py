@@ -10,7 +10,7 @@ import pytest
 
 import pcfix
 from pcfix.io.las.columns import COLUMNS, UPGRADE
-from pcfix.io.pdal import CLASS_FLAGS, STAGE_SOURCE, add_dimension
+from pcfix.io.pdal import CLASS_FLAGS, add_dimension
 from tests.utils.clouds import WATER_M, block, cameras_csv, framed_block, random_cloud, write_cloud
 from tests.utils.codes import warned
 from tests.utils.nightly import mostly_nightly
@@ -45,7 +45,7 @@ def job_of(point_format: int, **options: object) -> list[dict[str, Any]]:
 def stage_of(**options: object) -> dict[str, Any]:
     return {
         "type": "filters.python",
-        "source": STAGE_SOURCE.format("correct"),
+        "source": "from pcfix.pdal_stage import correct",
         "module": "pcfix_stage",
         "function": "correct",
         "add_dimension": f"{add_dimension(COLUMNS)},{CLASS_FLAGS}",
@@ -205,7 +205,7 @@ def test_options_of_recipes(path: Path) -> None:
     """PDAL's defaults are LAS 1.2 and centimetres; 2.2 and current releases share these options."""
     stages = json.loads(path.read_text())["pipeline"]
     for stage in (s for s in stages if s["type"] == "filters.python"):
-        assert stage["source"] == STAGE_SOURCE.format(stage["function"])
+        assert stage["source"] == f"from pcfix.pdal_stage import {stage['function']}"
         assert "script" not in stage
         if stage["function"] == "correct":
             assert stage["add_dimension"].startswith(f"{add_dimension(COLUMNS)},{CLASS_FLAGS}")

@@ -1,5 +1,6 @@
 """Water surfaces fitted to shoreline points: planes, levels, rivers; points without heights."""
 
+import json
 import math
 
 import numpy as np
@@ -259,8 +260,10 @@ def drawn_by_hand(seed, folder, every_m=30.0, off_m=0.3):
     rng = np.random.default_rng(seed)
     along = np.arange(0.0, 301.0, every_m)
     vertices = np.column_stack([along, rng.normal(0.0, off_m, len(along))])
-    path = folder / "shore.wkt"
-    path.write_text(f"LINESTRING ({', '.join(f'{x} {y}' for x, y in vertices)})")
+    path = folder / "shore.geojson"
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25830"}}
+    line = {"type": "LineString", "coordinates": vertices.tolist(), "crs": crs}
+    path.write_text(json.dumps(line))
     shore = read_shoreline(path)
     xyz = shore.xyz.copy()
     xyz[:, 2] = 0.1 * xyz[:, 1] + rng.normal(0.0, 0.004, len(xyz))  # medians of the cloud

@@ -253,8 +253,8 @@ def _into(
     heights = not (by_user or systems.heights_agree(frame.crs, target))
     if frame.direct and not heights and systems.is_same_numbers(frame.crs, target):
         return Georeference(name, offset, crs, notes)
-    plan = systems.typed(systems.parts(frame.crs if frame.direct else target)[0])
-    given = "ENU:latitude,longitude,height" if frame.topocentric else plan
+    plan = systems.crs_text(systems.parts(frame.crs if frame.direct else target)[0])
+    given = "ENU:latitude,longitude,height" if frame.topocentric else systems.shortened(plan)
     instead = f"or, if the heights of cameras and cloud agree, give --cameras-crs {given}"
     forward, of_step = systems.transformation(
         frame.crs, target, frame.enter(at), name, heights=heights, instead=instead

@@ -1,4 +1,4 @@
-"""Read a LAS or LAZ file, or a part of it, chunk by chunk, and keep what laspy would rewrite.
+"""Read a LAS or LAZ file chunk by chunk, and keep what laspy would rewrite.
 
 Variable length records stay with their bytes as they are in the file. laspy has classes of its own
 for many of them, which lose some bytes when they write; it cuts names that fill their field; and it
@@ -7,27 +7,24 @@ believes any number of records that a damaged header states.
 
 from __future__ import annotations
 
-import math
 import os
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import laspy
 import lazrs
 import numpy as np
-from laspy.copc import Bounds, CopcReader, load_octree_for_query
 from laspy.vlrs.vlr import VLR
 from laspy.vlrs.vlrlist import VLRList
 
-from pcfix.errors import SettingError, bad_file
+from pcfix.errors import bad_file
 from pcfix.io.crs import METRES, shortened
 from pcfix.io.files import check_input
-from pcfix.model import BoolArray, FloatArray
+from pcfix.model import FloatArray
 from pcfix.options.declare import File
 from pcfix.running import current
 
@@ -57,8 +54,6 @@ _UNITS, _OWN_CODE = {9001: "metre", 9002: "foot", 9003: "US survey foot"}, 32767
 
 MOST_SCALE_M = 1000.0
 """Largest step of coordinates that a header may state."""
-MOST_SHIFT_M = 1000.0
-"""For which there is room in the coordinates of a corrected cloud."""
 
 _LAST_DIGIT = 2.0**-52
 """Of a float64, relative."""
@@ -72,23 +67,15 @@ CHUNK_BYTES = 500_000_000
 SMALL_BYTES = 250_000_000
 """Point records of a cloud that stay in memory until it is read again."""
 
-Box = tuple[float, float, float, float]
-
 
 @dataclass(frozen=True)
-class CloudPart:
-    """A part of the cloud in a file; see `pcfix.io.tiles.part_of`, which counts its points.
-
-    Of a raster it may be all cells.
-    """
+class RasterBand:
+    """A band of a raster that is read as a cloud; `pcfix.io.tiles.band_of` counts its points."""
 
     path: Path
-    bounds: Box | None = None  # west, south, east, north, metres; points on the edges belong to it
-    resolution: float | None = None  # of COPC: levels down to the first with this spacing, metres
-    band: int | None = None  # of a raster, if it has several
+    band: int | None = None
     points: int = 0
-    points_of_file: int = 0
-    # the lowest and highest coordinates of the part, shape (3,), metres
+    # the lowest and highest coordinates, shape (3,), metres
     mins: FloatArray = field(default_factory=lambda: np.zeros(3))
     maxs: FloatArray = field(default_factory=lambda: np.zeros(3))
 
@@ -96,32 +83,6 @@ class CloudPart:
         return str(self.path)
 
     __fspath__ = __str__
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether it is all of its file."""
-        return self.bounds is None and self.resolution is None
-
-    def holds(self, points: laspy.ScaleAwarePointRecord) -> BoolArray:
-        """Return which points of a chunk are within the bounds."""
-        if self.bounds is None:
-            return np.ones(len(points), np.bool_)
-        steps = (np.reshape(self.bounds, (2, 2)) - points.offsets[:2]) / points.scales[:2]
-        (west, south), (east, north) = np.ceil(steps[0] - 1e-4), np.floor(steps[1] + 1e-4)
-        x, y = points.array["X"], points.array["Y"]
-        return np.asarray((x >= west) & (x <= east) & (y >= south) & (y <= north))
-
-
-def part_report(cloud: object) -> dict[str, Any] | None:
-    """Return what a summary says of the part that was read; None unless the cloud is a part."""
-    if not isinstance(cloud, CloudPart) or cloud.is_whole:
-        return None
-    return {
-        "points": cloud.points,
-        "of": cloud.points_of_file,
-        "bounds": None if cloud.bounds is None else list(cloud.bounds),
-        "read_resolution": cloud.resolution,
-    }
 
 
 class Record(VLR):  # type: ignore[misc]  # laspy is untyped
@@ -230,15 +191,12 @@ class LasSource:
 
     It has `path`, laspy's `header`, `vlrs` and `evlrs` from `read_records`, and `identity`: system
     identifier, generating software and date as they are in the file, where other software writes
-    what laspy would not. With a `part` it has only the points of that, and the header says so;
-    `points_of_file` is how many points the file has.
+    what laspy would not.
     """
 
-    def __init__(
-        self, path: File, jobs: int | None = None, *, part: CloudPart | None = None
-    ) -> None:
+    def __init__(self, path: File, jobs: int | None = None) -> None:
         """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable."""
-        self.path, self.part, self._clouds = check_input(path), part, current().clouds
+        self.path, self._clouds = check_input(path), current().clouds
         with las_errors(self.path):
             with self.path.open("rb") as stream:
                 if other := _OTHER_CLOUDS.get(stream.read(4)):
@@ -251,15 +209,10 @@ class LasSource:
         self.header: laspy.LasHeader = self._reader.header
         try:
             with las_errors(self.path):
-                self.points_of_file = len(self)
                 self._check_header()
         except BaseException:
             self._reader.close()
             raise
-        if part is not None:
-            self.header = copy(self.header)
-            self.header.point_count = part.points
-            self.header.mins, self.header.maxs = part.mins, part.maxs
 
     def __enter__(self) -> LasSource:
         return self
@@ -330,46 +283,25 @@ class LasSource:
                 (last,) = struct.unpack("<I", stream.read(4))
         return (chunks - 1) * chunk_points + last, chunks * chunk_points
 
-    def chunks(self, part: CloudPart | None = None) -> Iterator[laspy.ScaleAwarePointRecord]:
-        """Yield all points, or those of a part, in order, at most `CHUNK_POINTS` at a time.
+    def chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
+        """Yield all points in order, at most `CHUNK_POINTS` at a time.
 
-        A larger node of COPC is one chunk. An `InputError` if the file ends before its last point.
+        An `InputError` if the file ends before its last point.
         """
-        part = part or self.part
-        if part is None:
-            yield from self._all_chunks()
-            return
-        if part.resolution is not None and not is_copc(self.header):
-            sentence = "is not COPC and has no coarser levels to read. Omit --read-resolution."
-            raise SettingError("cloud.not_copc", f"{self.path}: {sentence}", path=self.path)
-        with las_errors(self.path):
-            chunks = self._all_chunks()
-            if is_copc(self.header):
-                info = self.header.vlrs[0]
-                end = info.hierarchy_root_offset + info.hierarchy_root_size
-                if end > self.path.stat().st_size:  # laspy would take memory for all of it
-                    raise ValueError("its octree begins or ends behind its end")
-                chunks = nodes_in(part, CHUNK_POINTS)
-            for points in chunks:
-                inside = part.holds(points)
-                if inside.any():
-                    yield points[inside]
-
-    def _all_chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
         clouds = self._clouds
         if clouds is not None and self.path in clouds:
             yield from clouds[self.path]
             return
-        is_small = self.points_of_file * self.header.point_format.size <= SMALL_BYTES
+        is_small = len(self) * self.header.point_format.size <= SMALL_BYTES
         read, chunks = 0, list[laspy.ScaleAwarePointRecord]()
         most = max(1, min(CHUNK_POINTS, CHUNK_BYTES // self.header.point_format.size))
-        while read < self.points_of_file:
+        while read < len(self):
             with las_errors(self.path):
                 points = self._reader.read_points(most)
-            if len(points) < min(most, self.points_of_file - read):
-                held = f"{read + len(points):,} of {self.points_of_file:,} points"
+            if len(points) < min(most, len(self) - read):
+                held = f"{read + len(points):,} of {len(self):,} points"
                 sentence = f"it ends after {held}. Copy it again."
-                raise bad_file(self.path, "cloud.count", sentence, stated=self.points_of_file)
+                raise bad_file(self.path, "cloud.count", sentence, stated=len(self))
             read += len(points)
             if clouds is not None and is_small:
                 chunks.append(points)
@@ -391,47 +323,6 @@ class LasSource:
         return np.asarray(points[name], dtype=np.float64)
 
 
-def is_copc(header: laspy.LasHeader) -> bool:
-    """Whether a cloud that is read is COPC."""
-    return bool(len(header.vlrs) and isinstance(header.vlrs[0], laspy.copc.CopcInfoVlr))
-
-
-def nodes_in(part: CloudPart, most: int) -> Iterator[laspy.ScaleAwarePointRecord]:
-    """Yield points of the nodes of a COPC file that a part may touch, at most `most` at a time.
-
-    They come in the order of the file; a node with more points is one batch.
-    """
-    with CopcReader.open(part.path) as reader:
-        header, info, levels, box = reader.header, reader.copc_info, None, None
-        if part.resolution is not None:
-            halvings = math.ceil(math.log2(info.spacing / part.resolution))
-            levels = range(max(halvings, 0) + 1)
-        if part.bounds is not None:
-            corners = np.array(part.bounds).reshape(2, 2)
-            box = Bounds(*corners).ensure_3d(header.mins, header.maxs)
-        found = load_octree_for_query(reader.source, info, reader.root_page, box, levels)
-        nodes = sorted((one for one in found if one.point_count), key=lambda one: one.offset)
-        if sum(one.point_count for one in nodes) > header.point_count:
-            raise ValueError("its octree has more points than its header")
-        while nodes:
-            counts = np.cumsum([one.point_count for one in nodes])
-            count = max(int(np.searchsorted(counts, most, side="right")), 1)
-            data = bytearray()
-            for one in nodes[:count]:
-                reader.source.seek(one.offset)
-                data += reader.source.read(one.byte_size)
-            rows = np.zeros(counts[count - 1], header.point_format.dtype())
-            table = [(one.point_count, one.byte_size) for one in nodes[:count]]
-            lazrs.decompress_points_with_chunk_table(
-                data, reader.laszip_vlr.record_data, rows.view(np.uint8), table,
-                laspy.DecompressionSelection.all().to_lazrs(),
-            )  # fmt: skip
-            yield laspy.ScaleAwarePointRecord(
-                rows, header.point_format, header.scales, header.offsets
-            )
-            del nodes[:count]
-
-
 def backend(jobs: int | None) -> laspy.LazBackend:
     """Return the LAZ backend: one thread when asked for one job, else all cores."""
     return laspy.LazBackend.Lazrs if jobs == 1 else laspy.LazBackend.LazrsParallel
@@ -441,19 +332,6 @@ def coordinates(points: laspy.ScaleAwarePointRecord) -> FloatArray:
     """Return x, y, z of a chunk, shape (n, 3), metres."""
     steps = np.column_stack([points.array[axis] for axis in "XYZ"])
     return np.asarray(steps * points.scales + points.offsets)
-
-
-def centring_steps(header: laspy.LasHeader) -> tuple[int, ...]:
-    """Return by how many steps each integer axis must be moved, so that its points can be shifted.
-
-    That is 0 where they have room in 32 bits for a shift of `MOST_SHIFT_M`, or where the header
-    states impossible bounds; else the middle of the axis becomes 0.
-    """
-    ends, most = (header.mins, header.maxs), 2.0**31
-    low, high = (np.clip((one - header.offsets) / header.scales, -1e10, 1e10) for one in ends)
-    reach = np.maximum(np.abs(low), np.abs(high))
-    is_near = (reach <= most) & (reach + MOST_SHIFT_M / header.scales > most)
-    return tuple(np.where(is_near, -np.rint((low + high) / 2), 0.0).astype(int).tolist())
 
 
 def read_xyz(path: File) -> FloatArray:

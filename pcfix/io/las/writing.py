@@ -1,7 +1,7 @@
 """Write a LAS or LAZ file: its header from that of its input and the way back, its points.
 
-A VLR says what pcfix did, and what the file was before. Points go chunk by chunk into a file beside
-the target, which is renamed when it is whole.
+A VLR records what pcfix did and the header before. Points go chunk by chunk into a temporary file,
+which is renamed when it is complete.
 """
 
 from __future__ import annotations
@@ -34,7 +34,6 @@ from pcfix.io.las.source import (
     RecordList,
     append_evlrs,
     backend,
-    part_report,
     stated_crs,
 )
 from pcfix.model import FloatArray
@@ -48,22 +47,17 @@ USER_ID = "pcfix"
 NOTES = {"settings": 1, "cleaning": 2, "labelling": 3}
 """VLRs of pcfix: one of a correction, and one for each cleaning or labelling."""
 _SEAL = "sha256"
-"""Of the rest of what it says: what is not as it was written leads to another cloud."""
+"""Key of the checksum of the record: a changed record would restore another cloud."""
 
 
 def output_header(
-    source: LasSource,
-    kind: str,
-    content: dict[str, Any],
-    columns: tuple[Column, ...] = (),
-    steps: tuple[int, ...] = (0, 0, 0),
+    source: LasSource, kind: str, content: dict[str, Any], columns: tuple[Column, ...] = ()
 ) -> laspy.LasHeader:
     """Return the header of an output cloud: LAS 1.4, the input's records, and pcfix's own.
 
     That is of a `kind` (see `NOTES`) with `content`; of a correction also with what the file was
-    before. The `columns` are added as extra dimensions. Each integer axis will be moved by its
-    `steps`, for which the offsets make up. An `InputError` if a cloud to be corrected already has a
-    dimension of one of these names, or was corrected before.
+    before. The `columns` are added as extra dimensions. An `InputError` if a cloud to be corrected
+    already has a dimension of one of these names, or was corrected before.
     """
     old, is_correction = source.header, kind == "settings"
     if is_correction and any(is_ours(v) for v in source.vlrs):
@@ -95,18 +89,14 @@ def output_header(
     if crs is not None:
         wkt = WktCoordinateSystemVlr(crs.to_wkt("WKT1_GDAL")).record_data_bytes()
         vlrs.append(VLR("LASF_Projection", 2112, "OGC COORDINATE SYSTEM WKT", wkt))
-    if source.part is not None:
-        content = {**content, "part": part_report(source.part)}
     if is_correction:
         before = {
             "version": str(old.version),
             "point_format": old.point_format.id,
             "identity": source.identity.decode("latin-1"),
             "global_encoding": old.global_encoding.value,
-            "offsets": old.offsets.tolist(),
             "added_wkt": crs is not None,
             "undescribed": [dimension.name for dimension in undescribed],
-            "steps": list(steps),
         }
         content = {**content, "before": before}
         content[_SEAL] = _seal_of(content)
@@ -114,7 +104,6 @@ def output_header(
     version = max(old.version, laspy.header.Version(1, 4))
     header = _header(source, version, point_format, vlrs, described)
     header.global_encoding.wkt = header.global_encoding.wkt or crs is not None
-    header.offsets = old.offsets - np.array(steps) * old.scales
     return header
 
 
@@ -135,7 +124,6 @@ def restored_header(source: LasSource, before: dict[str, Any], drop: set[str]) -
     version = laspy.header.Version.from_str(before["version"])
     header = _header(source, version, point_format, vlrs, records)
     header.global_encoding.value = before["global_encoding"]
-    header.offsets = np.array(before["offsets"], dtype=np.float64).reshape(3)
     return header
 
 
@@ -187,7 +175,7 @@ def _is_extra_bytes(vlr: VLR) -> bool:
 
 
 def is_ours(vlr: VLR) -> bool:
-    """Whether a VLR is the one that says how a file was corrected."""
+    """Whether a VLR is the record of a correction."""
     return bool(vlr.user_id == USER_ID and vlr.record_id == NOTES["settings"])
 
 
@@ -200,13 +188,13 @@ def _seal_of(content: dict[str, Any]) -> str:
 
 
 def own_settings(vlrs: Iterable[VLR]) -> Any:
-    """Return what the VLR of a correction says, None without one; ValueError if it is no JSON."""
+    """Return the record of a correction, None without one; ValueError if it is no JSON."""
     ours = next((vlr for vlr in vlrs if is_ours(vlr)), None)
     return None if ours is None else parse_json(ours.record_data)
 
 
 def read_settings(vlrs: Iterable[VLR], path: Path) -> dict[str, Any]:
-    """Return what the VLR of a correction says.
+    """Return the record of a correction.
 
     An `InputError` if there is none, or it is damaged.
     """
