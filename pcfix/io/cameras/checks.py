@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
+import warnings
 import zipfile
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, replace
@@ -100,32 +100,27 @@ def unsupported(path: Path, what: str, remedy: str, **values: Any) -> InputError
     return bad_file(path, "cameras.unsupported", f"{what} is not supported. {remedy}.", **values)
 
 
+def no_sensor(path: Path) -> InputError:
+    """Return the error for a table of poses without a lens."""
+    sentence = "has angles but no sensor. Give --sensor a table with focal,sensor_x,sensor_y (mm)."
+    return bad_file(path, "cameras.sensor_missing", sentence)
+
+
 def note(path: object, code: str, sentence: str, **values: Any) -> PcfixWarning:
-    """Return a note on what was done on reading a file."""
+    """Return a warning about a camera file."""
     return PcfixWarning(code, f"{path}: {sentence}", path=path, **values)
 
 
-def several(path: Path, count: int, images: int) -> PcfixWarning:
-    """Return a note on models that are not connected, of which the largest is read."""
-    sentence = f"has {count} separate models. Only the largest is read, with {images} images."
-    return note(path, "cameras.several_models", sentence, models=count, images=images)
+def warn(path: object, code: str, sentence: str, **values: Any) -> None:
+    """Warn about a camera file; `pcfix.read_cameras` also returns the warning in `notes`."""
+    warnings.warn(note(path, code, sentence, **values), stacklevel=3)
 
 
-def no_sensor(path: Path, columns: str) -> InputError:
-    """Return the error for a table of poses without a lens."""
-    sentence = f"has angles but no sensor. Give --sensor a table with the columns {columns}."
-    return bad_file(path, "cameras.sensor_missing", sentence, columns=columns)
-
-
-def repeated(path: Path, labels: Sequence[str], dropped: int = 0) -> tuple[PcfixWarning, ...]:
-    """Return a note where labels repeat: they are no key, and their images stay separate."""
-    names = [label for label, count in Counter(labels).items() if count > 1]
-    if not names:
-        return ()
-    copies = f"; {dropped} exact copies are ignored" if dropped else ""
-    listed = ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
-    sentence = f"{len(names)} labels repeat ({listed}). Different positions are all used{copies}."
-    return (note(path, "cameras.repeated", sentence, labels=names, dropped=dropped),)
+def warn_several(path: Path, count: int, images: int) -> None:
+    """Warn if a file has several models that are not connected, of which the largest is read."""
+    if count > 1:
+        sentence = f"has {count} separate models. Only the largest is read, with {images} images."
+        warn(path, "cameras.several_models", sentence, models=count, images=images)
 
 
 @contextmanager
@@ -215,7 +210,7 @@ def rotations(path: Path, labels: Sequence[str], matrices: FloatArray) -> FloatA
     matrices = np.asarray(matrices, np.float64).reshape(-1, 3, 3)
     off = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     good = (off <= ROUNDING) & (np.linalg.det(np.nan_to_num(matrices, posinf=0.0)) > 0.0)
-    _check_rotations(path, labels, good, "the rotation of {} is mirrored or skewed")
+    _check_rotations(path, labels, good)
     for _ in range(2):  # Newton's iteration to the polar factor squares the rounding each time
         matrices = 1.5 * matrices - 0.5 * matrices @ matrices.transpose(0, 2, 1) @ matrices
     return matrices
@@ -226,14 +221,14 @@ def quaternions(path: Path, labels: Sequence[str], wxyz: FloatArray) -> FloatArr
     from scipy.spatial.transform import Rotation
 
     good = np.abs(np.linalg.norm(wxyz, axis=1) - 1.0) <= ROUNDING
-    _check_rotations(path, labels, good, "the quaternion of {} has not the length 1")
+    _check_rotations(path, labels, good)
     return np.asarray(Rotation.from_quat(np.roll(wxyz, -1, axis=1)).as_matrix())
 
 
-def _check_rotations(path: Path, labels: Sequence[str], good: BoolArray, what: str) -> None:
+def _check_rotations(path: Path, labels: Sequence[str], good: BoolArray) -> None:
     if not good.all():
         label = labels[int(np.argmin(good))]
-        sentence = f"{what.format(label)}. Export the poses again."
+        sentence = f"the rotation of {label} is mirrored, skewed or scaled. Export the poses again."
         raise bad_file(path, "cameras.rotation", sentence, image=label)
 
 
@@ -325,10 +320,10 @@ def no_tie_points(path: Path, why: str) -> NoTiePointsError:
     return NoTiePointsError("cameras.no_tie_points", sentence, path=path)
 
 
-class Seen(NamedTuple):
+class Observations(NamedTuple):
     """Points, and observations of them in any order: row of the point and camera, u and v.
 
-    The camera -1 is one without a pose, the point -1 one that is not there.
+    The camera -1 has no pose, and the point -1 is not in the file.
     """
 
     xyz: FloatArray
@@ -348,8 +343,8 @@ def rows_of(wanted: IntArray, identifiers: IntArray) -> IntArray:
     return np.where(identifiers[row] == wanted, row, -1)
 
 
-def tie_points(*parts: Seen) -> TiePoints:
-    """Join points and gather their observations by point, without those of a camera -1.
+def tie_points(*parts: Observations) -> TiePoints:
+    """Join points and sort their observations by point, without those of a camera or point -1.
 
     An observation that is not finite is skipped, and such a position is unknown.
     """
@@ -385,7 +380,7 @@ def image_size(folder: Path, name: str) -> tuple[int, int] | None:
     return None
 
 
-# ---- what writers share ----
+# ---- shared by the writers ----
 
 
 def block_to_write(path: Path, cameras: Cameras) -> tuple[FloatArray, tuple[Lens, ...]]:

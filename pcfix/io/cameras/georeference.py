@@ -1,15 +1,12 @@
-"""From the frame of a camera file into the cloud's CRS.
+"""Transform cameras from the frame of their file to the cloud's CRS.
 
-Centres go through PROJ, point by point. A rotation is taken over at its own centre: the directions
-one metre along the source's axes become three vectors in the target, and the rotation next to them
-turns the camera. That is the meridian convergence between maps, and all of the rotation from
-geocentric or topocentric axes. What it cannot hold is the scale of the map against that of the
-heights, 0.9996 on the central meridian of UTM: points 100 m below are up to that part of their
-distance from the principal point elsewhere in the image, 0.8 px at the edge of 4000 px. A cloud
-in map coordinates has the same flaw.
+PROJ transforms every centre. A rotation is transformed at its own centre: steps along the source's
+axes become three vectors in the target, and the closest rotation turns the camera. This includes
+the meridian convergence between maps, and geocentric or topocentric axes. It excludes the scale of
+the map, 0.9996 on the central meridian of UTM, which heights do not have: 0.8 px at the edge of an
+image of 4000 px. A cloud in map coordinates has the same error.
 
-Heights are shifted only where both sides state what theirs are. Otherwise they do not change:
-ellipsoidal ones remain ellipsoidal, whatever the cloud's datum is.
+Heights are transformed only if both sides state their vertical datum. Otherwise they do not change.
 """
 
 from __future__ import annotations
@@ -31,6 +28,7 @@ if TYPE_CHECKING:
 
 CENTRE_DISTANCE_M = (6.2e6, 7.0e6)
 """Cameras are at no other distance from the centre of the earth."""
+LARGEST_DEG = 360.0 + 1e-6
 STEP_M, EARTH_RADIUS_M = 10.0, 6.4e6
 """About half the distance over which directions are compared."""
 
@@ -38,8 +36,8 @@ STEP_M, EARTH_RADIUS_M = 10.0, 6.4e6
 class Frame(NamedTuple):
     """A frame that is tied to the earth.
 
-    `enter` takes points (n, 3) of it to `crs`, which is not geocentric, and is the frame itself
-    where it is `direct`. A `topocentric` one has axes east, north, up at a place.
+    `enter` transforms points (n, 3) to `crs`, which is not geocentric. In a `direct` frame they are
+    in `crs` already. A `topocentric` frame has axes east, north, up at a place.
     """
 
     crs: CRS
@@ -53,8 +51,7 @@ class Frame(NamedTuple):
             return
         if self.direct:
             code, kind = "cameras.degrees", "longitude and latitude"
-            turn = 2.0 * np.pi / systems.plan_unit(self.crs)[1] * (1.0 + 1e-9)
-            bad = (np.abs(xyz[:, :2]) > [turn, turn / 4.0]).any(axis=1)
+            bad = (np.abs(xyz[:, :2]) > [LARGEST_DEG, LARGEST_DEG / 4.0]).any(axis=1)
         else:
             code, kind = "cameras.geocentric", "geocentric coordinates"
             radius, (least, most) = np.linalg.norm(xyz, axis=1), CENTRE_DISTANCE_M
@@ -106,11 +103,11 @@ class Georeference:
     offset: FloatArray  # (3,), added to points of the file first
     crs: str | None  # of the result, as in `Cameras.crs`
     notes: tuple[PcfixWarning, ...] = ()
-    frame: Frame | None = None  # of the file; None where the numbers are used as they are
+    frame: Frame | None = None  # of the file; None if the numbers do not change
     forward: systems.Points = lambda xyz: xyz
 
     def cameras(self, cameras: Cameras) -> Cameras:
-        """Return the cameras with centres and rotations there; `gnss` stays in its own CRS."""
+        """Return the cameras in the target; `gnss` stays in its own CRS."""
         centres, rotations = self.points(cameras.centres), cameras.rotations
         lost = ~np.isfinite(centres).all(axis=1)
         if lost.any():
@@ -120,25 +117,24 @@ class Georeference:
             sentence += f" {systems.shortened(self.crs or '')}. Check --cameras-crs."
             raise bad_file(self.name, "cameras.not_transformed", sentence, image=cameras.labels[i])
         if rotations is not None and self.frame is not None:
-            rotations = rotations @ self.turns(cameras.centres).transpose(0, 2, 1)
+            turns = self._turns(self.frame, cameras.centres + self.offset)
+            rotations = rotations @ turns.transpose(0, 2, 1)
         found = replace(cameras, centres=centres, rotations=rotations, crs=self.crs)
         return replace(found, project_crs=None, notes=cameras.notes + self.notes)
 
     def points(self, xyz: FloatArray) -> FloatArray:
-        """Return points (n, 3) there; NaN where one is not finite or has no place there."""
+        """Return points (n, 3) in the target; NaN for those that cannot be transformed."""
         return np.where(np.isfinite(found := self.forward(xyz + self.offset)), found, np.nan)
 
-    def turns(self, xyz: FloatArray) -> FloatArray:
+    def _turns(self, frame: Frame, at: FloatArray) -> FloatArray:
         """Return the rotations from the source's axes to the target's at points (n, 3)."""
-        if self.frame is None:
-            return np.broadcast_to(np.eye(3), (len(xyz), 3, 3))
-        crs, at, steps = self.frame.crs, xyz + self.offset, STEP_M * np.eye(3)
-        if self.frame.direct:  # about that many metres in the units of the axes
+        crs, steps = frame.crs, STEP_M * np.eye(3)
+        if frame.direct:  # about that many metres in the units of the axes
             unit = systems.plan_unit(crs)[1] * (EARTH_RADIUS_M if crs.is_geographic else 1.0)
             steps /= [unit, unit, abs(systems.metres_up(crs))]
         ahead, behind = (self.forward((at[:, None] + s).reshape(-1, 3)) for s in (steps, -steps))
         if not (np.isfinite(ahead).all() and np.isfinite(behind).all()):
-            return np.full((len(xyz), 3, 3), np.nan)
+            return np.full((len(at), 3, 3), np.nan)
         vectors = (ahead - behind).reshape(-1, 3, 3).transpose(0, 2, 1)
         if (np.linalg.det(vectors) < 0.0).any():
             sentence = f"the axes of {crs.name} are left-handed. Use another CRS."
@@ -162,22 +158,19 @@ def georeference(
     cameras : Cameras
         As a reader gave them, in the frame of their file.
     cloud_crs : str, CRS or None
-        Projected, in metres. None where the cloud names none: then they are brought to where
-        the software delivers clouds, mostly where the cameras are.
+        Projected, in metres. If it is None, the target is the CRS in which the software delivers
+        clouds, mostly that of the cameras.
     cameras_crs : str, optional
-        Overrides the CRS in the file. ``local``: the numbers are used as they are. A CRS without
-        heights states that these agree with the cloud's, and so does ``ENU:lat,lon,height``. For a
+        Overrides the CRS in the file. ``local``: the numbers do not change. A CRS without heights
+        states that these agree with the cloud's, and so does ``ENU:lat,lon,height``. For a
         file with geocentric positions it is the CRS in which its software delivers clouds, unless
         it is geocentric itself.
     offset_m : tuple of 3 float, optional
-        Added to the centres before all else, in the axes and the unit of the cameras' frame.
+        Added to the centres first, in the axes and the unit of the cameras' frame.
     name : str
-        What is being read, for messages.
+        Of the file, for messages.
     """
-    offset = np.zeros(3) if offset_m is None else np.asarray(offset_m, np.float64)
-    if offset.shape != (3,) or not np.isfinite(offset).all():
-        sentence = f"the offset {offset_m} is not three numbers. Give x, y, z."
-        raise bad_file(name, "cameras.offset", sentence, value=offset_m)
+    offset = np.zeros(3) if offset_m is None else np.array(offset_m, np.float64)
     cloud = None if cloud_crs is None else systems.parse_crs(cloud_crs, "the cloud")
     # the frame of the cameras, and the CRS in which their software delivers clouds
     stated, project, given = cameras.crs, _on_earth(cameras.project_crs, name), cameras_crs or ""
@@ -237,17 +230,14 @@ def _into(
     crs = systems.crs_text(target)
     own, there = systems.heights_of(frame.crs), systems.heights_of(target)
     unit, size = systems.plan_unit(frame.crs)
-    axes = [e.semi_major_metre for e in (frame.crs.ellipsoid, target.ellipsoid) if e is not None]
-    other_datum = bool(axes) and max(axes) - min(axes) > 1.0
-    is_guess = other_datum or (project is None and not frame.topocentric)
+    is_guess = project is None and not frame.topocentric
     assumed = ""
     if own == "unstated" and frame.crs.is_projected and size != 1.0:
         assumed = f"heights are assumed to be in {unit}, like x and y"
     elif own == "unstated" != there and not trusted:
         assumed = f"names no vertical datum; that of the cloud is assumed ({target.name})"
     elif own == "ellipsoidal" and there == "unstated" and is_guess and not trusted:
-        words = "names no vertical datum; ellipsoidal is assumed"
-        assumed = f"the cloud's CRS ({target.name}) {words}"
+        assumed = f"the cloud's CRS ({target.name}) names no vertical datum; ellipsoidal is assumed"
     notes = (note(name, "cameras.heights_assumed", f"{assumed}."),) if assumed else ()
     by_user = trusted and not frame.direct
     heights = not (by_user or systems.heights_agree(frame.crs, target))
@@ -275,18 +265,11 @@ def _into(
 
 
 def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatArray, str]:
-    """Return how far the adjusted centres are from where the GNSS stated that they were.
+    """Return adjusted centres minus GNSS positions, and the reason why some are not compared.
 
-    That is metres along the axes of the cameras' map, or east, north, up where they are in none,
-    shape (k, 3); NaN where a camera has no position, and where the two cannot be compared, which is
-    often so of heights. The text is the reason why they cannot.
-
-    Parameters
-    ----------
-    cameras : Cameras
-        As read or in the cloud's CRS.
-    name : str
-        Of their file, for messages.
+    The differences, shape (k, 3), are metres along the axes of the cameras' map, or else east,
+    north, up. They are NaN for cameras without a position, and if the two cannot be compared, which
+    often holds for heights. The cameras are as read or in the cloud's CRS; `name` is their file.
     """
     found = np.full((len(cameras), 3), np.nan)
     if cameras.gnss is None:

@@ -1,4 +1,4 @@
-"""What is likely wrong where cameras are not over their cloud."""
+"""Find out what is wrong if cameras are not over their cloud."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 FOOT_M = 0.3048
 MARGIN_M = 100.0
-"""With half the cloud's sides: how far outside the cloud a block may be."""
+"""Distance from the cloud, beyond half of its sides, at which a block can still belong to it."""
 UNDULATION_M = (15.0, 110.0)
-"""Of the geoid, where it is worth a word."""
+"""Smallest undulation of the geoid that is reported, and the largest on earth."""
 ABSURD_HEIGHTS = 3.0
 """Largest height of cameras above the cloud, in widths of the cloud."""
 _SAMPLE = 200
@@ -28,12 +28,12 @@ _SAMPLE = 200
 def likely_mistake(
     centres: FloatArray, low: FloatArray, high: FloatArray, cloud_crs: str | CRS | None
 ) -> str | None:
-    """Return what is likely wrong where a block does not fit its cloud; None where it does.
+    """Return what is likely wrong if a block does not match its cloud; None if it does.
 
     Parameters
     ----------
     centres : array, shape (k, 3)
-        Projection centres, taken to be in the cloud's CRS.
+        Projection centres, assumed to be in the cloud's CRS.
     low, high : array, shape (3,)
         Corners of the cloud, metres.
     cloud_crs : str, CRS or None
@@ -62,37 +62,35 @@ def likely_mistake(
 
 
 def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str, FloatArray]]:
-    """Yield other ways to read the numbers, the simplest first; to the metre or so."""
+    """Yield other meanings of the numbers, the simplest first; to the metre or so."""
     from pyproj import Transformer
     from pyproj.exceptions import ProjError
 
-    swapped = centres[:, [1, 0, 2]]
-    yield "with x and y exchanged: their axes are likely swapped", swapped
+    yield "with x and y exchanged: their axes are likely swapped", centres[:, [1, 0, 2]]
     yield "multiplied by 0.3048: they are likely in feet, it in metres", centres * FOOT_M
     yield "divided by 0.3048: they are likely in metres, it in feet", centres / FOOT_M
     plan = None if crs is None else parts(parse_crs(crs, "the cloud"))[0]
     if plan is None or not plan.is_projected:
         return
-    remedy, zone = "set it with --cameras-crs", int((plan.utm_zone or "0N")[:-1])
-    others = [
-        (f"longitude and latitude in degrees; {remedy} EPSG:4326", 4326, centres),
-        ("degrees, latitude before longitude; exchange the columns", 4326, swapped),
-        (f"web Mercator; {remedy} EPSG:3857", 3857, centres),
-    ]
-    # the zones within two of the cloud's, and the other hemisphere
-    for near in [(zone + step - 1) % 60 + 1 for step in (0, -1, 1, -2, 2)] if zone else []:
-        for side, first in (("N", 32600), ("S", 32700)):
-            words = f"UTM zone {near}{side} (the cloud is in {plan.utm_zone}); {remedy}"
-            others.append((words, first + near, centres))
-    for words, code, numbers in others:
-        with suppress(ProjError):  # of a CRS that is no single map, as all zones of UTM in one
+    own = plan.utm_zone
+    codes = [("longitude and latitude in degrees", 4326), ("web Mercator", 3857)]
+    for zone in [(int(own[:-1]) + step - 1) % 60 + 1 for step in (0, -1, 1)] if own else []:
+        codes += [
+            (f"UTM zone {zone}{side} (the cloud is in {own})", first + zone)
+            for side, first in (("N", 32600), ("S", 32700))
+        ]
+    for words, code in codes:
+        with suppress(ProjError):  # of a CRS that is not a single map, such as EPSG:32600
             to_cloud = Transformer.from_crs(code, plan, always_xy=True)
-            x, y = to_cloud.transform(numbers[:, 0], numbers[:, 1])  # infinite outside of the CRS
-            yield f"read as {words}", np.column_stack([x, y])
+            x, y = to_cloud.transform(centres[:, 0], centres[:, 1])  # infinite outside of the CRS
+            yield (
+                f"read as {words}; set it with --cameras-crs EPSG:{code}",
+                np.column_stack([x, y]),
+            )
 
 
 def _wrong_height(middle: float, low: FloatArray, high: FloatArray) -> str | None:
-    """Return what is likely wrong where cameras are over the cloud in plan, but not above it."""
+    """Return what is likely wrong if cameras are over the cloud in plan, but not above it."""
     below, above = float(low[2]) - middle, middle - float(high[2])
     width = max(float((high - low)[:2].max()), MARGIN_M)
     limit = ABSURD_HEIGHTS * width
@@ -101,11 +99,7 @@ def _wrong_height(middle: float, low: FloatArray, high: FloatArray) -> str | Non
     what = f"{above:.0f} m above the cloud, which is {width:.0f} m wide"
     if below > 0.0:
         what = f"{below:.0f} m below the lowest point of the cloud"
-    why = "their heights have another origin; see --cameras-offset"
+    why = "check their unit and origin; see --cameras-offset"
     if max(below, above - limit) <= UNDULATION_M[1]:
         why = "heights above the ellipsoid and geoid are mixed"
-    elif high[2] < middle * FOOT_M < high[2] + limit:
-        why = "their heights are likely in feet"
-    elif high[2] < middle / FOOT_M < high[2] + limit:
-        why = "their heights are likely in metres, not feet"
     return f"The cameras are {what}: {why}."

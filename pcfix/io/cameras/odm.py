@@ -31,9 +31,9 @@ from typing import Any
 import numpy as np
 
 from pcfix.io.cameras import checks, opensfm
-from pcfix.io.cameras.checks import AffineFrame, Source, damaged, load_json, note, triple
+from pcfix.io.cameras.checks import AffineFrame, Source, damaged, load_json, triple
 from pcfix.io.cameras.lenses import lens_by_name
-from pcfix.io.cameras.opensfm import is_panorama, lens
+from pcfix.io.cameras.opensfm import lens
 from pcfix.io.crs import Topocentric
 from pcfix.io.labels import unnamed
 from pcfix.io.tables import read_lines
@@ -208,19 +208,20 @@ def _projected(crs: str, lon: float | FloatArray, lat: float | FloatArray) -> Fl
 
 
 def _read_shots(files: Files) -> Cameras:
-    """Read the cameras of shots.geojson, in the projected CRS."""
+    """Read the cameras of shots.geojson, in the projected CRS.
+
+    A lens is that of the camera that the shot names, or else of the only one that is alike.
+    """
     shots, crs = _shots(files["poses"]), _crs_of(files)
     labels, each = tuple(shots), shots.values()
     centres = np.array([triple(shot["translation"]) for shot in each])
     if crs is None and (place := (next(iter(each))["geometry"] or {}).get("coordinates")):
         lon, lat, _ = triple(place).tolist()  # a project without GNSS has made-up coordinates
         crs, _ = _located(lat, lon, None, centres[0, :2]) or (None, None)
-    # the lens is that of the camera that the shot names, or else of the only one that is alike
     known = {}
     if beside := files.get("cameras.json"):
         with checks.reading(beside):
-            entries = load_json(beside).items()
-            known = {k: lens(beside, k, entry) for k, entry in entries if not is_panorama(entry)}
+            known = {k: lens(beside, k, entry) for k, entry in load_json(beside).items()}
     lenses, plain = [], 0
     for shot in each:
         size = width, height = float(shot["width"]), float(shot["height"])
@@ -234,8 +235,9 @@ def _read_shots(files: Files) -> Cameras:
         found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else None)
         plain += found is None
         lenses.append(found or lens_by_name({"f": focal}, width, height))
-    sentence = f"cameras.json has no camera of {plain} images; no distortion is assumed."
-    notes = (note(files["poses"], "cameras.no_distortion", sentence, images=plain),)
+    if plain:
+        sentence = f"cameras.json has no camera of {plain} images; no distortion is assumed."
+        checks.warn(files["poses"], "cameras.no_distortion", sentence, images=plain)
     gnss, listed = read_images(files.get("images.json"), labels)
     return Cameras(
         labels=labels,
@@ -243,7 +245,6 @@ def _read_shots(files: Files) -> Cameras:
         rotations=from_rotation_vectors(np.array([triple(shot["rotation"]) for shot in each])),
         lenses=tuple(lenses),
         crs=crs or "local",
-        notes=notes if plain else (),
         gnss=gnss,
         unposed=unnamed(listed, labels),
         source="OpenDroneMap",

@@ -5,9 +5,8 @@ The file is a list of reconstructions, each with `cameras`, `shots` and `points`
 forward, so the projection centre is -R't. The world is topocentric, metres east, north and up at
 `reference_lla`, which is in the reconstruction or in reference_lla.json; `gps_position` is in
 the same frame, `gps_dop` its standard deviation in metres. Without a reference the frame is local.
-Where a shot rides on a rig and has no pose of its own, it is that of the rig camera (rig to
-camera) after that of the rig instance (world to rig). Coordinates too large to be topocentric come
-from ``export_geocoords --reconstruction``; that file does not name its CRS.
+Coordinates too large to be topocentric come from ``export_geocoords --reconstruction``; that file
+does not name its CRS.
 
 A line of tracks.csv is image, track, feature, x, y and more that differs between the versions (0
 without a header, 1 and 2 with one): scale, colour, segmentation. x and y are image coordinates
@@ -17,14 +16,13 @@ Of the interior orientation, `focal`, `focal_x`, `focal_y`, `c_x` and `c_y` are 
 larger side too, from the centre of the image. The tangential terms follow OpenCV (p1 with 2 x y in
 x). Distortion acts on the projected coordinates, which are angles for the fisheye models.
 
-References: "Reconstruction file", "Coordinate Systems" and "Rig Models" in the manual,
-https://opensfm.org/docs.
+References: "Reconstruction file" and "Coordinate Systems" in the manual, https://opensfm.org/docs.
 """
 
 from __future__ import annotations
 
 import re
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,7 +30,6 @@ import numpy as np
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.lenses import LensModel, lens_by_name
 from pcfix.io.labels import unnamed
-from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 
@@ -43,11 +40,11 @@ NO_GNSS = 999999.0
 
 
 class Reconstruction(NamedTuple):
-    """What the largest reconstruction of a file holds, in the frame of the file.
+    """The largest reconstruction of a file, in the frame of the file.
 
     `cameras` and their `gnss` are topocentric at `reference`, else local. `reference` is latitude
-    and longitude in degrees and the height in metres of the topocentric origin; None where the file
-    has none, or the made-up one that OpenSfM gives to images without positions.
+    and longitude in degrees and the height in metres of the topocentric origin; None if the file
+    has none, or the zeros that OpenSfM writes for images without positions.
     """
 
     path: Path
@@ -61,29 +58,16 @@ def read_reconstruction(path: Path) -> Reconstruction:
     data = checks.load_json(path)
     with checks.reading(path):
         sets = [entry.get("shots", {}) for entry in data]
-        chosen, all_shots = max(zip(data, sets, strict=True), key=lambda two: len(two[1]))
-        entries, notes = chosen["cameras"], []
-        shots = {k: v for k, v in all_shots.items() if not is_panorama(entries[v["camera"]])}
-        panoramas = [k for k in all_shots if k not in shots]
-        others = [name for some in sets if some is not all_shots for name in some]
-        if others:
-            notes.append(checks.several(path, len(data), len(all_shots)))
-        if panoramas:
-            sentence = f"{len(panoramas)} images of spherical cameras are skipped."
-            notes.append(checks.note(path, "cameras.panoramas", sentence, images=panoramas))
+        chosen, shots = max(zip(data, sets, strict=True), key=lambda two: len(two[1]))
+        others = [name for some in sets if some is not shots for name in some]
+        checks.warn_several(path, len(data) if others else 1, len(shots))
         if not shots:
             raise checks.no_pose(path)
-        lenses = {k: lens(path, k, entries[k]) for k in {shot["camera"] for shot in shots.values()}}
-        on_rig = {  # the pose of the rig in the world, then that of the camera on the rig
-            label: (instance, chosen.get("rig_cameras", {}).get(str(camera)))
-            for instance in chosen.get("rig_instances", {}).values()
-            for label, camera in instance.get("rig_camera_ids", {}).items()
-        }
-        poses = [
-            _pose(shot) if "rotation" in shot else _pose(*on_rig.get(label, (shot,)))
-            for label, shot in shots.items()
-        ]
-        rotations, shifts = (np.array(each) for each in zip(*poses, strict=True))
+        used = dict.fromkeys(shot["camera"] for shot in shots.values())
+        lenses = {name: lens(path, name, chosen["cameras"][name]) for name in used}
+        turns = np.array([checks.triple(shot["rotation"]) for shot in shots.values()])
+        rotations = from_rotation_vectors(turns)
+        shifts = np.array([checks.triple(shot["translation"]) for shot in shots.values()])
         places = {}
         for label, shot in shots.items():
             position, dop = shot.get("gps_position"), shot.get("gps_dop")
@@ -99,33 +83,19 @@ def read_reconstruction(path: Path) -> Reconstruction:
                 raise checks.damaged(path, f"reference_lla {lat:g}, {lon:g} is no place on earth")
             reference = None if lat == lon == 0.0 else (lat, lon, alt)
         crs = "local" if reference is None else "ENU:" + ",".join(map(repr, reference))
-        listed = path.with_name("image_list.txt")  # the images that the project was given
-        lines = read_lines(listed) if listed.is_file() else []
-        given = [PurePath(line.strip().replace("\\", "/")).name for line in lines if line.strip()]
         cameras = Cameras(
             labels=tuple(shots),
             centres=checks.centres(rotations, shifts),
             rotations=rotations,
             lenses=tuple(lenses[shot["camera"]] for shot in shots.values()),
             crs=crs,
-            notes=tuple(notes),
             gnss=checks.measured([*shots], places, crs) if reference else None,
-            unposed=unnamed([*others, *panoramas, *given], shots),
+            unposed=unnamed(others, shots),
             source="OpenSfM",
         )
         return Reconstruction(path, cameras, reference, chosen.get("points", {}))
 
 
-def _pose(*parts: Any) -> tuple[FloatArray, FloatArray]:
-    """Return R and t, x_camera = R x + t, of one pose after the other."""
-    rotation, shift = np.eye(3), np.zeros(3)
-    for part in parts:
-        turn = from_rotation_vectors(checks.triple(part["rotation"]))
-        rotation, shift = turn @ rotation, turn @ shift + checks.triple(part["translation"])
-    return rotation, shift
-
-
-HEADER = b"OPENSFM_TRACKS_VERSION"
 CHUNK_BYTES = 1 << 24
 
 
@@ -144,8 +114,7 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
     parts: list[tuple[IntArray, IntArray, FloatArray]] = []
     with checks.reading(beside), beside.open("rb") as stream:
         while block := stream.readlines(CHUNK_BYTES):  # there can be many millions of lines
-            lines = [line.split(b"\t", 5) for line in block if line.strip()]
-            lines = lines[1:] if not parts and block[0].startswith(HEADER) else lines
+            lines = [line.split(b"\t", 5) for line in block if line.count(b"\t")]
             point = np.array([point_of.get(fields[1], -1) for fields in lines], dtype=np.int64)
             camera = np.array([camera_of.get(fields[0], -1) for fields in lines], dtype=np.int64)
             values = np.array([fields[3:5] for fields in lines], dtype=float).reshape(-1, 2)
@@ -157,10 +126,8 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
     order = np.lexsort((camera, point))
     size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]
     uv = xy * size.max(axis=1, initial=0.0)[:, None] + size / 2.0
-    return checks.tie_points(checks.Seen(xyz, point[order], camera[order], uv[order]))
+    return checks.tie_points(checks.Observations(xyz, point[order], camera[order], uv[order]))
 
-
-PANORAMAS = frozenset({"equirectangular", "spherical"})
 
 _MODELS = {
     "perspective": LensModel("f k1 k2"),
@@ -177,19 +144,13 @@ _MODELS = {
 _NAMES = {"f": "focal", "fx": "focal_x", "fy": "focal_y", "cx": "c_x", "cy": "c_y"}
 _NAMES |= {"p1": "p2", "p2": "p1", "s1": "s0", "s2": "s1", "s3": "s2", "s4": "s3"}
 """What OpenSfM calls what has another name in `lenses`."""
-_SIZE = re.compile(r" (\d{2,6}) (\d{2,6}) [a-z_]+\d* ")
-
-
-def is_panorama(camera: dict[str, Any]) -> bool:
-    """Whether a camera sees all around, which no plane image with a frame can hold."""
-    return str(camera.get("projection_type")) in PANORAMAS
 
 
 def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
     """Return the lens of an entry of `cameras`."""
     model = str(camera.get("projection_type", "perspective"))
     if model not in _MODELS:
-        remedy = f"Use one of {', '.join(_MODELS)}"
+        remedy = f"Remove its images, or use one of {', '.join(_MODELS)}"
         what = f"the projection_type '{model}' of camera {name}"
         raise checks.unsupported(path, what, remedy, model=model, camera=name)
 
@@ -197,9 +158,6 @@ def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
         return float(camera.get(key, default))
 
     width, height = value("width"), value("height")
-    named = _SIZE.search(name)  # the size, in old files
-    if not (width and height) and named:
-        width, height = float(named[1]), float(named[2])
     if not (width and height):
         raise checks.damaged(path, f"the width and height of camera {name} are missing")
     scale = max(width, height)

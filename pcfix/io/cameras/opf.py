@@ -29,9 +29,9 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning, bad_file
+from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import AffineFrame, Source, load_json, note, triple
+from pcfix.io.cameras.checks import AffineFrame, Source, load_json, triple
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.cameras.pix4d import fisheye
 from pcfix.io.crs import crs_text, parse_crs, plan_unit
@@ -51,7 +51,7 @@ def read(source: Source) -> Cameras:
     project = _open_project(source.path)
     path, calibrated = project.part("calibration", "calibrated-cameras")
     _, given = project.part("input_cameras", "input-cameras", needed=False)
-    (frame, notes), names = _frame_of(project), dict[int, str]()
+    frame, names = _frame_of(project), dict[int, str]()
     for listed in project.files("camera_list", FORMAT.format("camera-list")):
         for camera in load_json(listed)["cameras"] if listed.is_file() else []:
             name = camera["uri"].replace("\\", "/").rpartition("/")[2]
@@ -76,7 +76,6 @@ def read(source: Source) -> Cameras:
         lenses=tuple(lenses) if shots and len(lenses) == len(shots) else None,
         crs=frame.crs,
         project_crs=frame.project_crs,
-        notes=(*notes, *checks.repeated(path, labels)),
         gnss=_gnss(path, captures, list(shots)),
         unposed=tuple(names.get(i, f"camera {i}") for i in captured if i not in shots),
         source=project.generator,
@@ -125,11 +124,11 @@ def _open_project(path: Path) -> Project:
     return Project(path, content["items"], " ".join(map(str, words)).strip())
 
 
-def _frame_of(project: Project) -> tuple[AffineFrame, list[PcfixWarning]]:
-    """Return the frame of the processing, east, north, up, and notes on it."""
+def _frame_of(project: Project) -> AffineFrame:
+    """Return the frame of the processing: east, north, up."""
     path, scene = project.part("scene_reference_frame", "scene-reference-frame", needed=False)
     if not scene:  # the frame of the processing is arbitrary
-        return AffineFrame(np.eye(3), np.zeros(3), "local"), []
+        return AffineFrame(np.eye(3), np.zeros(3), "local")
     way = scene["base_to_canonical"]
     shift, scale = triple(way["shift"]), triple(way["scale"])
     if not (scale > 0.0).all():
@@ -138,12 +137,11 @@ def _frame_of(project: Project) -> tuple[AffineFrame, list[PcfixWarning]]:
         scale = scale[[1, 0, 2]]  # positions are east, north already, scales in the CRS's order
     stated = checks.crs(path, scene["crs"]["definition"])
     crs, unit = (stated, 1.0) if stated == "local" else _with_heights(stated, str(path))
-    size, notes = [1.0, 1.0, unit] / scale, list[PcfixWarning]()
+    size = [1.0, 1.0, unit] / scale
     if geoid_m := float(scene["crs"].get("geoid_height") or 0.0):
         sentence = f"its heights refer to a constant geoid height of {geoid_m:g} m."
-        notes.append(note(path, "cameras.constant_geoid", sentence, geoid_m=geoid_m))
-    frame = AffineFrame(np.diag(size), -shift * size, crs, None if crs == stated else stated)
-    return frame, notes
+        checks.warn(path, "cameras.constant_geoid", sentence, geoid_m=geoid_m)
+    return AffineFrame(np.diag(size), -shift * size, crs, None if crs == stated else stated)
 
 
 def _with_heights(text: str, name: str) -> tuple[str, float]:
@@ -206,7 +204,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     project = _open_project(source.path)
     _, calibrated = project.part("calibration", "calibrated-cameras")
     row_of = {shot["id"]: i for i, shot in enumerate(calibrated["cameras"])}
-    (frame, _), found = _frame_of(project), list[checks.Seen]()
+    frame, found = _frame_of(project), list[checks.Observations]()
     for path in project.files("calibration", "model/gltf+json"):
         with checks.reading(path):
             model = load_json(path)
@@ -224,8 +222,10 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     return checks.tie_points(*found)
 
 
-def _matches(path: Path, model: Part, primitive: Part, row_of: dict[int, int]) -> checks.Seen:
-    """Return the points of a primitive, in the axes of its node, and where images saw them."""
+def _matches(
+    path: Path, model: Part, primitive: Part, row_of: dict[int, int]
+) -> checks.Observations:
+    """Return the points of a primitive, in the axes of its node, and their observations."""
     matches = primitive["extensions"][MATCHES]
     xyz = _accessor(path, model, primitive["attributes"]["POSITION"], 3).astype(np.float64)
     uv = _accessor(path, model, matches["imagePoints"]["pixelCoordinates"], 2).astype(np.float64)
@@ -239,7 +239,7 @@ def _matches(path: Path, model: Part, primitive: Part, row_of: dict[int, int]) -
         raise checks.damaged(path, "its points have more matches than there are")
     point = np.repeat(np.arange(len(count)), count)
     at = np.arange(len(point)) + np.repeat(first - (np.cumsum(count) - count), count)
-    return checks.Seen(xyz, point, rows[index[at]], uv[at])
+    return checks.Observations(xyz, point, rows[index[at]], uv[at])
 
 
 def _accessor(path: Path, model: Part, index: int, width: int) -> Any:

@@ -33,12 +33,11 @@ import numpy as np
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, image_size, number, numbers, read_xml
 from pcfix.io.cameras.lenses import lens_by_name
-from pcfix.io.cameras.sensor import read_frame, sensor_file
+from pcfix.io.cameras.sensor import FILM_MM, read_sensor, sensor_file
 from pcfix.model import Cameras, Lens
 
 NAMESPACE = "http://www.capturingreality.com/ns/xcr/"
 DESCRIPTION = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"
-FILM_MM = 36.0
 MODELS = {
     "perspective": "",
     "brown3": "k1 k2 k3",
@@ -76,7 +75,8 @@ def read(source: Source) -> Cameras:
     if not posed:
         raise checks.no_pose(path, "has no xcr:Rotation and xcr:Position")
     sensor = sensor_file(source)
-    given = None if sensor is None else read_frame(sensor)
+    lens = None if sensor is None else read_sensor(sensor)
+    given = None if lens is None else (lens.width, lens.height)
     frames = {file: image_size(folder, names[file]) or given for file in posed}
     lenses = [_lens(file, posed[file], *frame) for file, frame in frames.items() if frame]
     relative = any(of.get("Coordinates", "absolute") != "absolute" for of in posed.values())

@@ -1,10 +1,9 @@
-"""The lens of the images of a table, and a block written as a table with its sensor next to it.
+"""Read the sensor of tables, and write a block as a table with its sensor next to it.
 
-The lens is that of a table next to it, a calibration, or the table's own columns. Written are
-``cameras.csv``, with label, x, y, z, qw, qx, qy, qz: projection centre and rotation from the world
-to the camera (x right, y down, z forward), after a comment with the CRS where there is one; and
-``sensor.csv``, with the one lens of all images, in pixels with OpenCV's names or, of an undistorted
-lens in mm, as focal, sensor_x, sensor_y.
+A block is written as ``cameras.csv`` (label, x, y, z, qw, qx, qy, qz: projection centre and
+rotation from the world to the camera, x right, y down, z forward, after a comment with the CRS) and
+``sensor.csv`` (the one lens of all images, in pixels with OpenCV's names or, of an undistorted lens
+in mm, as focal, sensor_x, sensor_y).
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import write_new
 from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
 from pcfix.io.crs import is_topocentric
-from pcfix.io.tables import Table, read_table
+from pcfix.io.tables import read_table
 from pcfix.model import Cameras, Lens
 from pcfix.options.declare import File
 
@@ -33,14 +32,13 @@ NAMES = {"d1": "k4", "d2": "k5", "d3": "k6", "p2": "p1", "p1": "p2"}
 OPENCV = {"OpenCV": LensModel("f cx cy k1 k2 k3 d1 d2 d3 p2 p1")}
 TERMS = OPENCV["OpenCV"].names.split()[1:]
 CENTRED = {"centred": LensModel("f")}
-FRAME = ("width_px", "height_px")
 DISTORTION = ("k1", "k2", "k3", "k4", "t1", "t2")
 FILM_MM = 36.0
 """Larger side of the film that 35 mm focal lengths mean."""
 
 
 def sensor_file(source: checks.Source) -> Path | None:
-    """Return the file with the lens of all images: that of the user, or the one next to them."""
+    """Return the file with the lens of all images: that of the user, or ``sensor.csv``."""
     folder = source.path if source.path.is_dir() else source.path.parent
     default = folder / "sensor.csv"
     return source.sensor or (default if default.is_file() else None)
@@ -52,16 +50,17 @@ def read_sensor(path: Path) -> Lens:
     Parameters
     ----------
     path : Path
-        A calibration of Metashape (XML), or a table of one row. Its columns are either focal,
-        sensor_x, sensor_y in mm; the principal point is then the centre. Or they are focal_px,
-        width_px, height_px and, where known, OpenCV's cx, cy (pixels from the upper left corner
-        of the image), k1 ... k6, p1, p2.
+        A calibration of Metashape (XML), or a table of one row. Its columns are focal, sensor_x,
+        sensor_y in mm, with the principal point in the centre; or focal_px, width_px, height_px
+        and, if known, OpenCV's cx, cy (pixels from the upper left corner of the image),
+        k1 ... k6, p1, p2.
     """
-    table = _table(path, MILLIMETRES, PIXELS)
-    if table is None:
+    if checks.Source(path).text.lstrip().startswith("<"):
         from pcfix.io.cameras.metashape import read_calibration
 
         return checks.lens(path, path.stem, read_calibration(path))
+    names = (*MILLIMETRES, *PIXELS, *(NAMES.get(one, one) for one in TERMS))
+    table = read_table(path, MILLIMETRES, PIXELS, spellings={name: (name,) for name in names})
     if len(table.rows) != 1:
         sentence = f"has {len(table.rows)} rows. Give one row for all images."
         raise bad_file(path, "cameras.sensor_rows", sentence, rows=len(table.rows))
@@ -78,24 +77,6 @@ def read_sensor(path: Path) -> Lens:
     return lens
 
 
-def read_frame(path: Path) -> tuple[float, float]:
-    """Read the width and height of all images; the lens is not needed."""
-    table = _table(path, FRAME, MILLIMETRES)
-    if table is not None and table.has(*FRAME):
-        width, height = table.of(FRAME)[0].tolist()
-        return width, height
-    lens = read_sensor(path)
-    return lens.width, lens.height
-
-
-def _table(path: Path, *needed: tuple[str, ...]) -> Table | None:
-    """Return a table with the needed columns; None of a calibration of Metashape (XML)."""
-    if checks.Source(path).text.lstrip().startswith("<"):
-        return None
-    names = (*MILLIMETRES, *PIXELS, *(NAMES.get(one, one) for one in TERMS))
-    return read_table(path, *needed, spellings={name: (name,) for name in names})
-
-
 POSE = ("label", "x", "y", "z", "qw", "qx", "qy", "qz")
 
 
@@ -105,7 +86,7 @@ def write_table(folder: File, cameras: Cameras) -> None:
     Parameters
     ----------
     folder : path
-        Made if need be.
+        Created if it does not exist.
     cameras : Cameras
         With rotations and lenses.
     """

@@ -39,12 +39,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.errors import InputError, bad_file
 from pcfix.io import tables
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Angles, Source, note
+from pcfix.io.cameras.checks import Angles, Source
 from pcfix.io.cameras.lenses import lens_by_name
-from pcfix.io.cameras.sensor import DISTORTION, FILM_MM, read_frame, sensor_file
+from pcfix.io.cameras.sensor import DISTORTION, FILM_MM, read_sensor, sensor_file
 from pcfix.io.crs import shortened
 from pcfix.io.tables import Table
 from pcfix.lens import rotations
@@ -66,24 +66,21 @@ SPELLINGS: dict[str, tuple[str, ...]] = {
     "yaw": ("yaw", "heading", "gimbalyawdegree"),
     "pitch": ("pitch", "gimbalpitchdegree"),
     "roll": ("roll", "gimbalrolldegree"),
-    "longitude_ref": ("gpslongituderef",),
-    "latitude_ref": ("gpslatituderef",),
     "sigma_x": ("sigma_x", "accuracy_x", "accuracy_x/y", "accuracy_x/y/z", "accuracy_horz", "hacc"),
     "sigma_y": ("sigma_y", "accuracy_y", "accuracy_x/y", "accuracy_x/y/z", "accuracy_horz", "hacc"),
     "sigma_z": ("sigma_z", "accuracy_z", "accuracy_x/y/z", "accuracy_vert", "vacc"),
 }
-"""What a column is, and its names; where several are there, the first counts."""
+"""Roles of columns, and their names; if a table has several, the first counts."""
 POSE = ("x", "y", "z", "longitude", "latitude", "yaw", "pitch", "roll", "omega", "phi", "kappa")
 _OWN_NAMES = (
-    *("omega", "phi", "kappa", "qw", "qx", "qy", "qz", "enable", "tx", "ty", "tz"),
+    *("omega", "phi", "kappa", "qw", "qx", "qy", "qz", "enable"),
     *(f"r{i}{j}" for i in "123" for j in "123"),
     *("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"),
 )
 SPELLINGS |= {name: (name,) for name in _OWN_NAMES}
 SPELLINGS |= {f"{role}_est": (f"{role}_est",) for role in POSE}
-AXES, TRANSLATION = (("x", "y", "z"), ("longitude", "latitude", "z")), ("tx", "ty", "tz")
-POSITION = {"label", "x", "y", "z", "longitude", "latitude", "tx", "ty", "tz"}
-POSITION |= {"x_est", "y_est", "z_est"}
+AXES = (("x", "y", "z"), ("longitude", "latitude", "z"))
+POSITION = {"label", "x", "y", "z", "longitude", "latitude", "x_est", "y_est", "z_est"}
 MANY = ("label", *(f"sigma_{axis}" for axis in "xyz"))  # the first spelling counts
 
 
@@ -122,15 +119,16 @@ def read(source: Source) -> Cameras:
         else:
             first.setdefault((label, xyz[i].tobytes()), i)
     if not first:
-        raise checks.no_pose(source.path, "no image has a position")
+        raise checks.no_pose(source.path)
     rows = np.array(list(first.values()))
-    repeated = [label for label in columns.labels if label not in set(unposed)]
     columns, measured = columns.take(rows), measured.take(rows)
     turns = _rotations(columns, source.angles)
-    system, notes = crs(measured)
+    system, unknown = crs(measured)
+    if unknown:
+        checks.warn(source.path, "cameras.crs_unknown", f"{unknown} The cloud's is assumed.")
     if by_gnss:
         sentence = "its positions are those of the GNSS, not adjusted ones."
-        notes += (note(columns.path, "cameras.not_adjusted", sentence),)
+        checks.warn(source.path, "cameras.not_adjusted", sentence)
     has_lens = turns is not None and columns.has("f", "px", "py")
     return Cameras(
         labels=tuple(columns.labels),
@@ -138,7 +136,6 @@ def read(source: Source) -> Cameras:
         rotations=turns,
         lenses=_own_lenses(columns, source) if has_lens else None,
         crs=system,
-        notes=(*checks.repeated(columns.path, repeated, len(repeated) - len(rows)), *notes),
         gnss=gnss_positions(measured) if has_both else None,
         unposed=tuple(unposed),
         source="CSV table",
@@ -161,21 +158,18 @@ def open_table(path: Path) -> Table:
         place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
         numbers, units = [i for i, _ in split], [""] * len(GEO)
         return Table(path, [*GEO], rows, numbers, place, units, crs=lines[0].strip())
-    kinds = [("label", *three) for three in (*AXES, ("x_est", "y_est", "z_est"), TRANSLATION)]
+    kinds = [("label", *three) for three in (*AXES, ("x_est", "y_est", "z_est"))]
     table = tables.read_table(path, *kinds, spellings=SPELLINGS)
     for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
         alike = [name for name in table.header if name in spellings]
         if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
             sentence = f"the columns {', '.join(alike)} may all be {role}. Remove all but one."
             raise bad_file(path, "table.columns_alike", sentence, columns=alike)
-    if table.has(*TRANSLATION) and axes(table.place) is None:
-        sentence = "tx, ty, tz may be translations. Give the projection centres as x, y, z."
-        raise bad_file(path, "table.translations", sentence)
     return table
 
 
 def gnss_positions(columns: Table) -> GnssPositions | None:
-    """Return the positions by GNSS, or None where only adjusted ones are there."""
+    """Return the positions by GNSS, or None if there are only adjusted ones."""
     if axes(columns.place) is None:
         return None
     xyz = centres(columns)
@@ -193,48 +187,29 @@ def axes(place: Iterable[str]) -> tuple[str, str, str] | None:
 
 def centres(columns: Table, *, needed: bool = False) -> FloatArray:
     """Return positions, shape (k, 3), NaN for rows without when they are not `needed`."""
-    from pyproj import CRS
-
     three = axes(columns.place)
     if three is None:
         return np.full((len(columns.rows), 3), np.nan)
     xyz = columns.of(three) if needed else columns.where_there(three)
-    for i, side in enumerate(("longitude_ref", "latitude_ref")):
-        if columns.has(side):
-            texts = columns.column(side)
-            beyond = [text[:1].upper() in ("S", "W") for text in texts]
-            xyz[beyond, i] = -np.abs(xyz[beyond, i])
-    system = crs(columns)[0] or "local"
-    if three[0] == "longitude" or (system != "local" and CRS(system).is_geographic):
-        bad = (np.abs(xyz[:, :2]) > [360.0, 90.0]).any(axis=1)
-        if bad.any():
-            i = int(np.argmax(bad))
-            sentence = f"longitude {xyz[i, 0]:g}, latitude {xyz[i, 1]:g} is no place on earth."
-            raise columns.error(i, "cameras.degrees", sentence)
     xyz[np.isnan(xyz).any(axis=1)] = np.nan
     return xyz
 
 
-def crs(columns: Table) -> tuple[str | None, tuple[PcfixWarning, ...]]:
-    """Return the CRS that a table states or implies, and notes on it.
+def crs(columns: Table) -> tuple[str | None, str]:
+    """Return the CRS that a table states or implies, and a sentence if PROJ does not know it.
 
-    Longitude and latitude without more are those of WGS 84. Heights then are ellipsoidal only
-    if the header calls them so; else the CRS has no heights. A ``.prj`` of the table's name next
-    to it counts where the table itself states none.
+    Longitude and latitude without a CRS are those of WGS 84. Their heights are ellipsoidal only if
+    the header calls them so; else the CRS has no heights.
     """
-    stated, beside = columns.crs, columns.path.with_suffix(".prj")
-    if not stated and beside != columns.path and beside.is_file():
-        stated = " ".join(tables.read_lines(beside)).strip() or None
-    if stated is None:
+    if columns.crs is None:
         if axes(columns.place) != ("longitude", "latitude", "z"):
-            return None, ()
+            return None, ""
         ellipsoidal = columns.name("z").startswith("ellipsoid")
-        return WGS84_ELLIPSOIDAL if ellipsoidal else WGS84, ()
+        return WGS84_ELLIPSOIDAL if ellipsoidal else WGS84, ""
     try:
-        return checks.crs(columns.path, stated), ()
+        return checks.crs(columns.path, columns.crs), ""
     except InputError:
-        sentence = f"PROJ does not know its CRS '{shortened(stated)}'. The cloud's is assumed."
-        return None, (note(columns.path, "cameras.crs_unknown", sentence, crs=stated),)
+        return None, f"PROJ does not know its CRS '{shortened(columns.crs)}'."
 
 
 def is_geo(lines: list[str]) -> bool:
@@ -321,8 +296,9 @@ def _own_lenses(columns: Table, source: Source) -> tuple[Lens, ...]:
     """Return the lens of each row from RealityCapture's columns, with the size of a sensor."""
     path = sensor_file(source)
     if path is None:
-        raise checks.no_sensor(columns.path, "width_px,height_px")
-    width, height = read_frame(path)
+        raise checks.no_sensor(columns.path)
+    frame = read_sensor(path)
+    width, height = frame.width, frame.height
     side, lenses = max(width, height), []
     distortion = np.nan_to_num(columns.where_there(DISTORTION))
     for focal, x, y, *brown in np.hstack([columns.of(("f", "px", "py")), distortion]).tolist():
