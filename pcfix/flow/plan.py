@@ -21,11 +21,11 @@ from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import prepare, solved_cameras
 from pcfix.adjust.solve import solve
 from pcfix.errors import PcfixWarning, SettingError
-from pcfix.flow.cameras import draw_footprints
 from pcfix.flow.correct import correct_points
 from pcfix.flow.pose_errors import pose_errors
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import Points
+from pcfix.lens.frames import footprint
 from pcfix.model import Cameras, Correction, FloatArray, TiePoints, Views, WaterPlane
 from pcfix.options.correct import BudgetOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import options_of, taken
@@ -54,6 +54,7 @@ if TYPE_CHECKING:
 
 POINTS = 400
 """Of each bed; they are also the tie points of the adjustments."""
+MOST_FOOTPRINTS = 400
 MOST_BASES, MOST_SPACINGS = 8, 4
 """Limits of the simulated block: farther inside, the geometry repeats."""
 FEWEST_SEEN, NOTHING_PX = 50, 1e-6
@@ -268,7 +269,9 @@ def plan_text(plan: Figures) -> str:
 def plan_figure(plan: Figures, given: PlanOptions, cameras: Cameras) -> Figure:
     """Draw the block in plan, and the standard errors over the depth."""
     figure, (block, errors) = new_figure(10.0, 4.6, ncols=2)
-    draw_footprints(block, cameras, 0.0, linewidth=0.5, alpha=0.5)
+    for row in range(0, len(cameras), max(1, len(cameras) // MOST_FOOTPRINTS)):
+        border = footprint(cameras, row, 0.0)
+        block.plot(*np.vstack([border, border[:1]]).T, color=WATER, linewidth=0.5, alpha=0.5)
     block.plot(*cameras.centres[:, :2].T, "^", color=AFTER, markersize=4, label="images")
     x, y = given.area
     block.plot([0, x, x, 0, 0], [0, 0, y, y, 0], color=REFERENCE, label="area")

@@ -285,9 +285,10 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
                     place, srs = element.find("Position"), text_of(element, "SRSId") or srs_of_all
                     is_known = place is not None and srs == photos[0].srs
                     for row, mark in zip(rows, marks, strict=True):
-                        point.append(len(xyz))
-                        camera.append(row)
-                        uv.append([float(text_of(mark, axis)) + FIRST_PIXEL for axis in "xy"])
+                        if row >= 0:
+                            point.append(len(xyz))
+                            camera.append(row)
+                            uv.append([float(text_of(mark, axis)) + FIRST_PIXEL for axis in "xy"])
                     axes = [text_of(place, a) for a in "xyz"] if is_known else ["nan"] * 3
                     xyz.append([float(text) for text in axes])
                 element.clear()

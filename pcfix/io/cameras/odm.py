@@ -50,8 +50,6 @@ SCALE_TOLERANCE = 0.1
 WHOLE_M = 2e-3
 """Newer ODM puts the origin at whole metres; reference_lla is rounded a little."""
 SAME_FOCAL = 1e-6
-FEWEST = 3
-"""Images that show in which frame a reconstruction is."""
 GNSS_KEYS = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev")
 
 _FOLDERS = ("opensfm", "odm_georeferencing", "odm_georeferencing_25d", "odm_report")
@@ -61,7 +59,7 @@ _SHOTS_HEAD = re.compile(
     r'\s*\{.*"features"\s*:\s*\[.*"(translation|rotation|filename)"', re.DOTALL
 )
 Files = dict[str, Path]
-"""The files of a project that are there, by name, and the one with the ``poses``."""
+"""The existing files of a project by name, and the one with the ``poses``."""
 
 
 def recognises(source: Source) -> bool:
@@ -155,21 +153,18 @@ def _frame(files: Files, found: opensfm.Reconstruction) -> AffineFrame | None:
     moved = AffineFrame(np.eye(3), np.array([*place, 0.0]), crs)
     # centres of shots.geojson, else the GNSS, which stays topocentric, show whether it was moved:
     # the two readings differ by the meridian convergence and the scale
-    there = _shots(files[SHOTS]) if SHOTS in files else {}
-    shared = [i for i, label in enumerate(found.cameras.labels) if label in there]
     own, gnss = found.cameras.centres, found.cameras.gnss
-    if len(shared) >= FEWEST:
-        names = [found.cameras.labels[i] for i in shared]
-        truth = np.array([triple(there[name]["translation"]) for name in names])
-    else:
-        known = np.zeros(len(own), bool) if gnss is None else np.isfinite(gnss.xyz).all(axis=1)
-        shared = np.flatnonzero(known).tolist()
-        if gnss is None or len(shared) < FEWEST:
-            return moved
-        truth = _from_topocentric(gnss.xyz[shared], reference, crs)
+    truth = np.full(own.shape, np.nan)
+    if SHOTS in files:
+        shots = _shots(files[SHOTS])
+        for i, label in enumerate(found.cameras.labels):
+            truth[i] = triple(shots[label]["translation"]) if label in shots else np.nan
+    elif gnss is not None:
+        truth = _from_topocentric(gnss.xyz, reference, crs)
+    known = np.isfinite(truth).all(axis=1)
     still_m, moved_m = (
-        np.linalg.norm((guess - truth)[:, :2])
-        for guess in (_from_topocentric(own[shared], reference, crs), moved.points(own[shared]))
+        np.linalg.norm((guess - truth)[known, :2])
+        for guess in (_from_topocentric(own, reference, crs), moved.points(own))
     )
     return unmoved._replace(project_crs=crs) if still_m < 0.5 * moved_m else moved
 
@@ -210,7 +205,7 @@ def _projected(crs: str, lon: float | FloatArray, lat: float | FloatArray) -> Fl
 def _read_shots(files: Files) -> Cameras:
     """Read the cameras of shots.geojson, in the projected CRS.
 
-    A lens is that of the camera that the shot names, or else of the only one that is alike.
+    A lens is that of the camera that the shot names, or else the only one of this focal length.
     """
     shots, crs = _shots(files["poses"]), _crs_of(files)
     labels, each = tuple(shots), shots.values()
@@ -224,14 +219,10 @@ def _read_shots(files: Files) -> Cameras:
             known = {k: lens(beside, k, entry) for k, entry in load_json(beside).items()}
     lenses, plain = [], 0
     for shot in each:
-        size = width, height = float(shot["width"]), float(shot["height"])
-        focal = float(shot["focal"]) * max(size)
-        alike = [
-            one
-            for one in known.values()
-            if (one.width, one.height) == size
-            and abs(one.focal + one.b1 - focal) < SAME_FOCAL * max(size)
-        ]
+        width, height = float(shot["width"]), float(shot["height"])
+        focal = float(shot["focal"]) * max(width, height)
+        near = SAME_FOCAL * focal
+        alike = [one for one in known.values() if abs(one.focal + one.b1 - focal) < near]
         found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else None)
         plain += found is None
         lenses.append(found or lens_by_name({"f": focal}, width, height))

@@ -50,44 +50,40 @@ def read(source: Source) -> Cameras:
     """Read calibrated poses and lenses, in the CRS of the project."""
     project = _open_project(source.path)
     path, calibrated = project.part("calibration", "calibrated-cameras")
-    _, given = project.part("input_cameras", "input-cameras", needed=False)
+    _, given = project.part("input_cameras", "input-cameras")
     frame, names = _frame_of(project), dict[int, str]()
     for listed in project.files("camera_list", FORMAT.format("camera-list")):
         for camera in load_json(listed)["cameras"] if listed.is_file() else []:
             name = camera["uri"].replace("\\", "/").rpartition("/")[2]
             names[camera["id"]] = unquote(name.removesuffix("#page=0"))  # others keep their page
     shots = {shot["id"]: shot for shot in calibrated["cameras"]}
+    if not shots:
+        raise checks.no_pose(path)
     labels = tuple(names.get(i, f"camera {i}") for i in shots)
-    xyz = np.array([triple(shot["position"]) for shot in shots.values()]).reshape(-1, 3)
-    angles = np.array([triple(s["orientation_deg"]) for s in shots.values()]).reshape(-1, 3)
-    sensors = {sensor["id"]: sensor for sensor in given.get("sensors", [])}
-    known = {
-        sensor["id"]: _lens(path, sensor, sensors[sensor["id"]])
-        for sensor in calibrated["sensors"]
-        if "image_size_px" in sensors.get(sensor["id"], {})
-    }
-    lenses = [known[shot["sensor_id"]] for shot in shots.values() if shot["sensor_id"] in known]
+    xyz = np.array([triple(shot["position"]) for shot in shots.values()])
+    angles = np.array([triple(shot["orientation_deg"]) for shot in shots.values()])
+    sensors = {sensor["id"]: sensor for sensor in given["sensors"]}
+    lenses = {one["id"]: _lens(path, one, sensors[one["id"]]) for one in calibrated["sensors"]}
     captures = given.get("captures", [])
     captured = [shot["id"] for capture in captures for shot in capture.get("cameras", [])]
     return Cameras(
         labels=labels,
         centres=frame.points(xyz),
-        rotations=from_omega_phi_kappa(*angles.T) if len(shots) else None,
-        lenses=tuple(lenses) if shots and len(lenses) == len(shots) else None,
+        rotations=from_omega_phi_kappa(*angles.T),
+        lenses=tuple(lenses[shot["sensor_id"]] for shot in shots.values()),
         crs=frame.crs,
         project_crs=frame.project_crs,
         gnss=_gnss(path, captures, list(shots)),
         unposed=tuple(names.get(i, f"camera {i}") for i in captured if i not in shots),
-        source=project.generator,
+        source="OPF",
     )
 
 
 class Project(NamedTuple):
-    """The list of items of a project, and what wrote it."""
+    """The list of items of a project."""
 
     path: Path
     items: list[Part]
-    generator: str
 
     def files(self, kind: str, form: str) -> list[Path]:
         """Return the files of a format that items of a kind have."""
@@ -100,7 +96,7 @@ class Project(NamedTuple):
         ]
 
     def part(self, kind: str, form: str, *, needed: bool = True) -> tuple[Path, Part]:
-        """Return the one file of a format and what it holds; nothing where it is not needed."""
+        """Return the one file of a format and its contents, which are empty if not needed."""
         found = self.files(kind, FORMAT.format(form))
         if not found and not needed:
             return self.path, {}
@@ -119,9 +115,7 @@ def _open_project(path: Path) -> Project:
             sentence = f"belongs to one of {len(found)} OPF projects. Give the project file (.opf)."
             raise bad_file(path, "cameras.several_projects", sentence, projects=len(found))
         path, content = found[0], load_json(found[0])
-    generator = content.get("generator", {})
-    words = ("OPF", generator.get("name", ""), generator.get("version", ""))
-    return Project(path, content["items"], " ".join(map(str, words)).strip())
+    return Project(path, content["items"])
 
 
 def _frame_of(project: Project) -> AffineFrame:
@@ -138,9 +132,6 @@ def _frame_of(project: Project) -> AffineFrame:
     stated = checks.crs(path, scene["crs"]["definition"])
     crs, unit = (stated, 1.0) if stated == "local" else _with_heights(stated, str(path))
     size = [1.0, 1.0, unit] / scale
-    if geoid_m := float(scene["crs"].get("geoid_height") or 0.0):
-        sentence = f"its heights refer to a constant geoid height of {geoid_m:g} m."
-        checks.warn(path, "cameras.constant_geoid", sentence, geoid_m=geoid_m)
     return AffineFrame(np.diag(size), -shift * size, crs, None if crs == stated else stated)
 
 
