@@ -114,7 +114,7 @@ def read_cameras(
     for one in shown:
         warnings.warn(one.message, one.category, stacklevel=2)
     notes = [one.message for one in shown if isinstance(one.message, PcfixWarning)]
-    return replace(cameras, notes=tuple(notes))
+    return replace(cameras, notes=tuple(notes), source=FORMATS[form])
 
 
 def read_tie_points(path: File, cameras: Cameras) -> TiePoints:

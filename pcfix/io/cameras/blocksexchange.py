@@ -88,7 +88,6 @@ def read(source: Source) -> Cameras:
         crs=_crs_of(path, root, photos[0].srs),
         gnss=_gnss(path, root, photos),
         unposed=tuple(unposed),
-        source="BlocksExchange",
     )
 
 
@@ -252,6 +251,10 @@ def _photogroup(path: Path, element: Element) -> tuple[FloatArray, Lens | None]:
         return axes, None
     if text_of(element, "PrincipalPoint/x") and text_of(element, "PrincipalPoint/y"):
         given |= {f"c{side}": value(f"PrincipalPoint/{side}") + FIRST_PIXEL for side in "xy"}
+    elif pixel_mm > 0.0:  # from the centre, in the axes of the camera
+        mm = np.array([value("PrincipalPoint/xmm"), value("PrincipalPoint/ymm")])
+        x, y = axes[:2, :2] @ mm / pixel_mm
+        given |= {"cx": width / 2.0 + x, "cy": height / 2.0 + y}
     return axes, lens_by_name(given, width, height, sensor=name, **more)
 
 

@@ -2,30 +2,26 @@
 
 *Bundler*: N. Snavely, "Bundler v0.4 User's Manual", section "Output format", of files that begin
 with ``# Bundle file v0.3`` (https://www.cs.cornell.edu/~snavely/bundler/bundler-v0.4-manual.html).
-After the numbers of cameras and points come, for each camera, f k1 k2, a matrix R and a vector t,
-and then the points with their views (image, feature, x, y). ``X_cam = R X + t`` is in axes x right,
-y up, z backward, so the rows of y and z change sign for OpenCV's axes. The image is
-``f (1 + k1 r^2 + k2 r^4) (-X_cam / Z_cam)``, x right and y up from the middle of the frame. f = 0
-marks an image without a pose. Names are in ``list.txt``, a line for each camera.
+After the numbers of cameras and points come, for each camera, f k1 k2, R and t, and then the points
+with their views (image, feature, x, y). ``X_cam = R X + t`` is in axes x right, y up, z backward.
+The image is ``f (1 + k1 r^2 + k2 r^4) (-X_cam / Z_cam)``, x right and y up from the middle of the
+frame. f = 0 marks an image without a pose. ``list.txt`` has a name for each camera.
 
 *MVE* ("drews 1.0", https://github.com/simonfuhrmann/mve/wiki/MVE-File-Format) has OpenCV's axes, f
 in units of the longer side of the frame, and views (image, feature, nothing).
 
 *VisualSFM*: C. Wu, "VisualSFM: documentation", section "The output format: N-View Match"
-(http://ccwu.me/vsfm/doc.html#nvm). The first line may go on with the calibration that was held,
-``FixedK fx cx fy cy``. Then come models, up to a 0 or the end: a number of cameras, a line for each
-(name, f, quaternion with the scalar first, projection centre, k, 0), a number of points, a line for
-each (x y z, colour, n, then n times image, feature, x, y). A model without points holds the images
-that have no pose. In names, ``"`` stands for a space. The quaternion is world to camera in OpenCV's
-axes; ``NVM_V3_R9T`` has the matrix and the translation of ``x_cam = R x + t`` instead
-(``pba/src/pba/util.h`` of Multicore Bundle Adjustment). k is of the measured place:
-``(1 + k r^2) m / f`` is the undistorted one, with ``r = |m| / f``. Measured places m are counted
-from the principal point, which is the middle of the frame unless FixedK states another.
+(http://ccwu.me/vsfm/doc.html#nvm). The first line can state a fixed calibration, ``FixedK fx cx fy
+cy``. Then come models, up to a 0 or the end: a number of cameras, a line for each (name with ``"``
+for a space, f, quaternion with the scalar first, projection centre, k, 0), a number of points, a
+line for each (x y z, colour, n, then n times image, feature, x, y). A model without points has the
+images without a pose. The quaternion is world to camera in OpenCV's axes; ``NVM_V3_R9T`` has R and
+t of ``x_cam = R x + t`` instead. The undistorted place is ``(1 + k r^2) m / f`` with r = |m| / f;
+m is counted from the principal point, the middle of the frame unless FixedK states another.
 
 OpenSfM and ODM write .nvm files with places from the upper left corner, and scale the shorter side
-of the frame by its own length instead of the longer one's. Such a file is recognised by places none
-of which is negative and which are far from the projected points. The frame then follows from the
-points themselves.
+of the frame by its own length instead of the longer one's. In such a file no place is negative, and
+places are far from the projected points, which then show the frame.
 
 None has the sizes of the images: they are those of the images next to the file, or else the
 smallest that contain all tie points. The files name no CRS.
@@ -51,6 +47,7 @@ from pcfix.model import Cameras, FloatArray, TiePoints
 CONTENT = re.compile(r"\A\s*(#\s*Bundle file v\d+\.\d+|drews 1\.0|NVM_V3)")
 _BUNDLER = re.compile(r"#\s*Bundle file v(\d+\.\d+)")
 _VERSION = "0.3"
+BUNDLER, MVE, VISUALSFM = "Bundler", "MVE", "VisualSFM"
 _CAMERA_NUMBERS = 15
 _FOCAL_OF_LIST = re.compile(r"\s+0\s+[\d.]+$")
 _NVM = re.compile(r"NVM_V3(_R9T)?\b(?:\s*FixedK\s+(.*))?")
@@ -75,24 +72,25 @@ class Model(NamedTuple):
     lenses: list[dict[str, float]]  # parameters; f is of the longer side in files of MVE
     least_px: FloatArray
     points: Observations
+    software: str
 
 
 def read(source: Source) -> Cameras:
     """Read the poses of the largest model, and its lenses if sizes are known."""
-    cameras, parameters, least_px, _ = _model(source)
+    cameras, parameters, least_px, _, software = _model(source)
     frames = _frame_sizes(source.path, cameras.labels, least_px)
     lenses = []
     for given, (w, h) in zip(parameters, frames.tolist(), strict=False):
-        if cameras.source == "MVE":
+        if software == MVE:
             given["f"] *= max(w, h)
-        lenses.append(lens_by_name(given, w, h, inverse=cameras.source == "VisualSFM"))
+        lenses.append(lens_by_name(given, w, h, inverse=software == VISUALSFM))
     return replace(cameras, lenses=tuple(lenses) or None)
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points of the largest model and where the images saw them."""
     model = _model(source)
-    if model.cameras.source == "MVE":
+    if model.software == MVE:
         raise checks.no_tie_points(source.path, "MVE writes no image coordinates")
     middles = [(one.principal_x, one.principal_y) for one in cameras.lenses or ()]
     uv = np.array(middles).reshape(-1, 2)[model.points.camera] + model.points.uv
@@ -124,9 +122,8 @@ def _model(source: Source) -> Model:
         points = points._replace(uv=points.uv * (1.0, -1.0))
         least = _least_frames(points, len(rows))
     given = [dict(zip(("f", "k1", "k2"), row, strict=True)) for row in rows[:, :3].tolist()]
-    software, unposed = f"Bundler v{_VERSION}" if version else "MVE", _others(names, labels)
-    cameras = Cameras(labels, centres, rotations, unposed=unposed, source=software)
-    return Model(cameras, given, least, points)
+    cameras = Cameras(labels, centres, rotations, unposed=_others(names, labels))
+    return Model(cameras, given, least, points, BUNDLER if version else MVE)
 
 
 def _posed(
@@ -202,8 +199,8 @@ def _read_nvm(path: Path) -> Model:
     given = [{"f": f, "k1": k1} | fixed for f, k1 in rows[:, [0, -2]].tolist()]
     unposed = _others((name for model in models for name in model[0]), labels)
     checks.warn_several(path, len(among), len(labels))
-    cameras = Cameras(labels, centres, rotations, unposed=unposed, source="VisualSFM")
-    return Model(cameras, given, least, points)
+    cameras = Cameras(labels, centres, rotations, unposed=unposed)
+    return Model(cameras, given, least, points, VISUALSFM)
 
 
 def _points(path: Path, body: FloatArray, count: int, images: int, width: int) -> Observations:

@@ -66,11 +66,6 @@ class Source:
         is_archive = self.head.startswith(ZIP_MAGIC)
         return tables.decoded(read_document(self.path)[:_HEAD_BYTES] if is_archive else self.head)
 
-    @cached_property
-    def names(self) -> frozenset[str]:
-        """Names of the contents of a folder; none for a file."""
-        return frozenset(p.name for p in self.path.iterdir()) if self.path.is_dir() else frozenset()
-
 
 def recognises(form: Any, source: Source) -> bool:
     """Whether a format knows a file or folder: by a rule of its own, or by patterns.
@@ -80,7 +75,8 @@ def recognises(form: Any, source: Source) -> bool:
     if hasattr(form, "recognises"):
         return bool(form.recognises(source))
     if source.path.is_dir():
-        return any(re.fullmatch(getattr(form, "INSIDE", ""), name) for name in source.names)
+        pattern = re.compile(getattr(form, "INSIDE", ""))
+        return any(pattern.fullmatch(inside.name) for inside in source.path.iterdir())
     return re.search(form.CONTENT, source.text) is not None
 
 

@@ -1,28 +1,21 @@
 """COLMAP's sparse models, as text or binary.
 
-A model is a folder with ``cameras``, ``images`` and ``points3D``, all ``.bin`` or all ``.txt``.
-``rigs`` and ``frames`` (COLMAP 3.12 and later) are not needed, as ``images`` has the pose of every
-image in rigs also. Definition: https://colmap.github.io/format.html.
+A model is a folder with ``cameras``, ``images`` and ``points3D``, all ``.bin`` or all ``.txt``;
+``rigs`` and ``frames`` (COLMAP 3.12 and later) repeat them. Definition:
+https://colmap.github.io/format.html. A pose is a unit quaternion, scalar first, and a translation,
+both world to camera, in OpenCV axes: ``x_cam = R x + t``. Pixels start at the upper left corner of
+the upper left pixel. An image point has the identifier of its point in space, -1 for none;
+``points3D`` lists the same as tracks.
 
-A pose is a unit quaternion, scalar first, and a translation, both world to camera, in OpenCV
-axes: ``x_cam = R x + t``, so the projection centre is ``-R' t``. Pixels start at the upper left
-corner of the upper left pixel. The files name no CRS, unless ``georeference.json`` of pcfix is next
-to them (``crs``, text or null, ``offset_m``, three numbers, ``written_by``): its offset is then
-added to centres and tie points, and its CRS is theirs.
+The parameters of a camera are those of https://colmap.github.io/cameras.html and, for newer models,
+``src/colmap/sensor/models`` of COLMAP 4. p1 and p2 are in OpenCV's order, except in the model of
+Project Aria's cameras (RAD_TAN_THIN_PRISM_FISHEYE), where they are in Brown's and the tangential
+and prism terms are of the radially distorted place.
 
-Binary files are little-endian, with counts before lists and names that end with a zero byte; text
-files have a line per camera and point, two per image, and ``#`` before comments. The parameters of
-a camera are those of COLMAP's own list, in its order (https://colmap.github.io/cameras.html and,
-for newer models, ``src/colmap/sensor/models`` of COLMAP 4). p1 and p2 are in OpenCV's order, except
-in the model of Project Aria's cameras (RAD_TAN_THIN_PRISM_FISHEYE), where they are in Brown's and
-the tangential and prism terms are of the radially distorted place.
-
-Images keep the order of the file. An image point has the identifier of its point in space, -1 for
-none; ``points3D`` lists the same as tracks.
-
-Models are written in binary, without ``rigs`` and ``frames``, which COLMAP makes itself. Images
-and cameras are numbered from 1 in the order of the block, points in the order of the tie points.
-Positions are written minus an offset, which ``georeference.json`` records.
+The files name no CRS. pcfix writes positions minus an offset, and both to ``georeference.json``
+(``crs``, text or null, ``offset_m``, three numbers, ``written_by``), which it also reads. It writes
+binary models; images and cameras are numbered from 1 in the order of the block, points in the order
+of the tie points.
 """
 
 from __future__ import annotations
@@ -76,7 +69,6 @@ def read(source: Source) -> Cameras:
         rotations=rotations,
         lenses=tuple(lenses[image.camera] for image in images),
         crs=crs,
-        source="COLMAP",
     )
 
 

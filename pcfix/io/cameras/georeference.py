@@ -20,17 +20,16 @@ import numpy as np
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io import crs as systems
 from pcfix.io.cameras.checks import note
-from pcfix.io.cameras.mistakes import UNDULATION_M
 from pcfix.model import Cameras, FloatArray
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-CENTRE_DISTANCE_M = (6.2e6, 7.0e6)
-"""Cameras are at no other distance from the centre of the earth."""
 LARGEST_DEG = 360.0 + 1e-6
 STEP_M, EARTH_RADIUS_M = 10.0, 6.4e6
 """About half the distance over which directions are compared."""
+LEAST_UNDULATION_M = 15.0
+"""Difference from the GNSS above which heights above ellipsoid and geoid are likely mixed."""
 
 
 class Frame(NamedTuple):
@@ -46,21 +45,18 @@ class Frame(NamedTuple):
     topocentric: bool = False
 
     def check(self, xyz: FloatArray, labels: Sequence[str], name: str) -> None:
-        """Raise InputError for numbers that are no place on the earth."""
+        """Raise InputError for numbers that are not on the earth."""
         if self.topocentric or self.crs.is_projected:
             return
-        if self.direct:
-            code, kind = "cameras.degrees", "longitude and latitude"
-            bad = (np.abs(xyz[:, :2]) > [LARGEST_DEG, LARGEST_DEG / 4.0]).any(axis=1)
-        else:
+        code, kind = "cameras.degrees", "longitude and latitude"
+        bad = (np.abs(xyz[:, :2]) > [LARGEST_DEG, LARGEST_DEG / 4.0]).any(axis=1)
+        if not self.direct:
             code, kind = "cameras.geocentric", "geocentric coordinates"
-            radius, (least, most) = np.linalg.norm(xyz, axis=1), CENTRE_DISTANCE_M
-            bad = ~((radius > least) & (radius < most))
+            bad = np.abs(np.linalg.norm(xyz, axis=1) - EARTH_RADIUS_M) > 0.6e6
         if bad.any():
-            i = int(np.argmax(bad))
-            numbers = ", ".join(f"{number:.10g}" for number in xyz[i])
-            sentence = f"image {labels[i]}: {numbers} are not {kind}. Give --cameras-crs."
-            raise bad_file(name, code, sentence, image=labels[i], crs=self.crs.name)
+            label = labels[int(np.argmax(bad))]
+            sentence = f"the coordinates of image {label} are not {kind}. Give --cameras-crs."
+            raise bad_file(name, code, sentence, image=label, crs=self.crs.name)
 
 
 def frame_of(text: str, name: str) -> Frame:
@@ -255,7 +251,7 @@ def _into(
     if by_user and not frame.topocentric and systems.heights_of(target) == "gravity":
         up = adjusted_minus_gnss(found.cameras(cameras), name)[0][:, 2]
         off = float(np.median(up[np.isfinite(up)])) if np.isfinite(up).any() else 0.0
-        if abs(off) >= UNDULATION_M[0]:
+        if abs(off) >= LEAST_UNDULATION_M:
             side = "above" if off > 0.0 else "below"
             sentence = f"with the heights of --cameras-crs the cameras are {abs(off):.1f} m {side}"
             sentence += " their GNSS positions. Install the grid of the geoid instead."

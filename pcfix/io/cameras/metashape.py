@@ -1,15 +1,14 @@
-"""Agisoft Metashape and PhotoScan: exported cameras or markers, and whole projects.
+"""Agisoft Metashape and PhotoScan: exported cameras or markers, and projects.
 
 Read are the XML of *Export Cameras* and *Export Markers*, projects of one file (.psz, a zip) and
 projects with a folder (.psx, whose documents are zips in ``<name>.files``).
 
-Convention. ``camera/transform`` is a 4x4 matrix from the camera (x right, y down, z forward) to the
-chunk, whose origin, axes and scale mean nothing. The ``transform`` of the camera's component, or of
-the chunk, leads on to the world as s R X + t. With a CRS in ``reference`` the world is geocentric,
-on the datum of that CRS, whatever its kind, with ellipsoidal heights. With ``LOCAL_CS``, or no
-transform, it is local. The image of a slave camera (``master_id``) has the pose T_master [R, t],
-with the rotation and location of its sensor in the master's frame, t in the unit of the chunk. EXIF
-orientations turn only what is displayed: matrices and pixels are those of the image as stored.
+``camera/transform`` is a 4x4 matrix from the camera (x right, y down, z forward) to the chunk. The
+``transform`` of the camera's component, or of the chunk, leads on to the world as s R X + t. With
+a CRS in ``reference`` the world is geocentric, on the datum of that CRS, with ellipsoidal heights.
+With ``LOCAL_CS``, or no transform, it is local. The image of a slave camera (``master_id``) has the
+pose T_master [R, t], with the rotation and location of its sensor in the master's frame. EXIF
+orientations are ignored: matrices and pixels are those of the image as stored.
 
 The tie points of a frame are PLY files in one archive: ``points`` has x, y, z in the frame of the
 component and the id of the track, ``projections`` of each camera x and y in pixels from the corner
@@ -19,8 +18,7 @@ positions are the ``reference`` of each camera, in the CRS of the cameras or of 
 
 Calibration. The formula is that of `pcfix.model.Lens`, with cx and cy from the centre of the image.
 A fisheye is equidistant, and since version 2.3 can be equisolid. Files of PhotoScan up to 1.2 can
-have fx and fy instead of f (the version of the document does not show it): there cx and cy count
-from the corner, and p1 and p2 change places.
+have fx and fy instead of f: there cx and cy count from the corner, and p1 and p2 change places.
 
 References: "Agisoft Metashape User Manual, Professional Edition", appendix "Camera models";
 "Metashape Python Reference", Chunk.transform, Sensor.location, CoordinateSystem.geoccs;
@@ -86,7 +84,6 @@ def read(source: Source) -> Cameras:
         project_crs=project_crs,
         gnss=_gnss_positions(chunk, images),
         unposed=unposed,
-        source=chunk.software,
     )
 
 
@@ -94,11 +91,10 @@ def read(source: Source) -> Cameras:
 
 
 class Document(NamedTuple):
-    """An element, and the file or archive that contains it; of a chunk also what wrote it."""
+    """An element, and the file or archive that contains it."""
 
     root: Element
     path: Path
-    software: str = ""
 
     def path_to(self, element: Element) -> Path | None:
         """Return the archive that an element refers to; None if it has no path."""
@@ -129,24 +125,21 @@ def open_chunk(path: Path) -> Document:
     if top.root.tag == "document" and (inside := top.root.get("path")):  # .psx: in its folder
         named = path.parent / inside.replace("{projectname}", path.stem)
         top = Document(read_xml(named), named)
-    chosen = top
-    if top.root.tag != "chunk":
-        parent = top.root.find("chunks")
-        active = None if parent is None else parent.get("active_id")
-        listed = top.root.findall("chunk") or top.root.findall("chunks/chunk")
-        listed.sort(key=lambda chunk: chunk.get("id") != active)
-        found = [top.follow(chunk) for chunk in listed]
-        posed = [one for one in found if one.root.find("cameras//camera/transform") is not None]
-        if not found:
-            raise checks.no_pose(path, "has no chunk")
-        chosen = (posed or found)[0]
-        names = [name_of(one.root) for one in posed]
-        if len(names) > 1:
-            sentence = f"several chunks have aligned images; the active one, {names[0]}, is read."
-            warn(path, "cameras.several_chunks", sentence, chunk=names[0], others=names[1:])
-    about = top.properties("meta") | chosen.properties("meta")
-    version = about.get("Info/LastSavedSoftwareVersion", "")
-    return chosen._replace(software=f"Agisoft Metashape {version}".strip())
+    if top.root.tag == "chunk":
+        return top
+    parent = top.root.find("chunks")
+    active = None if parent is None else parent.get("active_id")
+    listed = top.root.findall("chunk") or top.root.findall("chunks/chunk")
+    listed.sort(key=lambda chunk: chunk.get("id") != active)
+    found = [top.follow(chunk) for chunk in listed]
+    posed = [one for one in found if one.root.find("cameras//camera/transform") is not None]
+    if not found:
+        raise checks.no_pose(path)
+    names = [name_of(one.root) for one in posed]
+    if len(names) > 1:
+        sentence = f"several chunks have aligned images; the active one, {names[0]}, is read."
+        warn(path, "cameras.several_chunks", sentence, chunk=names[0], others=names[1:])
+    return (posed or found)[0]
 
 
 # ---- images ----

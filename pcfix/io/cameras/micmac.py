@@ -2,27 +2,25 @@
 
 `Externe` has the projection centre (`Centre`) and the matrix camera to world as rows L1, L2, L3
 (`CodageMatr`); the camera is x right, y down, z forward. The interior orientation is `Interne` in
-the same file, or in the file that `FileInterne` names from the folder in which MicMac ran; it is
-looked for next to the orientation first. Scanned images, whose `OrIntImaM2C` maps camera to image
-pixels, are refused. The formats do not say whether pixels begin at the corner or the centre of the
-first, so nothing is added. The files name no CRS.
+the same file, or in the file that `FileInterne` names. Scanned images, with an `OrIntImaM2C`, are
+refused. The format does not say whether pixels begin at the corner or the centre of the first, so
+nothing is added. The files name no CRS.
 
-An ideal position F (x, y) / z + PP, in pixels, goes through the distortion to the observed one
-(eConvApero_DistM2C), or the observed to the ideal one (eConvApero_DistC2M). Read are the formulas
-that `pcfix.model.Lens` holds exactly, d being the distance from the centre of distortion: none;
-radial, d (k1 d^2 + k2 d^4 + ...); and Fraser's with decentring P1 (2 x^2 + d^2) + 2 P2 x y. The
-affinity b1 x + b2 y of Fraser's is of the ideal place, that of a lens of the distorted one; they
-differ by the product of affinity and distortion, mostly below 0.1 px. mm3d ConvertCalib converts
-other formulas.
+An ideal position F (x, y) / z + PP, in pixels, is distorted to the observed one
+(eConvApero_DistM2C), or the observed to the ideal one (eConvApero_DistC2M). Read are no distortion;
+radial, d (k1 d^2 + k2 d^4 + ...) with d from the centre of distortion; and Fraser's with decentring
+P1 (2 x^2 + d^2) + 2 P2 x y. The affinity b1 x + b2 y of Fraser's is of the ideal place, that of
+`pcfix.model.Lens` of the distorted one; they differ by the product of affinity and distortion,
+mostly below 0.1 px. mm3d ConvertCalib converts other formulas.
 
-MMVII has the centre (`Center`) and the camera's axes in the world (`AxeI`, `AxeJ`, `AxeK`), the
-same matrix by columns, and the calibration in a file next to it: ideal places (X, Y) / Z to
-observed ones with K1, K2, ... radial, p1, p2, b1 and b2 as above; anything beyond is refused.
+MMVII has the centre (`Center`) and the camera's axes in the world (`AxeI`, `AxeJ`, `AxeK`), and the
+calibration in a file next to it: ideal places (X, Y) / Z to observed ones with K1, K2, ... radial,
+p1, p2, b1 and b2 as above.
 
 References: M. Pierrot-Deseilligny and others, "MicMac, Apero, Pastis and other beverages in a
 nutshell", https://github.com/micmacIGN/Documentation, "Distortion models" and ConvertCalib;
-include/XML_GEN/ParamChantierPhotogram.xml of https://github.com/micmacIGN/micmac for the elements;
-MMVII's files write the formula of each coefficient next to it.
+include/XML_GEN/ParamChantierPhotogram.xml of https://github.com/micmacIGN/micmac; MMVII's files
+write the formula of each coefficient next to it.
 """
 
 from __future__ import annotations
@@ -63,7 +61,6 @@ def read(source: Source) -> Cameras:
         centres=np.array([centre for centre, _, _ in poses]),
         rotations=np.array([rotation for _, rotation, _ in poses]),
         lenses=tuple(lens for _, _, lens in poses),
-        source="MicMac",
     )
 
 

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 FOOT_M = 0.3048
 MARGIN_M = 100.0
 """Distance from the cloud, beyond half of its sides, at which a block can still belong to it."""
-UNDULATION_M = (15.0, 110.0)
-"""Smallest undulation of the geoid that is reported, and the largest on earth."""
 ABSURD_HEIGHTS = 3.0
 """Largest height of cameras above the cloud, in widths of the cloud."""
 _SAMPLE = 200
@@ -40,25 +38,30 @@ def likely_mistake(
     """
     centres = np.asarray(centres, np.float64)[:: max(1, len(centres) // _SAMPLE)]
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
-    size, margin = high - low, 0.5 * (high - low)[:2] + MARGIN_M
+    width, margin = max((high - low)[:2].max(), MARGIN_M), 0.5 * (high - low)[:2] + MARGIN_M
+    middle = np.median(centres, axis=0)
 
     def is_over(moved: FloatArray) -> bool:
         """Whether the middle of a block is over the cloud, or not far from it."""
-        middle = np.median(moved[:, :2], axis=0)
-        return bool(np.all((middle >= low[:2] - margin) & (middle <= high[:2] + margin)))
+        x, y = np.median(moved[:, :2], axis=0)
+        return bool((([x, y] >= low[:2] - margin) & ([x, y] <= high[:2] + margin)).all())
 
     if is_over(centres):
-        return _wrong_height(float(np.median(centres[:, 2])), low, high)
+        if low[2] <= middle[2] <= high[2] + ABSURD_HEIGHTS * width:
+            return None
+        what = f"{middle[2] - high[2]:.0f} m above the cloud, which is {width:.0f} m wide"
+        if middle[2] < low[2]:
+            what = f"{low[2] - middle[2]:.0f} m below the lowest point of the cloud"
+        why = "check the unit and the vertical datum of both, or see --cameras-offset"
+        return f"The cameras are {what}: {why}."
     for words, moved in _readings(centres, cloud_crs):
         if is_over(moved):
             return f"The cameras would be over the cloud {words}."
-    x, y = (low + high)[:2] / 2.0 - np.median(centres[:, :2], axis=0)
-    span, away = np.ptp(centres[:, :2], axis=0).max(), float(np.hypot(x, y))
-    advice = "check the CRS of both."
-    if 0.2 < span / max(size[:2].max(), 1e-9) < 5.0:
-        advice = f"perhaps by an offset of {x:.0f}, {y:.0f} m; see --cameras-offset."
+    x, y = (low + high)[:2] / 2.0 - middle[:2]
+    away = float(np.hypot(x, y))
     far = f"{away / 1000.0:,.1f} km" if away >= 1e4 else f"{away:.0f} m"
-    return f"The cameras are {far} from the cloud in plan; {advice}"
+    advice = f"check the CRS of both, or give an offset of {x:.0f}, {y:.0f} m by --cameras-offset"
+    return f"The cameras are {far} from the cloud in plan; {advice}."
 
 
 def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str, FloatArray]]:
@@ -75,31 +78,9 @@ def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str,
     own = plan.utm_zone
     codes = [("longitude and latitude in degrees", 4326), ("web Mercator", 3857)]
     for zone in [(int(own[:-1]) + step - 1) % 60 + 1 for step in (0, -1, 1)] if own else []:
-        codes += [
-            (f"UTM zone {zone}{side} (the cloud is in {own})", first + zone)
-            for side, first in (("N", 32600), ("S", 32700))
-        ]
+        codes += [(f"UTM zone {zone}N", 32600 + zone), (f"UTM zone {zone}S", 32700 + zone)]
     for words, code in codes:
         with suppress(ProjError):  # of a CRS that is not a single map, such as EPSG:32600
             to_cloud = Transformer.from_crs(code, plan, always_xy=True)
-            x, y = to_cloud.transform(centres[:, 0], centres[:, 1])  # infinite outside of the CRS
-            yield (
-                f"read as {words}; set it with --cameras-crs EPSG:{code}",
-                np.column_stack([x, y]),
-            )
-
-
-def _wrong_height(middle: float, low: FloatArray, high: FloatArray) -> str | None:
-    """Return what is likely wrong if cameras are over the cloud in plan, but not above it."""
-    below, above = float(low[2]) - middle, middle - float(high[2])
-    width = max(float((high - low)[:2].max()), MARGIN_M)
-    limit = ABSURD_HEIGHTS * width
-    if below <= 0.0 and above <= limit:
-        return None
-    what = f"{above:.0f} m above the cloud, which is {width:.0f} m wide"
-    if below > 0.0:
-        what = f"{below:.0f} m below the lowest point of the cloud"
-    why = "check their unit and origin; see --cameras-offset"
-    if max(below, above - limit) <= UNDULATION_M[1]:
-        why = "heights above the ellipsoid and geoid are mixed"
-    return f"The cameras are {what}: {why}."
+            moved = np.column_stack(to_cloud.transform(centres[:, 0], centres[:, 1]))
+            yield f"read as {words}; set it with --cameras-crs EPSG:{code}", moved

@@ -4,14 +4,14 @@ ODM reconstructs with OpenSfM and delivers its cloud in a projected CRS, named i
 the first line of coords.txt. Its reconstruction has been in three frames:
 
 - up to 2020 topocentric as OpenSfM writes it, with geocoords_transformation.txt, an affine map
-  from it to projected coordinates, and so to the cloud;
-- then with the axes of the projected CRS, less its coordinates of the reference; the reference is
-  at whole metres, which distinguishes this frame from a topocentric one;
+  to the projected CRS of the cloud;
+- then with the axes of the projected CRS, minus its coordinates of the reference, which are whole
+  metres;
 - topocentric again in versions that project the finished cloud point by point, and in
-  reconstruction.topocentric.json, which the second kind keeps.
+  reconstruction.topocentric.json. If the reference is at whole metres, shots.geojson or the GNSS
+  positions (always topocentric) distinguish it from the second.
 
-Where the reference is at whole metres, shots.geojson or the GNSS positions (always topocentric)
-decide between the last two. Poses come out in the projected CRS, in the third frame topocentric.
+Poses are returned in the projected CRS, in the third frame topocentric.
 
 shots.geojson has per image `translation`, the projection centre in the projected CRS, `rotation`,
 axis times angle from the axes of that CRS to the camera (x right, y down, z forward), and size and
@@ -88,7 +88,6 @@ def read(source: Source) -> Cameras:
         project_crs=placed.project_crs,
         gnss=gnss or own.gnss,
         unposed=unnamed([*own.unposed, *listed], own.labels),
-        source="OpenDroneMap",
     )
 
 
@@ -238,7 +237,6 @@ def _read_shots(files: Files) -> Cameras:
         crs=crs or "local",
         gnss=gnss,
         unposed=unnamed(listed, labels),
-        source="OpenDroneMap",
     )
 
 

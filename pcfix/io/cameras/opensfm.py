@@ -91,7 +91,6 @@ def read_reconstruction(path: Path) -> Reconstruction:
             crs=crs,
             gnss=checks.measured([*shots], places, crs) if reference else None,
             unposed=unnamed(others, shots),
-            source="OpenSfM",
         )
         return Reconstruction(path, cameras, reference, chosen.get("points", {}))
 

@@ -1,14 +1,13 @@
 """OPF, the Open Photogrammetry Format of PIX4Dmatic and PIX4Dcatch: a project and its parts.
 
-The project (``.opf``, JSON) names files by item and format. Of the item `calibration` come the
-calibrated cameras and the tracks; `input_cameras` has frames, pixel sizes and the GNSS positions;
-`camera_list` the names of the images; `scene_reference_frame` the CRS.
+The project (``.opf``, JSON) names files by item and format. The item `calibration` has the
+calibrated cameras and the tracks; `input_cameras` frames and GNSS positions; `camera_list` the
+names of the images; `scene_reference_frame` the CRS.
 
-Poses are in the processing CRS, which is right-handed and isometric: coordinates of the project's
-CRS times `scale`, with x and y exchanged where that is left-handed (`swap_xy`), plus `shift`. So
-its axes are east, north, up, as `Cameras` has them of a CRS with northing before easting too. A CRS
-without heights has ellipsoidal ones, in the unit of its plan. Omega, phi, kappa: Rx Ry Rz turns
-image axes x right, y up, z back to the processing CRS.
+Poses are in the processing CRS, which is right-handed: coordinates of the project's CRS times
+`scale`, with x and y exchanged if that is left-handed (`swap_xy`), plus `shift`. So its axes are
+east, north, up. A CRS without heights has ellipsoidal ones, in the unit of its plan. Omega, phi,
+kappa: Rx Ry Rz turns image axes x right, y up, z back to the processing CRS.
 
 Pixels start at the corner of the image; T1 and T2 are in OpenCV's order. A fisheye has an affine
 matrix [c d; e f] and a polynomial of 2 theta / pi, as in `pcfix.io.cameras.pix4d`.
@@ -75,7 +74,6 @@ def read(source: Source) -> Cameras:
         project_crs=frame.project_crs,
         gnss=_gnss(path, captures, list(shots)),
         unposed=tuple(names.get(i, f"camera {i}") for i in captured if i not in shots),
-        source="OPF",
     )
 
 

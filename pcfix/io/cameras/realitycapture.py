@@ -1,22 +1,20 @@
 """RealityCapture and RealityScan: .xmp files next to the images, one each.
 
 The fields of the namespace ``xcr`` are attributes or child elements. `Rotation` is world to
-camera by rows (x right, y down, z forward) and `Position` the projection centre. Lengths in the
-image are shares of its larger side, the focal length times 36 (the film of 35 mm cameras), the
-principal point from the centre of the image:
+camera by rows (x right, y down, z forward) and `Position` the projection centre. With
+scale = max(width, height) and f = FocalLength35mm / 36 scale:
 
-    scale = max(width, height),  f = FocalLength35mm / 36 scale
     u = width / 2 + U scale + f x' + Skew scale y'
     v = height / 2 + V scale + AspectRatio f y'
 
 The coefficients are k1, k2, k3, k4, t1, t2 of Brown's formula, in his order,
 x' = ... + t1 (r^2 + 2 x^2) + 2 t2 x y; models named brown3 leave k4 out, those without "t2" the
 last two. The division model undoes the distortion after the calibration matrix, about the centre
-of the image: m = m' / (1 + k1 |m'|^2), m and m' places in shares of the larger side.
+of the image: m = m' / (1 + k1 |m'|^2), m and m' divided by the scale.
 
-The size of an image is not in the file: it is that of the image next to it, or from the proportions
-of ``--sensor``. Positions called relative or rigid are in a local frame; absolute ones are in the
-CRS of the export, which the file does not name; its `latitude` and `longitude` are others.
+The size of an image is that of the image next to the file, or has the proportions of ``--sensor``.
+Positions called relative or rigid are in a local frame; absolute ones are in the CRS of the export,
+which the file does not name; its `latitude` and `longitude` are others.
 
 References: Epic Games, "RealityScan/RealityCapture XMP camera math" and RealityScan Help, "XMP
 Metadata" (tools/xmpalign). The software's own templates for OpenCV and projection matrices, and the
@@ -90,7 +88,6 @@ def read(source: Source) -> Cameras:
         lenses=tuple(lenses) if len(lenses) == len(posed) else None,
         crs="local" if relative else None,
         unposed=tuple(names[file] for file in images if file not in posed),
-        source="RealityCapture",
     )
 
 

@@ -1,33 +1,29 @@
 """Plain tables of poses: a header line, then one image a row.
 
-Fields are separated by comma, semicolon, tab or spaces; the header may be a comment (#), and units
-may stand in it (x[m], omega[gon]). What its columns may be called is in `SPELLINGS`: the image, its
-projection centre (longitude and latitude in degrees of WGS 84 are EPSG:4326, or EPSG:4979 if the
-header calls the heights ellipsoidal), and how it is turned, or nothing:
+Fields are separated by comma, semicolon, tab or spaces; the header may be a comment (#), and have
+units (x[m], omega[gon]). `SPELLINGS` has the names of the columns: image, projection centre
+(degrees are of WGS 84, EPSG:4326, or EPSG:4979 if the header calls the heights ellipsoidal), and
+the rotation, or none. P are photogrammetric camera axes, x right, y up, z back:
 
-- omega, phi, kappa: photogrammetric camera axes (x right, y up, z back) go to the world by
-  Rx(omega) Ry(phi) Rz(kappa); a matrix next to them is ignored.
-- yaw, pitch, roll, 0 for a view straight down: those axes go to the world by
-  Rz(-yaw) Rx(pitch) Ry(roll). So are Metashape's reference angles, ODM's, and the heading,
-  pitch, roll of RealityCapture.
-- yaw, pitch, roll of a gimbal, -90 for a view straight down (``angles="aircraft"``, or
-  exiftool's GimbalPitchDegree): Rz(-yaw) Rx(90 + pitch) Rz(-roll). Angles that fit this better
-  than the former are refused until the user names their kind.
+- omega, phi, kappa: P to world is Rx(omega) Ry(phi) Rz(kappa); a matrix next to them is ignored.
+- yaw, pitch, roll, 0 for a view straight down (Metashape, ODM, RealityCapture's heading): P to
+  world is Rz(-yaw) Rx(pitch) Ry(roll).
+- yaw, pitch, roll of a gimbal, -90 for a view straight down (``angles="aircraft"``, or exiftool's
+  GimbalPitchDegree): Rz(-yaw) Rx(90 + pitch) Rz(-roll). If these fit better and the user has not
+  set the kind, the table is refused.
 - qw, qx, qy, qz: world to camera with axes x right, y down, z forward, as in COLMAP.
 - only r11 ... r33: world to camera, to either of the two axes; the cameras look down.
 
-Axes of the world are those of the CRS of the positions: its grid north, or for degrees the east,
-north and up of the place. Values called ``_est`` are adjusted ones; the others are then
-positions by GNSS, with the stated accuracies (Metashape's reference table).
+World axes are those of the CRS of the positions, or for degrees east, north and up. Values called
+``_est`` are adjusted ones; the others are then GNSS positions (Metashape's reference table).
 
 RealityCapture's ``f, px, py, k1 ... k4, t1, t2``: f in mm for a film of 36 mm along the larger side
-of the image, px and py in units of that side from the centre, Brown's distortion with t1 and t2 in
-his order.
+of the image, px and py in units of that side from the centre, Brown's distortion in his order.
 
-References: Agisoft Metashape User Manual; OpenDroneMap documentation, "Image Geolocation Files".
-The turn of RealityCapture is shown by one camera in XMP and in CSV at
+References: Agisoft Metashape User Manual; OpenDroneMap documentation, "Image Geolocation Files";
+one camera of RealityCapture in XMP and in CSV at
 https://forums.unrealengine.com/t/different-rotation-of-cameras-in-xmp-and-csv/710449 ; the scale of
-its f, px, py and the order of t1, t2 are those of AliceVision's reader of the same numbers.
+f, px, py and the order of t1, t2 as in AliceVision's reader.
 """
 
 from __future__ import annotations
@@ -138,7 +134,6 @@ def read(source: Source) -> Cameras:
         crs=system,
         gnss=gnss_positions(measured) if has_both else None,
         unposed=tuple(unposed),
-        source="CSV table",
     )
 
 
@@ -228,15 +223,15 @@ CONVERSIONS = {
 OMEGA_PHI_KAPPA, YAW_PITCH_ROLL, _ = (roles for roles, _ in CONVERSIONS.values())
 QUATERNION, MATRIX = ("qw", "qx", "qy", "qz"), tuple(f"r{i}{j}" for i in "123" for j in "123")
 LARGEST_DEG = 360.0
-LOOKS_DOWN_DEG = 80.0
-"""Largest tilt from the vertical of a camera that looks at the ground."""
+LOOKS_DOWN = 0.17
+"""Least cosine of the tilt, about 80 degrees, of a camera that looks at the ground."""
 
 
 def _rotations(columns: Table, angles: Angles | None) -> FloatArray | None:
-    """Return world to camera rotations, or None where the table has nothing that turns.
+    """Return world to camera rotations, or None if the table has none.
 
-    `angles` is their kind as the user names it. Where the header cannot, the view must decide: the
-    cameras look down at the ground.
+    `angles` is their kind if the user sets it. Otherwise the header decides, or the assumption that
+    the cameras look down at the ground.
     """
     path, wanted = columns.path, CONVERSIONS[angles][0] if angles else ()
 
@@ -269,12 +264,9 @@ def _rotations(columns: Table, angles: Angles | None) -> FloatArray | None:
     found, gimbal = rotations.from_yaw_pitch_roll(*values), rotations.from_aircraft(*values)
     if columns.name("yaw").startswith("gimbal"):
         return gimbal
-    tilt, other = (  # the angles between the views and straight down
-        np.degrees(np.arctan2(np.hypot(each[:, 2, 0], each[:, 2, 1]), -each[:, 2, 2]))
-        for each in (found, gimbal)
-    )
+    down, other = -found[:, 2, 2], -gimbal[:, 2, 2]  # cosines of the tilt from straight down
     reality_capture = columns.after_hash and columns.name("yaw") == "heading"
-    is_likely = other.max() < LOOKS_DOWN_DEG and np.median(other) < np.median(tilt)
+    is_likely = other.min() > LOOKS_DOWN and np.median(other) > np.median(down)
     if is_likely and not reality_capture:
         sentence = "yaw, pitch, roll are likely those of a gimbal. Give --angles aircraft, or"
         raise unclear(f"{sentence} --angles yaw-pitch-roll.")

@@ -89,7 +89,7 @@ def read(source: Source) -> NoReturn:
 def _refusal(source: Source) -> tuple[str, str] | None:
     """Return what the content is and what to do, or None if it is not known."""
     is_folder = source.path.is_dir()
-    names = sorted(source.names) if is_folder else [source.path.name]
+    names = sorted(p.name for p in source.path.iterdir()) if is_folder else [source.path.name]
     for pattern, what, remedy in FOLDERS if is_folder else PARTS:
         if found := next((name for name in names if re.fullmatch(pattern, name)), None):
             return (f"a folder with {found}: {what}" if is_folder else what), remedy
