@@ -123,11 +123,8 @@ def _photos(path: Path, root: Element) -> tuple[list[Photo], list[str]]:
     photos = turned or main or outside
     if not photos:
         raise checks.no_pose(path)
-    block_of: dict[str, int] = {}
-    twice = [p.label for p in photos if block_of.setdefault(p.label, p.key[0]) != p.key[0]]
-    if twice or len({photo.srs for photo in photos}) > 1:
-        why = f"image {twice[0]} is in several blocks" if twice else "it has several SRS"
-        sentence = f"{why}. Export only the block of the cloud, in one SRS."
+    if len({(photo.key[0], photo.srs) for photo in photos}) > 1:
+        sentence = "has several blocks or SRS. Export only the block of the cloud, in one SRS."
         raise bad_file(path, "cameras.several_blocks", sentence)
     if ignored:
         sentence = f"photogroup {', '.join(ignored[:10])} is skipped (its ManualPose is false)."

@@ -30,7 +30,6 @@ smallest that contain all tie points. The files name no CRS.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -44,9 +43,7 @@ from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_photogrammetric
 from pcfix.model import Cameras, FloatArray, TiePoints
 
-CONTENT = re.compile(r"\A\s*(#\s*Bundle file v\d+\.\d+|drews 1\.0|NVM_V3)")
-_BUNDLER = re.compile(r"#\s*Bundle file v(\d+\.\d+)")
-_VERSION = "0.3"
+CONTENT = r"\A\s*(#\s*Bundle file v0\.3|drews 1\.0|NVM_V3)"
 BUNDLER, MVE, VISUALSFM = "Bundler", "MVE", "VisualSFM"
 _CAMERA_NUMBERS = 15
 _FOCAL_OF_LIST = re.compile(r"\s+0\s+[\d.]+$")
@@ -103,38 +100,35 @@ def _model(source: Source) -> Model:
     if _NVM.match(source.text.lstrip()):
         return _read_nvm(path)
     head, *body = read_lines(path)
-    version = _BUNDLER.match(head)
-    if version and version[1] != _VERSION:
-        what = f"Bundler's format v{version[1]}"
-        raise checks.unsupported(path, what, f"Export v{_VERSION}", version=version[1])
+    is_mve = "drews" in head
     values = np.array(" ".join(body).split(), np.float64)
     count, end = int(values[0]), 2 + _CAMERA_NUMBERS * int(values[0])
     rows = values[2:end].reshape(count, _CAMERA_NUMBERS)
-    points = _points(path, values[end:], int(values[1]), count, 4 if version else 3)
-    rows, points, posed = _posed(path, rows, points, rows[:, 0] != 0.0)
-    kind = "camera" if version else "view"
+    points = _points(path, values[end:], int(values[1]), count, 3 if is_mve else 4)
+    kind = "view" if is_mve else "camera"
     names = _listed_names(path, count) or [f"{kind} {i}" for i in range(count)]
-    labels = tuple(names[i] for i in posed)
+    rows, points, labels = _posed(path, rows, points, names)
     rotations = checks.rotations(path, labels, rows[:, 3:12])
     centres, least = checks.centres(rotations, rows[:, 12:]), np.zeros((len(rows), 2))
-    if version:
+    if not is_mve:
         rotations = from_photogrammetric(rotations)
         points = points._replace(uv=points.uv * (1.0, -1.0))
         least = _least_frames(points, len(rows))
     given = [dict(zip(("f", "k1", "k2"), row, strict=True)) for row in rows[:, :3].tolist()]
-    cameras = Cameras(labels, centres, rotations, unposed=_others(names, labels))
-    return Model(cameras, given, least, points, BUNDLER if version else MVE)
+    cameras = Cameras(labels, centres, rotations, unposed=tuple(sorted({*names} - {*labels})))
+    return Model(cameras, given, least, points, MVE if is_mve else BUNDLER)
 
 
 def _posed(
-    path: Path, rows: FloatArray, points: Observations, has_pose: np.ndarray
-) -> tuple[FloatArray, Observations, list[int]]:
-    """Return the rows of images with a pose, the views with their new numbers, and the old ones."""
+    path: Path, rows: FloatArray, points: Observations, names: list[str]
+) -> tuple[FloatArray, Observations, tuple[str, ...]]:
+    """Return the rows, the views and the names of images with a pose; the first column is f."""
+    has_pose = rows[:, 0] > 0.0
     if not has_pose.any():
         raise checks.no_pose(path)
     number = np.where(has_pose, np.cumsum(has_pose) - 1, -1)
     points = points._replace(camera=number[points.camera])
-    return rows[has_pose], points, np.flatnonzero(has_pose).tolist()
+    return rows[has_pose], points, tuple(names[i] for i in np.flatnonzero(has_pose))
 
 
 def _least_frames(points: Observations, count: int) -> FloatArray:
@@ -142,11 +136,6 @@ def _least_frames(points: Observations, count: int) -> FloatArray:
     least, is_posed = np.zeros((count, 2)), points.camera >= 0
     np.maximum.at(least, points.camera[is_posed], 2.0 * np.abs(points.uv[is_posed]))
     return least
-
-
-def _others(names: Iterable[str], labels: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of images without a pose, each once."""
-    return tuple(name for name in dict.fromkeys(names) if name not in set(labels))
 
 
 def _listed_names(path: Path, count: int) -> list[str]:
@@ -181,8 +170,7 @@ def _read_nvm(path: Path) -> Model:
         raise checks.no_pose(path)
     among = [model for model in models if len(model[2].xyz)] or models
     names, rows, points = max(among, key=lambda model: (model[1][:, 0] > 0.0).sum())
-    rows, points, posed = _posed(path, rows, points, rows[:, 0] > 0.0)
-    labels = tuple(names[i] for i in posed)
+    rows, points, labels = _posed(path, rows, points, names)
     if matrix:
         rotations = checks.rotations(path, labels, rows[:, 1:10])
         centres = checks.centres(rotations, rows[:, 10:13])
@@ -197,7 +185,7 @@ def _read_nvm(path: Path) -> Model:
         expected = rows[points.camera, :1] * np.column_stack([x / z, y / z])
         points, least = _from_the_middle(points, expected, rows[:, 0])
     given = [{"f": f, "k1": k1} | fixed for f, k1 in rows[:, [0, -2]].tolist()]
-    unposed = _others((name for model in models for name in model[0]), labels)
+    unposed = tuple(sorted({name for model in models for name in model[0]} - {*labels}))
     checks.warn_several(path, len(among), len(labels))
     cameras = Cameras(labels, centres, rotations, unposed=unposed)
     return Model(cameras, given, least, points, VISUALSFM)

@@ -6,7 +6,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from pathlib import Path, PureWindowsPath
@@ -234,7 +234,7 @@ def centres(rotations: FloatArray, translations: FloatArray) -> FloatArray:
 
 
 def lens(path: Path, name: str, given: Lens) -> Lens:
-    """Return the lens when its numbers can be those of a camera."""
+    """Return the lens if its numbers can be those of a camera."""
     positive = min(given.focal, given.focal + given.b1, given.width, given.height) > 0.0
     every = np.hstack([v for v in astuple(given) if isinstance(v, float | tuple)])
     if not (positive and np.isfinite(every).all()):
@@ -260,8 +260,8 @@ def measured(
 ) -> GnssPositions | None:
     """Return the GNSS positions of images by their keys, with their standard deviations.
 
-    Numbers that are not finite are unknown; a position may lack its height only. None where no
-    image has a position.
+    Numbers that are not finite are unknown; a position may lack its height only. None if no image
+    has a position.
     """
     unknown = np.full((2, 3), np.nan)
     rows = [places.get(key, unknown) for key in keys]
@@ -329,12 +329,11 @@ class Observations(NamedTuple):
 
 
 def rows_of(wanted: IntArray, identifiers: IntArray) -> IntArray:
-    """Return the first row of each of the wanted in a list of identifiers, -1 where it is none."""
+    """Return the first row of each wanted one in a list of identifiers, -1 if it is not there."""
     if not len(identifiers):
         return np.full(len(wanted), -1)
-    order, rising = np.argsort(identifiers, kind="stable"), np.argsort(wanted)
-    place = np.empty(len(wanted), np.int64)  # a search in rising order is far quicker
-    place[rising] = np.searchsorted(identifiers[order], wanted[rising])
+    order = np.argsort(identifiers, kind="stable")
+    place = np.searchsorted(identifiers, wanted, sorter=order)
     row = order[np.minimum(place, len(order) - 1)]
     return np.where(identifiers[row] == wanted, row, -1)
 
@@ -358,21 +357,17 @@ def tie_points(*parts: Observations) -> TiePoints:
 
 
 def image_size(folder: Path, name: str) -> tuple[int, int] | None:
-    """Return width and height of an image, None when it is not there or cannot be opened.
+    """Return width and height of an image; None if it is missing or cannot be opened.
 
-    It is looked for in the folder, one folder up, and in ``images``.
+    It can be in the folder, one folder up, or in ``images``.
     """
     from PIL import Image
 
     plain = name.replace("\\", "/")
     file = PureWindowsPath(name).name
     for place in (folder / plain, folder / file, folder.parent / plain, folder / "images" / file):
-        try:
-            if place.is_file():
-                with Image.open(place) as image:
-                    return image.size
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-            continue
+        with suppress(Exception), Image.open(place) as image:
+            return image.size
     return None
 
 

@@ -177,9 +177,8 @@ def aligned_images(chunk: Document) -> tuple[list[Image], tuple[str, ...]]:
     own = dict[str, FloatArray]()  # poses in the chunk
     for name, camera in photos.items():
         if text := text_of(camera, "transform"):
-            where = f"image {name_of(camera)}"
-            matrix = numbers(path, f"{where}, transform", text, 16).reshape(4, 4)
-            own[name] = _rigid(path, where, matrix[:3, :3], matrix[:3, 3])
+            where = f"image {name_of(camera)}, transform"
+            own[name] = numbers(path, where, text, 16).reshape(4, 4)
     images, others, unused = list[Image](), list[str](), 0
     for name, camera in photos.items():
         label, master = name_of(camera), camera.get("master_id") or ""
@@ -187,11 +186,12 @@ def aligned_images(chunk: Document) -> tuple[list[Image], tuple[str, ...]]:
         place = places.get(home, places[None])
         sensor, pose = sensors.get(camera.get("sensor_id")), own.get(name)
         if pose is None and master in own and sensor is not None:  # its sensor is on the master
-            where = f"sensor {name_of(sensor)}"
-            rotation = text_of(sensor, "rotation") or "1 0 0 0 1 0 0 0 1"
-            shift = numbers(path, where, text_of(sensor, "location") or "0 0 0", 3)
-            turn = numbers(path, where, rotation, 9)
-            pose = own[master] @ _rigid(path, where, turn, shift)
+            where, turn = f"sensor {name_of(sensor)}", text_of(sensor, "rotation")
+            on_master = np.eye(4)
+            on_master[:3, 3] = numbers(path, where, text_of(sensor, "location") or "0 0 0", 3)
+            if turn:
+                on_master[:3, :3] = numbers(path, where, turn, 9).reshape(3, 3)
+            pose = own[master] @ on_master
         if pose is None:
             others.append(label)
         elif sensor is None:
@@ -203,19 +203,10 @@ def aligned_images(chunk: Document) -> tuple[list[Image], tuple[str, ...]]:
             images.append(Image(name, label, camera, sensor, home, pose, place))
     why = "disabled, not from a frame or fisheye sensor, or in a component without transform"
     if not images:
-        reason = f"{len(others) - unused} are not aligned, {unused} {why}"
-        raise checks.no_pose(path, f"of the {len(photos)} images {reason}")
+        raise checks.no_pose(path, f"no image is aligned, or all are {why}")
     if unused:
         warn(path, "cameras.left_out", f"{unused} aligned images are skipped: {why}.")
     return images, tuple(others)
-
-
-def _rigid(path: Path, where: str, rotation: FloatArray, shift: FloatArray) -> FloatArray:
-    """Return the 4x4 matrix of a rotation, rounded in the file, and a translation."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = checks.rotations(path, [where], rotation)[0]
-    matrix[:3, 3] = shift
-    return matrix
 
 
 def _places(path: Path, chunk: Element) -> tuple[dict[str | None, FloatArray | None], bool]:

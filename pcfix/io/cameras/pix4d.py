@@ -105,7 +105,6 @@ def read(source: Source) -> Cameras:
         lenses=lenses if len(lenses) == len(labels) else None,
         crs=checks.crs(files["wkt"], wkt) if wkt else None,
         unposed=tuple(name for name in dict.fromkeys(given) if name not in set(labels)),
-        source="Pix4D",
     )
 
 

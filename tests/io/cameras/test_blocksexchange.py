@@ -205,7 +205,7 @@ TIE = (
     "<TiePoint><Position><x>1</x><y>2</y><z>3</z></Position>"
     "<Measurement><PhotoId>1</PhotoId><x>10</x><y>20</y></Measurement>"
     "<Measurement><PhotoId>99</PhotoId><x>1</x><y>1</y></Measurement>"
-    "<Measurement><PhotoId>2</PhotoId><xmm>0.6</xmm><ymm>-0.6</ymm></Measurement></TiePoint>"
+    "<Measurement><PhotoId>2</PhotoId><x>3110</x><y>1890</y></Measurement></TiePoint>"
     "<TiePoint><Measurement><PhotoId>2</PhotoId><x>0</x><y>0</y></Measurement></TiePoint>"
     "<TiePoint><SRSId>0</SRSId><Position><x>1</x><y>2</y><z>3</z></Position>"
     "<Measurement><PhotoId>2</PhotoId><x>5</x><y>6</y></Measurement></TiePoint>"

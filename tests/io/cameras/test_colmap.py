@@ -144,7 +144,6 @@ def test_binary_knows_the_models_by_their_numbers(tmp_path, number):
         ("cameras", "500 510", "0 510", "cameras.lens"),
         ("images", "4 1 0 0 0", "4 2 0 0 0", "cameras.rotation"),
         ("images", IMAGES, "# none\n", "cameras.no_pose"),
-        ("cameras", "# Cam", "# Number of cameras: 3\n# Cam", "cameras.damaged"),
         ("images", "a.jpg\n\n", "a.jpg\n", "cameras.damaged"),
     ],
 )  # fmt: skip

@@ -109,7 +109,6 @@ def test_tracks_fall_where_the_images_saw_them(make, kind):
     assert len(misses) == 59
     assert misses.max() < FLOAT32_PX
     assert cameras.labels == ("a b.jpg", "b.jpg")
-    assert cameras.source == "OPF PIX4Dmatic 1.6"
 
 
 @pytest.mark.parametrize("given", ["folder", "project.opf", "calibrated-cameras.json"])
