@@ -114,13 +114,11 @@ def read_place(folder: Path) -> tuple[FloatArray, str | None]:
     """Return the offset of a model's positions and their CRS, from pcfix's file next to it."""
     path = folder / FILE
     with checks.reading(path):
-        found = checks.load_json(path) if path.is_file() else None
-        if not isinstance(found, dict) or found.get("written_by") != WRITER:
+        found = checks.load_json(path) if path.is_file() else {}
+        if found.get("written_by") != WRITER:
             return np.zeros(3), None
         offset, crs = checks.triple(found["offset_m"]), found["crs"]
-        if not np.isfinite(offset).all() or not isinstance(crs, str | None):
-            raise checks.damaged(path, "it needs offset_m, three numbers, and crs")
-    return offset, crs if crs is None or is_topocentric(crs) else checks.crs(path, crs)
+        return offset, crs if crs is None or is_topocentric(crs) else checks.crs(path, crs)
 
 
 def place_text(offset_m: FloatArray, crs: str | None) -> str:
@@ -290,7 +288,7 @@ def read_points(path: Path) -> tuple[IntArray, FloatArray]:
 
 
 WRITTEN = {k: model for k, model in BY_NAME.items() if k not in ("SIMPLE_FISHEYE", "FISHEYE")}
-"""Without the two for which older versions of COLMAP have one that does the same."""
+"""Models that are written: older versions of COLMAP do not know the two others."""
 GREY = (128, 128, 128)
 ROUND_M = 100.0
 

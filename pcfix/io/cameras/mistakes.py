@@ -36,8 +36,7 @@ def likely_mistake(
         Corners of the cloud, metres.
     cloud_crs : str, CRS or None
     """
-    centres = np.asarray(centres, np.float64)[:: max(1, len(centres) // _SAMPLE)]
-    low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    centres = centres[:: max(1, len(centres) // _SAMPLE)]
     width, margin = max((high - low)[:2].max(), MARGIN_M), 0.5 * (high - low)[:2] + MARGIN_M
     middle = np.median(centres, axis=0)
 

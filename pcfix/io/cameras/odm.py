@@ -46,7 +46,7 @@ TRANSFORMATION = "geocoords_transformation.txt"
 TOPOCENTRIC = "reconstruction.topocentric.json"
 TOPOCENTRIC_LIMIT_M = 1e5
 SCALE_TOLERANCE = 0.1
-"""Of the squared scale of a map projection; feet, or a matrix of nonsense, are outside."""
+"""Of the squared scale of a map projection, which excludes feet."""
 WHOLE_M = 2e-3
 """Newer ODM puts the origin at whole metres; reference_lla is rounded a little."""
 SAME_FOCAL = 1e-6

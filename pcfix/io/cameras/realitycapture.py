@@ -62,12 +62,11 @@ def read(source: Source) -> Cameras:
     beside = {p.stem: p.name for p in folder.iterdir() if p.suffix.lower() in IMAGES}
     images: dict[Path, dict[str, str]] = {}
     for file in _files(path):
-        if file.stem != "_common":  # which speaks of no image
-            images[file] = {}
-            for one in read_xml(file).iter(DESCRIPTION):
-                fields = one.attrib | {str(child.tag): child.text or "" for child in one}
-                own = {k: v.strip() for k, v in fields.items() if k.startswith("{" + NAMESPACE)}
-                images[file] |= {name.partition("}")[2]: text for name, text in own.items()}
+        images[file] = {}
+        for one in read_xml(file).iter(DESCRIPTION):
+            fields = one.attrib | {str(child.tag): child.text or "" for child in one}
+            own = {k: v.strip() for k, v in fields.items() if k.startswith("{" + NAMESPACE)}
+            images[file] |= {name.partition("}")[2]: text for name, text in own.items()}
     names = {file: beside.get(file.stem, file.stem) for file in images}
     posed = {f: of for f, of in images.items() if {"Rotation", "Position"} <= of.keys()}
     if not posed:
@@ -79,11 +78,10 @@ def read(source: Source) -> Cameras:
     lenses = [_lens(file, posed[file], *frame) for file, frame in frames.items() if frame]
     relative = any(of.get("Coordinates", "absolute") != "absolute" for of in posed.values())
     rotations = [numbers(f, "xcr:Rotation", of["Rotation"], 9) for f, of in posed.items()]
+    positions = [numbers(f, "xcr:Position", of["Position"], 3) for f, of in posed.items()]
     return Cameras(
         labels=tuple(names[file] for file in posed),
-        centres=np.array(
-            [numbers(f, "xcr:Position", of["Position"], 3) for f, of in posed.items()]
-        ),
+        centres=np.array(positions),
         rotations=np.array(rotations).reshape(-1, 3, 3),
         lenses=tuple(lenses) if len(lenses) == len(posed) else None,
         crs="local" if relative else None,
@@ -96,7 +94,8 @@ def _files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
     listed = sorted(p for p in path.iterdir() if p.suffix.lower() == ".xmp" and p.is_file())
-    return [file for file in listed if NAMESPACE.encode() in file.read_bytes()]
+    named = [file for file in listed if file.stem != "_common"]  # which is of no image
+    return [file for file in named if NAMESPACE.encode() in file.read_bytes()]
 
 
 def _lens(path: Path, fields: dict[str, str], width: float, height: float) -> Lens:

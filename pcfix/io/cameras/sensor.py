@@ -102,7 +102,7 @@ def write_table(folder: File, cameras: Cameras) -> None:
         sentence = f"a table holds one lens, but the images have {1 + len(others)}. Use another"
         raise bad_file(target, "output.lens", f"{sentence} format.")
     is_px = given.unit == "px"
-    _, values = model_of(target, given, OPENCV if is_px else CENTRED, unit=given.unit)
+    _, values = model_of(target, given, OPENCV if is_px else CENTRED)
     frame = (values.pop("f"), given.width, given.height)
     sensor = dict(zip(PIXELS if is_px else MILLIMETRES, map(float, frame), strict=True))
     sensor |= {NAMES.get(name, name): float(value) for name, value in values.items()}

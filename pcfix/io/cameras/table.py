@@ -107,16 +107,11 @@ def read(source: Source) -> Cameras:
         columns = replace(columns, place=adjusted | {"label": place["label"]})
     by_gnss = any(name in tables.EXIF for name in columns.header)  # measured, not adjusted
     by_gnss |= columns.has("sigma_x")
-    xyz, unposed = centres(columns), list[str]()
-    first = dict[tuple[str, bytes], int]()  # an exact copy of a row counts once
-    for i, label in enumerate(columns.labels):
-        if (has_both or by_gnss) and np.isnan(xyz[i]).any():  # else it is a mistake
-            unposed.append(label)
-        else:
-            first.setdefault((label, xyz[i].tobytes()), i)
-    if not first:
+    lost = np.isnan(centres(columns)).any(axis=1) & (has_both or by_gnss)  # else it is a mistake
+    if lost.all():
         raise checks.no_pose(source.path)
-    rows = np.array(list(first.values()))
+    unposed = columns.take(np.flatnonzero(lost)).labels
+    rows = np.flatnonzero(~lost)
     columns, measured = columns.take(rows), measured.take(rows)
     turns = _rotations(columns, source.angles)
     system, unknown = crs(measured)

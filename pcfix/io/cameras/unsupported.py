@@ -15,11 +15,12 @@ from pcfix.io.cameras.checks import Source
 POSES = "Give the file or folder with the camera poses"
 OPK = "Write a table with the header label,x,y,z,omega,phi,kappa and give its lens by --sensor"
 COLMAP = "Export a COLMAP model (cameras, images, points3D)"
-TABLES = "Give calibrated_camera_parameters.txt of the same export, or its folder params"
-HEADER = "Write one, for example label,x,y,z,omega,phi,kappa"
-RECONSTRUCTION = "Give reconstruction.json"
+GCPS = "a list of ground control points (ODM)", POSES
+BARE = "a table without a header", "Write one, for example label,x,y,z,omega,phi,kappa"
 PIX4D = "a project of Pix4D", "Give its folder 1_initial/params"
 MICMAC = "a calibration of MicMac", "Give the folder with its orientations"
+LENSES = "a list of lenses (OpenDroneMap), without poses", "Give reconstruction.json"
+NERF = "a scene of nerfstudio or instant-ngp", "Give the model from which it was converted"
 CONTENTS: tuple[tuple[bytes, str, str], ...] = (
     (rb"\A(\xff\xd8\xff|II[*+]\0|MM\0[*+]|\x89PNG)", "an image", POSES),
     (rb"\ALASF", "a point cloud (LAS, LAZ)", POSES),
@@ -30,43 +31,34 @@ CONTENTS: tuple[tuple[bytes, str, str], ...] = (
     (rb"<!DOCTYPE Pix4D", *PIX4D),
     (rb"<Reality(Capture|Scan)", "a project of RealityCapture", "Export XMP files"),
     (rb"<kml[\s>]", "a map of Google Earth (KML)", POSES),
-    (
-        rb"\A(EPSG:\d|\+proj=|WGS84 UTM )[^\n]*\n\s*[-+.\d]+[ \t]+[-+.\d]+[ \t]",
-        *("a list of ground control points (ODM)", POSES),
-    ),
+    (rb"\A(EPSG:|\+proj=|WGS84 UTM )[^\n]*\n\s*[-+.\d]+[ \t]", *GCPS),
     (rb"\A(\xef\xbb\xbf)?focal", "a table of the sensor", "Give it by --sensor"),
     (rb"\A\s*\$PROJECT\b|^\s*\$(PHOTO_NUM|EXT_ORI)\b", "a project of Inpho (Trimble)", OPK),
     (rb"^\s*(SENSOR_TYPE|TRIANGULATION_TYPE)\s", "a support file of SOCET SET", OPK),
     (rb"^\s*(ORI[AE]|PRO[JI]|GEOI|BILD)\s+\S+\s+\S", "a file of BINGO", OPK),
     (rb"<(CalibrationInternConique|InternalCalibration)>", *MICMAC),
-    (rb'"projection_type"', "a list of lenses without poses", RECONSTRUCTION),
+    (rb'"projection_type"', *LENSES),
     (rb'"sfm_data_version"', "a scene of OpenMVG", COLMAP),
     (rb'"viewId"|"featuresFolders"|"pipelineVersion"', "a scene of AliceVision (Meshroom)", COLMAP),
-    (rb'"transform_matrix"|"camera_angle_x"|"fl_x"', "a scene of nerfstudio", COLMAP),
-    (  # at most one name, then numbers
-        rb"\A[ \t]*([^\s,;]+[ \t]*[,;\s][ \t]*)?[-+.\d]+([ \t]*[,; \t][ \t]*[-+.\d]+)+[ \t]*[\r\n]",
-        *("a table without a header", HEADER),
-    ),
+    (rb'"transform_matrix"|"camera_angle_x"|"fl_x"', *NERF),
+    # numbers, after one name at most
+    (rb"\A\s*([^\s,;]+[,;\s]+)?[-+.\d]+([,; \t]+[-+.\d]+)+\s*$", *BARE),
 )
 """Patterns of the first bytes of a file, what it is, and what to do; the first match decides."""
-PARTS: tuple[tuple[str, str, str], ...] = (
-    (r"(?i)(.*_)?calibrated_images_position\.txt", "a list of positions of Pix4D", TABLES),
-    (r"(?i)(.*_)?pmatrix\.txt", "a list of projection matrices of Pix4D", TABLES),
-    (r"(?i)(.*_)?offset\.xyz", "the offset of a project of Pix4D", TABLES),
-    (r"(?i)(.*_)?internal_camera_parameters\.cam", "a calibration of Pix4D", TABLES),
-    (r"(?i)(.*_)?camera_parameters(_wgs84)?_error\.txt", "standard errors of Pix4D", TABLES),
+PART = re.compile(
+    r"(?i)(.*_)?(calibrated_images_position\.txt|pmatrix\.txt|offset\.xyz"
+    r"|internal_camera_parameters\.cam|camera_parameters(_wgs84)?_error\.txt)"
 )
-"""Names of files that are one part of an export."""
+"""Files of Pix4D's parameters without poses; those of standard errors look like poses."""
 FOLDERS: tuple[tuple[str, str, str], ...] = (
-    *PARTS,
     (r"AutoCal.*\.xml|Calib-PerspCentral-.*\.xml", *MICMAC),
-    (r"cameras\.json|camera_models\.json", "a list of lenses of OpenDroneMap", RECONSTRUCTION),
+    (r"cameras\.json|camera_models\.json", *LENSES),
     (r"sfm_data\.(json|bin)|.*\.(sfm|mg)", "a scene of OpenMVG or AliceVision", COLMAP),
-    (r"transforms\.json", "a scene of nerfstudio", COLMAP),
+    (r"transforms\.json", *NERF),
     (r"1_initial", *PIX4D),
     (r"(?i).*\.(jpe?g|tiff?|png|dng)", "a folder of images", POSES),
 )
-"""The same of files inside a folder."""
+"""Names inside a folder."""
 
 
 def recognises(source: Source) -> bool:
@@ -76,7 +68,7 @@ def recognises(source: Source) -> bool:
 
 def is_part(source: Source) -> bool:
     """Whether a file is by its name a part of an export without poses."""
-    return source.path.is_file() and any(re.fullmatch(one[0], source.path.name) for one in PARTS)
+    return source.path.is_file() and bool(PART.fullmatch(source.path.name))
 
 
 def read(source: Source) -> NoReturn:
@@ -90,9 +82,11 @@ def _refusal(source: Source) -> tuple[str, str] | None:
     """Return what the content is and what to do, or None if it is not known."""
     is_folder = source.path.is_dir()
     names = sorted(p.name for p in source.path.iterdir()) if is_folder else [source.path.name]
-    for pattern, what, remedy in FOLDERS if is_folder else PARTS:
+    if any(map(PART.fullmatch, names)):
+        return "a part of the parameters of Pix4D", "Give calibrated_camera_parameters.txt"
+    for pattern, what, remedy in FOLDERS if is_folder else ():
         if found := next((name for name in names if re.fullmatch(pattern, name)), None):
-            return (f"a folder with {found}: {what}" if is_folder else what), remedy
+            return f"a folder with {found}: {what}", remedy
     for head, what, remedy in CONTENTS:
         if re.search(head, source.head, re.MULTILINE):
             return what, remedy
