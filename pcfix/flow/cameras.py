@@ -14,8 +14,7 @@ from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.plausibility import plausible
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import CloudView, sample_of, view_of
-from pcfix.io.cameras.georeference import adjusted_minus_gnss
-from pcfix.io.cameras.mistakes import likely_mistake
+from pcfix.io.cameras.georeference import adjusted_minus_gnss, likely_mistake
 from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.crs import shortened
 from pcfix.io.files import check_input

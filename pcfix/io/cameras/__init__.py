@@ -21,7 +21,7 @@ import numpy as np
 from pcfix.errors import PcfixWarning, SettingError, bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Angles, Source, reading
-from pcfix.io.cameras.sensor import read_sensor, sensor_file
+from pcfix.io.cameras.table import read_sensor, sensor_file
 from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File

@@ -31,7 +31,7 @@ import numpy as np
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, image_size, number, numbers, read_xml
 from pcfix.io.cameras.lenses import lens_by_name
-from pcfix.io.cameras.sensor import FILM_MM, read_sensor, sensor_file
+from pcfix.io.cameras.table import FILM_MM, read_sensor, sensor_file
 from pcfix.model import Cameras, Lens
 
 NAMESPACE = "http://www.capturingreality.com/ns/xcr/"

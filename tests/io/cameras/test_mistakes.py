@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
-from pcfix.io.cameras.mistakes import likely_mistake
+from pcfix.io.cameras.georeference import likely_mistake
 
 pytestmark = pytest.mark.quick
 

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 import pcfix
 from pcfix.io.cameras import table
-from pcfix.io.cameras.sensor import read_sensor
+from pcfix.io.cameras.table import read_sensor
 from tests.utils.camera_files import read
 from tests.utils.codes import refused
 from tests.utils.shared import needs

@@ -10,7 +10,7 @@ from pyproj import CRS
 from pcfix.errors import InputError, SettingError
 from pcfix.io.cameras import read_cameras, read_tie_points
 from pcfix.io.cameras.colmap import write_colmap
-from pcfix.io.cameras.sensor import write_table
+from pcfix.io.cameras.table import write_table
 from pcfix.lens.imaging import project
 from pcfix.model import Lens, TiePoints, Views
 from tests.utils.blocks import PLAIN, small_block, some_ties
