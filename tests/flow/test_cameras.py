@@ -1,7 +1,6 @@
 """Inspect cameras with `pcfix cameras`, and options that place and choose them."""
 
 import json
-import struct
 from dataclasses import replace
 
 import laspy
@@ -13,7 +12,6 @@ import pcfix
 from pcfix.flow.cameras import check_cameras, sensors_of
 from pcfix.flow.inputs import Inputs, both_models
 from pcfix.io.cameras.colmap import write_colmap
-from pcfix.lens.imaging import project
 from pcfix.model import Cameras, Lens
 from tests.utils.clouds import write_las
 from tests.utils.program import run_pcfix
@@ -168,27 +166,3 @@ def test_sensor_of_the_original_cameras(tmp_path):
     assert (old.sensor, new.sensor) == (SENSOR, None)
     old, new = both_models(replace(model, cameras=CAMERAS))
     assert (old.sensor, new.sensor) == (SENSOR, SENSOR)
-
-
-def in_frame(xyz, cameras):
-    """Return which cameras (columns) hold which points, by projection."""
-    held = []
-    for rotation, centre, lens in zip(
-        cameras.rotations, cameras.centres, cameras.lenses, strict=True
-    ):
-        u, v = project(lens, (xyz - centre) @ rotation.T).T
-        held.append((u >= 0) & (u <= lens.width) & (v >= 0) & (v <= lens.height))
-    return np.array(held).T
-
-
-def test_list_of_all_visible_cameras(tmp_path, plain):
-    cameras, xyz = pcfix.read_cameras(CAMERAS), laspy.read(CLOUD).xyz
-    parts = [struct.pack("<Q", len(xyz))]
-    for row in in_frame(xyz, cameras):
-        names = np.flatnonzero(row)
-        parts.append(struct.pack(f"<I{len(names)}I", len(names), *names))
-    (tmp_path / "cloud.vis").write_bytes(b"".join(parts))
-    found, summary = corrected(tmp_path, "v.las", cameras=CAMERAS, views=tmp_path / "cloud.vis")
-    assert same(found, plain[0])
-    assert summary.views["by_row"] == len(xyz)
-    assert summary.views["share_seen"] == 1.0

@@ -162,6 +162,9 @@ def open_table(path: Path) -> Table:
         if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
             sentence = f"the columns {', '.join(alike)} may all be {role}. Remove all but one."
             raise bad_file(path, "table.columns_alike", sentence, columns=alike)
+    beside = path.with_suffix(".prj")
+    if table.crs is None and beside.is_file():
+        return replace(table, crs=" ".join(tables.read_lines(beside)).strip() or None)
     return table
 
 

@@ -198,11 +198,8 @@ SCANNED = "<OrIntImaM2C><I00>9 9</I00><V10>0 1</V10><V01>1 0</V01></OrIntImaM2C>
 @pytest.mark.parametrize(
     ("text", "code"),
     [
-        (embedded(NO_DISTORTION)[:-30], "cameras.damaged"),
-        (embedded().replace("<L2>-0.8", "<L2>0.8"), "cameras.rotation"),
         (embedded().replace("CodageMatr", "CodageAngulaire"), "cameras.unsupported"),
         (embedded(convention="eConvOriLib"), "cameras.unsupported"),
-        (embedded().replace("<SzIm>4000", "<SzIm>0"), "cameras.lens"),
         (embedded("<ModGridDef/>"), "cameras.unsupported"),
         (
             embedded(STANDARD.format("<b1>2e-2</b1>"), convention="eConvApero_DistC2M"),

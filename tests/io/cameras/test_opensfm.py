@@ -168,10 +168,8 @@ def test_tracks_of_every_version(tmp_path, header, tail):
 @pytest.mark.parametrize(
     ("change", "code"),
     [
-        ({"shots": {"a.jpg": {**SHOT, "translation": [1, 2, 10**400]}}}, "cameras.damaged"),
         ({"shots": {}}, "cameras.no_pose"),
         ({"cameras": {"c": {**CAMERA, "projection_type": "pinhole9"}}}, "cameras.unsupported"),
-        ({"cameras": {"c": {**CAMERA, "focal": 0}}}, "cameras.lens"),
         ({"cameras": {"c": {"width": 4000, "height": 3000}}}, "cameras.damaged"),
         ({"cameras": {"c": {"projection_type": "equirectangular"}}}, "cameras.unsupported"),
         ({"reference_lla": {**LLA, "latitude": 4700.0}}, "cameras.damaged"),
@@ -188,8 +186,6 @@ def test_refused(tmp_path, change, code):
     [
         ([1, 2, 3], None, "cameras.no_tie_points"),
         (None, "a.jpg\t1\t2\t0\t0\n", "cameras.no_tie_points"),
-        ([1, 2], "a.jpg\t1\t2\t0\t0\n", "cameras.damaged"),
-        ([1, 2, 3], "a.jpg\t1\t2\tx\t0.5\t1\n", "cameras.damaged"),
     ],
 )
 def test_tie_points_refused(tmp_path, point, tracks, code):

@@ -170,12 +170,7 @@ GOOD = {"parameters": HEADER + block("a.jpg", (1, 2, 3)), "offset": "0 0 0"}
     ("files", "code"),
     [
         ({"parameters": GOOD["parameters"][:-30]}, "cameras.damaged"),
-        ({"parameters": GOOD["parameters"].replace("0.3", "zero")}, "cameras.number"),
         ({"parameters": HEADER}, "cameras.damaged"),
-        (
-            {"parameters": HEADER + block("a.jpg", (1, 2, 3), np.diag([1.0, 1, -1]))},
-            "cameras.rotation",
-        ),
         ({**GOOD, "offset": "1 2"}, "cameras.damaged"),
         ({**GOOD, "wkt": "PROJCS[nothing"}, "cameras.crs"),
     ],
@@ -189,7 +184,6 @@ def test_refused(tmp_path, files, code):
     ("form", "code"),
     [
         ({}, "cameras.no_tie_points"),
-        ({"bingo": BINGO.replace("-6.0", "x")}, "cameras.damaged"),
         ({"bingo": "z H_12.0_8.0\n7 1 2\n-99\n"}, "cameras.no_tie_points"),
     ],
 )

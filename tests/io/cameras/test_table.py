@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from pyproj import CRS
 from scipy.spatial.transform import Rotation
 
 import pcfix
@@ -338,3 +339,12 @@ def test_angles_need_a_sensor(tmp_path, text):
     row = "a,1,2,3" + ",0" * (text.count(",") - 3)
     with refused("cameras.sensor_missing"):
         read(write(tmp_path, text + row, sensor=None))
+
+
+def test_a_projection_beside_a_table_is_its_crs(tmp_path):
+    path = tmp_path / "cameras.csv"
+    path.write_text("label,x,y,z\na,500000,5200000,90\n")
+    path.with_suffix(".prj").write_text(CRS.from_epsg(32632).to_wkt("WKT1_ESRI"))
+    assert CRS(pcfix.read_cameras(path).crs).equals(CRS(32632), ignore_axis_order=True)
+    path.write_text("# crs: EPSG:25832\nlabel,x,y,z\na,500000,5200000,90\n")
+    assert pcfix.read_cameras(path).crs == "EPSG:25832"  # the comment overrides it
