@@ -29,7 +29,7 @@ from pcfix.options.declare import File
 LISTS = (
     *(".xml", ".csv", ".txt", ".json", ".geojson", ".psx", ".psz", ".xmlz", ".opf", ".out", ".nvm"),
 )
-"""Endings of files that may hold cameras."""
+"""Suffixes of possible camera files."""
 
 
 UNSUPPORTED = "unsupported"
@@ -157,7 +157,7 @@ def _recognised(path: File, sensor: File | None, angles: Angles | None) -> tuple
     for file in sorted(p for p in where.glob("*") if p.suffix.lower() in LISTS and p.is_file()):
         form = _format_of(Source(file))
         if form not in (None, UNSUPPORTED):
-            sentence = f"is a folder that holds a camera file ({FORMATS[form]}). Give {file}."
+            sentence = f"is a folder with a camera file ({FORMATS[form]}). Give {file}."
             raise bad_file(where, "cameras.folder", sentence, file=file.name)
     if known is not None:
         return source, known

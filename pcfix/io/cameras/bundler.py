@@ -152,9 +152,9 @@ def _read_nvm(path: Path) -> Model:
     """Read the model with most posed images, of those with points if there are any."""
     head, *lines = [x for line in read_lines(path) if (x := line.strip()) and x[0] != "#"]
     found = _NVM.match(head)
-    matrix, held = found.groups() if found else (None, None)
+    matrix, stated = found.groups() if found else (None, None)
     width = _MATRIX_NUMBERS if matrix else _QUATERNION_NUMBERS
-    fixed = dict(zip(("fx", "cx", "fy", "cy"), map(float, (held or "").split()), strict=False))
+    fixed = dict(zip(("fx", "cx", "fy", "cy"), map(float, (stated or "").split()), strict=False))
     models: list[tuple[list[str], FloatArray, Observations]] = []
     at = 0
     while at < len(lines) and (count := int(lines[at])) > 0:

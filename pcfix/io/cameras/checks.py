@@ -42,7 +42,7 @@ _HEAD_BYTES = 4096
 
 @dataclass(frozen=True)
 class Source:
-    """A file or folder that may hold cameras, and what the user states about it.
+    """A file or folder that may have cameras, and the settings of the user for it.
 
     `sensor` is the ``--sensor`` file, `angles` the kind of angles of a table whose header does not
     name it.
@@ -173,7 +173,7 @@ def text_of(element: Element, name: str) -> str:
 
 
 def load_json(path: Path) -> Any:
-    """Return what a JSON file holds."""
+    """Return the contents of a JSON file."""
     with reading(path):
         return parse_json(path.read_bytes())
 

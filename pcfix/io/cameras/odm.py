@@ -78,7 +78,7 @@ Files = dict[str, Path]
 
 
 def recognises(source: Source) -> bool:
-    """Whether it is shots.geojson or a reconstruction, or a folder that holds one."""
+    """Whether it is shots.geojson or a reconstruction, or a folder with one."""
     files = _files_of(source.path)
     text = Source(files["poses"]).text.lstrip() if "poses" in files else ""
     return bool(_SHOTS_HEAD.match(text) or _HEAD.match(text))
@@ -117,8 +117,8 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
 def _files_of(path: Path) -> Files:
     """Return the files of the project that a file or folder belongs to.
 
-    A file is taken as it is; of a folder its reconstruction, or else its shots.geojson. Other files
-    are next to it, or in the project's own folders.
+    The poses of a folder are in its reconstruction, or else in its shots.geojson. Other files are
+    next to these, or in the project's own folders.
     """
     folder = path if path.is_dir() else path.parent
     root = folder.parent if folder.name == "undistorted" else folder
@@ -225,12 +225,12 @@ def _read_shots(files: Files) -> Cameras:
     labels, each = tuple(shots), shots.values()
     centres = np.array([triple(shot["translation"]) for shot in each])
     if crs is None and (place := (next(iter(each))["geometry"] or {}).get("coordinates")):
-        lon, lat, _ = triple(place).tolist()  # a project without GNSS has made-up coordinates
+        lon, lat, _ = triple(place).tolist()  # without GNSS its coordinates are arbitrary
         crs, _ = _located(lat, lon, None, centres[0, :2]) or (None, None)
     known = {}
-    if beside := files.get("cameras.json"):
-        with checks.reading(beside):
-            known = {k: lens(beside, k, entry) for k, entry in load_json(beside).items()}
+    if lenses_file := files.get("cameras.json"):
+        with checks.reading(lenses_file):
+            known = {k: lens(lenses_file, k, entry) for k, entry in load_json(lenses_file).items()}
     lenses, plain = [], 0
     for shot in each:
         width, height = float(shot["width"]), float(shot["height"])
@@ -324,9 +324,9 @@ def read_reconstruction(path: Path) -> Reconstruction:
             position, dop = shot.get("gps_position"), shot.get("gps_dop")
             if position is not None and dop != NO_GNSS:
                 places[label] = position, [np.nan if dop is None else dop] * 3
-        origin, beside = chosen.get("reference_lla"), path.with_name("reference_lla.json")
-        if origin is None and beside.is_file() and beside.read_bytes()[:100].lstrip()[:1] == b"{":
-            origin = checks.load_json(beside)
+        origin, other = chosen.get("reference_lla"), path.with_name("reference_lla.json")
+        if origin is None and other.is_file() and other.read_bytes()[:100].lstrip()[:1] == b"{":
+            origin = checks.load_json(other)
         reference = None
         if origin is not None:
             lat, lon, alt = (float(origin[key]) for key in ("latitude", "longitude", "altitude"))
@@ -352,8 +352,8 @@ CHUNK_BYTES = 1 << 24
 def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
     """Return the points in the frame of the file, and where its images saw them."""
     path, cameras, _, points = reconstruction
-    beside = path.with_name("tracks.csv")
-    if not points or not beside.is_file():
+    tracks = path.with_name("tracks.csv")
+    if not points or not tracks.is_file():
         why = "it has no points" if not points else "there is no tracks.csv next to it"
         raise checks.no_tie_points(path, why)
     xyz = np.array([point["coordinates"] for point in points.values()], float).reshape(-1, 3)
@@ -362,7 +362,7 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
         for names in (cameras.labels, points)
     )
     parts: list[tuple[IntArray, IntArray, FloatArray]] = []
-    with checks.reading(beside), beside.open("rb") as stream:
+    with checks.reading(tracks), tracks.open("rb") as stream:
         while block := stream.readlines(CHUNK_BYTES):  # there can be many millions of lines
             lines = [line.split(b"\t", 5) for line in block if line.count(b"\t")]
             point = np.array([point_of.get(fields[1], -1) for fields in lines], dtype=np.int64)
@@ -371,7 +371,7 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
             known = (point >= 0) & (camera >= 0)
             parts.append((point[known], camera[known], values[known]))
     if not parts:
-        raise checks.damaged(beside, "it is empty")
+        raise checks.damaged(tracks, "it is empty")
     point, camera, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.lexsort((camera, point))
     size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]

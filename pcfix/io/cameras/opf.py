@@ -162,7 +162,7 @@ def _lens(path: Path, sensor: Part, given: Part) -> Lens:
 
 
 def _gnss(path: Path, captures: list[Part], ids: list[int]) -> GnssPositions | None:
-    """Return where captures were taken, at their reference cameras, in the CRS of the first."""
+    """Return the positions of captures, at their reference cameras, in the CRS of the first."""
     found = {
         capture["reference_camera_id"]: capture["geolocation"]
         for capture in captures

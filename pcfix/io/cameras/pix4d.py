@@ -127,7 +127,7 @@ def _find(source: Source) -> dict[str, Path]:
     folder, prefix = tables[0]
     prefixes = {one for where, one in tables if where == folder}
     if len(prefixes) > 1:
-        sentence = f"holds several projects ({', '.join(sorted(prefixes))}). Give one file."
+        sentence = f"has several projects ({', '.join(sorted(prefixes))}). Give one file."
         raise bad_file(folder, "cameras.several_projects", sentence, projects=len(prefixes))
     files = {kind: folder / (prefix + name) for kind, name in NAMES.items()}
     if columns[:1] == ["filename"]:
@@ -172,8 +172,8 @@ def _rows(labels: list[str], turns: FloatArray, names: list[str], others: FloatA
     found = []
     for label, turn in zip(labels, turns, strict=True):
         rows = left[label]
-        apart = np.linalg.norm(others[rows] - turn, axis=(1, 2))
-        found.append(rows.pop(int(np.argmin(apart))) if rows else -1)
+        difference = np.linalg.norm(others[rows] - turn, axis=(1, 2))
+        found.append(rows.pop(int(np.argmin(difference))) if rows else -1)
     return found
 
 

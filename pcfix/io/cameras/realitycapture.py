@@ -59,7 +59,7 @@ def read(source: Source) -> Cameras:
     """Read the poses, and the lenses where the size of the images is known."""
     path = source.path
     folder = path if path.is_dir() else path.parent
-    beside = {p.stem: p.name for p in folder.iterdir() if p.suffix.lower() in IMAGES}
+    pictures = {p.stem: p.name for p in folder.iterdir() if p.suffix.lower() in IMAGES}
     images: dict[Path, dict[str, str]] = {}
     for file in _files(path):
         images[file] = {}
@@ -67,7 +67,7 @@ def read(source: Source) -> Cameras:
             fields = one.attrib | {str(child.tag): child.text or "" for child in one}
             own = {k: v.strip() for k, v in fields.items() if k.startswith("{" + NAMESPACE)}
             images[file] |= {name.partition("}")[2]: text for name, text in own.items()}
-    names = {file: beside.get(file.stem, file.stem) for file in images}
+    names = {file: pictures.get(file.stem, file.stem) for file in images}
     posed = {f: of for f, of in images.items() if {"Rotation", "Position"} <= of.keys()}
     if not posed:
         raise checks.no_pose(path, "has no xcr:Rotation and xcr:Position")

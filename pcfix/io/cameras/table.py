@@ -162,9 +162,9 @@ def open_table(path: Path) -> Table:
         if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
             sentence = f"the columns {', '.join(alike)} may all be {role}. Remove all but one."
             raise bad_file(path, "table.columns_alike", sentence, columns=alike)
-    beside = path.with_suffix(".prj")
-    if table.crs is None and beside.is_file():
-        return replace(table, crs=" ".join(tables.read_lines(beside)).strip() or None)
+    projection = path.with_suffix(".prj")
+    if table.crs is None and projection.is_file():
+        return replace(table, crs=" ".join(tables.read_lines(projection)).strip() or None)
     return table
 
 
@@ -380,11 +380,11 @@ def write_table(folder: File, cameras: Cameras) -> None:
     target = Path(folder)
     turns, lenses = checks.block_to_write(target, cameras)
     if cameras.crs is not None and is_topocentric(cameras.crs):
-        sentence = f"a table cannot hold the axes {cameras.crs}. Use a projected CRS."
+        sentence = f"a table cannot have the axes {cameras.crs}. Use a projected CRS."
         raise bad_file(target, "output.crs", sentence, crs=cameras.crs)
     given, *others = dict.fromkeys(lenses)
     if others:
-        sentence = f"a table holds one lens, but the images have {1 + len(others)}. Use another"
+        sentence = f"a table has one lens, but the images have {1 + len(others)}. Use another"
         raise bad_file(target, "output.lens", f"{sentence} format.")
     is_px = given.unit == "px"
     _, values = model_of(target, given, OPENCV if is_px else CENTRED)
