@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import PcfixWarning, SettingError, bad_file
-from pcfix.io.cameras import checks
+from pcfix.io.cameras import checks, unsupported
 from pcfix.io.cameras.checks import Angles, Source, reading
 from pcfix.io.cameras.table import read_sensor, sensor_file
 from pcfix.io.files import check_input
@@ -32,7 +32,6 @@ LISTS = (
 """Suffixes of possible camera files."""
 
 
-UNSUPPORTED = "unsupported"
 FORMATS = {
     "metashape": "Agisoft Metashape, PhotoScan",
     "pix4d": "Pix4D",
@@ -44,7 +43,6 @@ FORMATS = {
     "blocksexchange": "ContextCapture, iTwin Capture, DJI Terra",
     "realitycapture": "RealityCapture (XMP)",
     "table": "CSV table",
-    UNSUPPORTED: "a format that pcfix does not read",
 }
 """The modules of this folder and their software, in the order in which they are asked."""
 TAKE_SENSOR = ("table", "realitycapture")
@@ -151,16 +149,13 @@ def _recognised(path: File, sensor: File | None, angles: Angles | None) -> tuple
         None if sensor is None else check_input(sensor),
         angles,
     )
-    known = _format_of(source)
-    if known not in (None, UNSUPPORTED):
-        return source, known
+    if form := _format_of(source):
+        return source, form
     for file in sorted(p for p in where.glob("*") if p.suffix.lower() in LISTS and p.is_file()):
-        form = _format_of(Source(file))
-        if form not in (None, UNSUPPORTED):
+        if form := _format_of(Source(file)):
             sentence = f"is a folder with a camera file ({FORMATS[form]}). Give {file}."
             raise bad_file(where, "cameras.folder", sentence, file=file.name)
-    if known is not None:
-        return source, known
+    unsupported.refuse(source)
     sentence = "is not a camera file that pcfix knows. Give a file that pcfix/io/cameras/README.md"
     sentence += " lists, or a CSV table with label, x, y, z and, if known, yaw, pitch, roll."
     raise bad_file(where, "cameras.unknown", sentence)
@@ -177,12 +172,8 @@ def reader_of(form: str) -> Any:
 
 
 def _format_of(source: Source) -> str | None:
-    """Return the first format that knows the content; one that damage hides is passed over.
-
-    Files of standard errors look like poses, so the refused parts of exports are asked first.
-    """
-    is_part = reader_of(UNSUPPORTED).is_part(source)
-    for form in [UNSUPPORTED] if is_part else FORMATS:
+    """Return the first format that recognises the content."""
+    for form in () if unsupported.is_part(source) else FORMATS:
         with suppress(Exception), np.errstate(all="ignore"):
             if checks.recognises(reader_of(form), source):
                 return form

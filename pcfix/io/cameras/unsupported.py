@@ -7,7 +7,6 @@ keywords in the first bytes, or by names of files, also inside a folder.
 from __future__ import annotations
 
 import re
-from typing import NoReturn
 
 from pcfix.errors import bad_file
 from pcfix.io.cameras.checks import Source
@@ -31,7 +30,7 @@ CONTENTS: tuple[tuple[bytes, str, str], ...] = (
     (rb"<!DOCTYPE Pix4D", *PIX4D),
     (rb"<Reality(Capture|Scan)", "a project of RealityCapture", "Export XMP files"),
     (rb"<kml[\s>]", "a map of Google Earth (KML)", POSES),
-    (rb"\A(EPSG:|\+proj=|WGS84 UTM )[^\n]*\n\s*[-+.\d]+[ \t]", *GCPS),
+    (rb"\A(EPSG:|\+proj=|WGS84 UTM )[^\n]*\n\s*([-+.\d]+[ \t]+){2}", *GCPS),
     (rb"\A(\xef\xbb\xbf)?focal", "a table of the sensor", "Give it by --sensor"),
     (rb"\A\s*\$PROJECT\b|^\s*\$(PHOTO_NUM|EXT_ORI)\b", "a project of Inpho (Trimble)", OPK),
     (rb"^\s*(SENSOR_TYPE|TRIANGULATION_TYPE)\s", "a support file of SOCET SET", OPK),
@@ -49,7 +48,7 @@ PART = re.compile(
     r"(?i)(.*_)?(calibrated_images_position\.txt|pmatrix\.txt|offset\.xyz"
     r"|internal_camera_parameters\.cam|camera_parameters(_wgs84)?_error\.txt)"
 )
-"""Files of Pix4D's parameters without poses; those of standard errors look like poses."""
+"""Files of Pix4D's parameters without poses."""
 FOLDERS: tuple[tuple[str, str, str], ...] = (
     (r"AutoCal.*\.xml|Calib-PerspCentral-.*\.xml", *MICMAC),
     (r"cameras\.json|camera_models\.json", *LENSES),
@@ -61,21 +60,17 @@ FOLDERS: tuple[tuple[str, str, str], ...] = (
 """Names inside a folder."""
 
 
-def recognises(source: Source) -> bool:
-    """Whether the content is one of these."""
-    return _refusal(source) is not None
-
-
 def is_part(source: Source) -> bool:
-    """Whether a file is by its name a part of an export without poses."""
+    """Whether a file is by its name a part of an export; standard errors look like poses."""
     return source.path.is_file() and bool(PART.fullmatch(source.path.name))
 
 
-def read(source: Source) -> NoReturn:
-    """Refuse the file."""
-    what, remedy = _refusal(source) or ("a format that pcfix does not read", POSES)
-    sentence = f"is {what}, which pcfix does not read as cameras. {remedy}."
-    raise bad_file(source.path, "cameras.not_read", sentence, what=what)
+def refuse(source: Source) -> None:
+    """Raise InputError if the content is one of these."""
+    if found := _refusal(source):
+        what, remedy = found
+        sentence = f"is {what}, which pcfix does not read as cameras. {remedy}."
+        raise bad_file(source.path, "cameras.not_read", sentence, what=what)
 
 
 def _refusal(source: Source) -> tuple[str, str] | None:
