@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 
-import laspy
 import numpy as np
 import pytest
 from pyproj import Transformer
@@ -127,33 +126,10 @@ def test_groups_of_lenses(lenses, images, different):
     assert [sensor["focal_most"] for sensor in sensors] == most
 
 
-SNELL = {"water": 0.37, "method": "snell", "max_angle": None}
-
-
-def corrected(tmp_path, name, **options):
-    path = tmp_path / name
-    summary = pcfix.correct_file(CLOUD, path, **{**SNELL, "sensor": SENSOR, **options})
-    return laspy.read(path), summary
-
-
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory):
-    return corrected(tmp_path_factory.mktemp("plain"), "plain.las", cameras=CAMERAS)
-
-
-def same(one, other, steps=0):
-    """Whether coordinates differ by at most so many steps of the file."""
-    return all(np.abs(one[axis].astype(np.int64) - other[axis]).max() <= steps for axis in "XYZ")
-
-
-def test_offset_applied(tmp_path, plain):
-    shift = np.array([410_000.0, 4_650_000.0, 0.0])
-    path = table(tmp_path / "cameras.csv", lambda xyz: xyz - shift)
-    found, _ = corrected(tmp_path, "o.las", cameras=path, cameras_offset=tuple(shift))
-    assert same(found, plain[0], steps=1)
-    for text in ("1,2", "a,b,c", "1,2,inf", ""):
-        with pytest.raises(pcfix.SettingError):
-            corrected(tmp_path, "o.las", cameras=path, cameras_offset=text)
+@pytest.mark.parametrize("text", ["1,2", "a,b,c", "1,2,inf", ""])
+def test_offset_refused(text):
+    with pytest.raises(pcfix.SettingError):
+        Inputs(cameras=CAMERAS, water=0.37, cameras_offset=text)
 
 
 def test_sensor_of_the_original_cameras(tmp_path):

@@ -448,20 +448,3 @@ def test_refused(tmp_path, content, code):
     path = write(tmp_path, content)
     with refused(code, path=path):
         read(path)
-
-
-@pytest.mark.parametrize(
-    ("file", "entries", "code"),
-    [
-        ("project.zip", None, "cameras.missing_file"),
-        ("0/chunk.zip", {"other.xml": ""}, "cameras.damaged"),
-    ],
-)
-def test_project_refused(tmp_path, file, entries, code):
-    path = project_of(tmp_path, [chunk()])
-    archive = tmp_path / "river.files" / file
-    archive.unlink()
-    if entries is not None:
-        put_zip(archive, entries)
-    with refused(code, path=archive):
-        read(path)

@@ -198,17 +198,3 @@ def test_refused(make, tmp_path, part, values, code):
     change(tmp_path, part, **values)
     with refused(code):
         pcfix.read_cameras(path)
-
-
-def test_tracks_refused(make, tmp_path):
-    path, _ = make()
-    cameras = pcfix.read_cameras(path)
-    (tmp_path / "pixels.bin").write_bytes(b"")
-    with refused("cameras.damaged", path=tmp_path / "pixels.bin"):
-        read_tie_points(path, cameras)
-    (tmp_path / "tracks.gltf").unlink()
-    with refused("cameras.missing_file", path=tmp_path / "tracks.gltf"):
-        read_tie_points(path, cameras)
-    (tmp_path / "calibrated-cameras.json").unlink()
-    with refused("cameras.missing_file", path=tmp_path / "calibrated-cameras.json"):
-        pcfix.read_cameras(path)
