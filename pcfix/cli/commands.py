@@ -176,7 +176,7 @@ def view(*clouds: Path, options: ViewerOptions, quiet: bool) -> None:
 
 
 @command(
-    "pcfix cameras cameras.xml --cloud cloud.laz --water 0.37 --plot block.png",
+    "pcfix cameras cameras.xml --cloud cloud.laz --water 0.37",
     path="File or folder of camera poses.",
 )
 def cameras(path: Path, /, *, options: CamerasCheckOptions) -> None:

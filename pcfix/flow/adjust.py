@@ -30,7 +30,7 @@ from pcfix.flow.runner import check_folder
 from pcfix.flow.surfaces import sample_of, view_of
 from pcfix.io.atomic import temporary_output
 from pcfix.io.cameras.colmap import write_colmap
-from pcfix.io.cameras.sensor import read_sensor, write_table
+from pcfix.io.cameras.table import read_sensor, write_table
 from pcfix.io.crs import is_topocentric, parse_crs
 from pcfix.io.files import write_members, write_text
 from pcfix.io.gnss_positions import gnss_in_frame_of, read_gnss

@@ -3,50 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pcfix.adjust.diagnosis import EXPORT, Diagnosis
-from pcfix.errors import InputError, SettingError, plain, shown_once
+from pcfix.errors import InputError, SettingError, plain
 from pcfix.flow.diagnosis import adjust_words, diagnose_inputs, has_datum, quick_ties
 from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.plausibility import plausible
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import CloudView, sample_of, view_of
-from pcfix.io.cameras.georeference import adjusted_minus_gnss
-from pcfix.io.cameras.mistakes import UNDULATION_M, likely_mistake
+from pcfix.io.cameras.georeference import adjusted_minus_gnss, likely_mistake
 from pcfix.io.clouds import check_same_crs, read_reference
+from pcfix.io.crs import shortened
 from pcfix.io.files import check_input
 from pcfix.io.gnss_positions import read_gnss
-from pcfix.lens.frames import cameras_in_sight, footprint
-from pcfix.lens.imaging import unproject
-from pcfix.model import Cameras, FloatArray, Lens, TiePoints, WaterDimension
+from pcfix.lens.frames import cameras_in_sight
+from pcfix.model import Cameras, FloatArray, TiePoints, WaterDimension
 from pcfix.options.correct import CamerasCheckOptions
 from pcfix.options.declare import File, taken
-from pcfix.report.page import (
-    AFTER,
-    WATER,
-    draw_cloud,
-    label_plan,
-    label_side,
-    legend_below,
-    new_figure,
-)
-from pcfix.report.text import Plain, Rows, aligned
+from pcfix.report.text import Plain, aligned
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 MOST_SENSORS = 8
 """Sensors in the text; the others are counted."""
 SAMPLE_POINTS = 50_000
 """Points of the cloud that are tested in the frames, evenly spread."""
-MOST_FOOTPRINTS = 400
-SHORT_CRS, SHOWN_NAMES = 60, 5
+SHOWN_NAMES = 5
 
 
 def check_cameras(
@@ -65,13 +50,12 @@ def check_cameras(
     given = taken(CamerasCheckOptions, options, keywords, "check_cameras")
     cloud = given.cloud
     check_summary(given, [path, *paths_in(given)])
-    if cloud is None or given.water is None:
-        for name in ("gcps", "lens", "reference"):
-            if getattr(given, name) is not None:
-                sentence = f"{name} needs cloud and water, to test for absorbed refraction."
-                raise SettingError("option.needs", sentence, options=[name, "cloud", "water"])
+    surveys = [name for name in ("gcps", "lens", "reference") if getattr(given, name) is not None]
+    if surveys and (cloud is None or given.water is None):
+        sentence = f"{surveys[0]} needs cloud and water, to test for absorbed refraction."
+        raise SettingError("option.needs", sentence, options=[surveys[0], "cloud", "water"])
     inputs = replace(given.part(Inputs), cameras=path)
-    read = shown_once(inputs.read, lambda cameras: cameras.notes)
+    read = inputs.read()
     view = None if cloud is None else view_of(check_input(cloud))
     surface = None if given.water is None else inputs.surface(view).surface
     xyz, heights, problem = np.zeros((0, 3)), None, ""
@@ -96,8 +80,8 @@ def check_cameras(
         diagnosis = diagnose_inputs(
             inputs, cameras, view, surface, index, gcps=given.gcps, reference=reference
         )
-        surveys = {name: getattr(given, name) for name in ("gnss", "gcps", "lens", "index")}
-        remedy = adjust_words(inputs, view.name, has_datum=has_datum(cameras, str(path)), **surveys)
+        named = {name: getattr(given, name) for name in ("gnss", "gcps", "lens", "index")}
+        remedy = adjust_words(inputs, view.name, has_datum=has_datum(cameras, str(path)), **named)
     level = above = tilt = fit = None
     if surface is not None and not (isinstance(surface, WaterDimension) and heights is None):
         at = cameras.centres if heights is None else xyz
@@ -109,8 +93,8 @@ def check_cameras(
         tilt = np.degrees(np.arccos(np.clip(-cameras.rotations[:, 2, 2], -1.0, 1.0)))
     gnss = _gnss(cameras, str(path))
     if view is not None:
-        up = 0.0 if gnss is None or inputs.cameras_crs is None else np.nan_to_num(gnss["mean_m"][2])
-        fit = _fit(cameras, view, xyz, quick_ties(inputs, view.crs), up)
+        flight = {"file": path, "water_m": level}
+        fit = _fit(cameras, view, xyz, quick_ties(inputs, view.crs), flight)
     figures = plain({
         "path": path,
         "crs_read": read.crs,
@@ -127,9 +111,8 @@ def check_cameras(
         "refraction": diagnosis and diagnosis.as_dict(),
         "notes": list(map(str, cameras.notes)),
     })  # fmt: skip
-    report = CamerasReport(figures, cameras, xyz, level, diagnosis, remedy)
-    write_summary(given, figures, lambda: block_figure(report))
-    return report
+    write_summary(given, figures)
+    return CamerasReport(figures, cameras, diagnosis, remedy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,25 +120,20 @@ class CamerasReport:
     """The report of ``pcfix cameras``."""
 
     figures: Plain  # as JSON holds them
-    cameras: Cameras  # in the cloud's CRS, where there is a cloud
-    sample_xyz: FloatArray  # points of the cloud, shape (m, 3), for a picture
-    level_m: float | None  # mean height of the water
+    cameras: Cameras  # in the cloud's CRS, if there is a cloud
     diagnosis: Diagnosis | None  # whether the poses have absorbed the refraction
     remedy: tuple[str, str]  # the command that corrects the poses, and a remark
 
 
 def sensors_of(cameras: Cameras, above_m: FloatArray | None) -> list[Plain]:
-    """Return the sensors of a block; values are None where not stated.
+    """Return the sensors of a block: lenses of one name, frame and projection.
 
-    A sensor is a lens, or if nearly each image has its own, a name with a frame and a projection.
-    ``lenses`` counts the lenses that differ, and ``folded`` is the share of the frame beyond the
-    fold of the distortion.
+    ``lenses`` counts those that differ.
     """
     all_lenses, groups = cameras.lenses or (), dict[Any, list[int]]()
-    is_shared = 2 * len(set(all_lenses)) <= len(cameras)
     for row, lens in enumerate(all_lenses):
         kind = lens.sensor, lens.width, lens.height, lens.unit, lens.projection
-        groups.setdefault(lens if is_shared else kind, []).append(row)
+        groups.setdefault(kind, []).append(row)
     sensors = []
     for rows in groups.values():
         lenses = list(dict.fromkeys(all_lenses[row] for row in rows))
@@ -170,25 +148,11 @@ def sensors_of(cameras: Cameras, above_m: FloatArray | None) -> list[Plain]:
             "focal_most": max(focal),
             "unit": lens.unit,
             "projection": lens.projection,
-            "distorted": _is_distorted(lens),
+            "distorted": any((*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism)),
             "gsd_m": height_m / lens.focal if height_m > 0.0 and lens.unit == "px" else None,
             "lenses": len(lenses),
-            "folded": max(_folded(one) for one in lenses[:: 1 + len(lenses) // 20]),
         })  # fmt: skip
     return sensors
-
-
-def _is_distorted(lens: Lens) -> bool:
-    return any((*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism))
-
-
-def _folded(lens: Lens) -> float:
-    """Return the share of the frame that no direction is imaged to, beyond the fold of the lens."""
-    if not _is_distorted(lens):  # the border of a fisheye's image is none
-        return 0.0
-    across = np.linspace(0.0, 1.0, 41)
-    places = np.stack(np.meshgrid(across * lens.width, across * lens.height), axis=-1)
-    return float(np.mean(np.isnan(unproject(lens, places.reshape(-1, 2))).any(axis=1)))
 
 
 def _gnss(cameras: Cameras, name: str) -> Plain | None:
@@ -198,37 +162,26 @@ def _gnss(cameras: Cameras, name: str) -> Plain | None:
     enu_m, reason = adjusted_minus_gnss(cameras, name)
     rows = np.flatnonzero(np.isfinite(enu_m[:, 0]))
     enu = enu_m[rows] if len(rows) else np.full((1, 3), np.nan)
-    length = np.sqrt(np.nansum(enu * enu, axis=1))
     return {
-        "images": len(rows),
-        "mean_m": enu.mean(axis=0),
-        "sd_m": enu.std(axis=0),
-        "largest_m": length.max(),
-        "largest_image": cameras.labels[rows[int(np.argmax(length))]] if len(rows) else "",
-        "reason": reason,
-    }
+        "images": len(rows), "mean_m": enu.mean(axis=0), "sd_m": enu.std(axis=0), "reason": reason
+    }  # fmt: skip
 
 
 def _fit(
-    cameras: Cameras, view: CloudView, xyz: FloatArray, ties: TiePoints | None, up_m: float,
+    cameras: Cameras, view: CloudView, xyz: FloatArray, ties: TiePoints | None,
+    flight: dict[str, Any],
 ) -> Plain:  # fmt: skip
-    """Test cameras against a sample of the cloud; `up_m` are they above their GNSS positions.
+    """Test cameras against a sample of the cloud.
 
-    ``seen_by`` are the shares of the points that 0, 1, 2, 3 or more frames hold. The verdict is
-    what is likely wrong, empty where cameras and cloud match.
+    ``seen_by`` are the shares of the points in the frames of 0, 1, 2, 3 or more images. The verdict
+    is what is likely wrong, empty if cameras and cloud match.
     """
     visible = np.minimum(cameras_in_sight(xyz, cameras), 3)
     shares = np.bincount(visible, minlength=4) / len(xyz)
-    found = plausible(cameras, xyz, ties)
+    found = plausible(cameras, xyz, ties, **flight)
     verdict = likely_mistake(cameras.centres, xyz.min(axis=0), xyz.max(axis=0), view.crs)
-    verdict = verdict or " ".join(map(str, found.doubts))
-    if not verdict and abs(up_m) >= UNDULATION_M[0]:
-        side = "above" if up_m > 0.0 else "below"
-        verdict = (
-            f"With --cameras-crs the cameras are {abs(up_m):.1f} m {side} their GNSS heights. One"
-            " of them is likely above the ellipsoid and the other above the geoid; check the"
-            " vertical CRS."
-        )
+    differ = [one for one in cameras.notes if one.code == "cameras.heights_differ"]
+    verdict = verdict or " ".join(map(str, [*found.doubts, *differ]))
     return {
         "cloud": view.name,
         "points_sampled": len(xyz),
@@ -248,16 +201,16 @@ def cameras_text(report: CamerasReport) -> str:
     if missing:
         more = ", ..." if len(missing) > SHOWN_NAMES else ""
         images += f", {len(missing):,} without: {', '.join(missing[:SHOWN_NAMES])}{more}"
-    rows = [("Images", images), *(row for s in sensors[:MOST_SENSORS] for row in _sensor_rows(s))]
+    rows = [("Images", images), *(("Sensor", _sensor_words(s)) for s in sensors[:MOST_SENSORS])]
     if len(sensors) > MOST_SENSORS:
         rows.append(("", f"and {len(sensors) - MOST_SENSORS} more"))
     if not sensors:
         rows.append(("Sensor", "none: the image sizes are not known"))
     if cameras.rotations is None:
         rows.append(("Angles", "none: every camera counts as visible from every point"))
-    rows.append(("CRS", _short(r["crs_read"])))
+    rows.append(("CRS", shortened(r["crs_read"] or "not stated")))
     if r["crs"] != r["crs_read"]:
-        rows.append(("CRS of cloud", _short(r["crs"])))
+        rows.append(("CRS of cloud", shortened(r["crs"] or "not stated")))
     heights = f"{z.min():.2f} to {z.max():.2f} m, mean {z.mean():.2f} m"
     rows.append(("Problem", r["problem"]) if r["problem"] else ("Heights", heights))
     if r["height_above_water_m"] is not None:
@@ -268,12 +221,11 @@ def cameras_text(report: CamerasReport) -> str:
         rows.append(("Tilt", f"median {median:.1f} deg, largest {largest:.1f} deg"))
     if gnss is not None and gnss["images"]:
         mean, sd = (
-            ", ".join("-" if one is None else f"{one:{form}}" for one in gnss[name])
-            for name, form in (("mean_m", "+z.3f"), ("sd_m", "z.3f"))
+            ", ".join("-" if one is None else f"{one:z.3f}" for one in gnss[name])
+            for name in ("mean_m", "sd_m")
         )
         rows.append(("GNSS", f"{gnss['images']:,} images. Poses minus GNSS (east, north, up):"
-                     f" mean {mean} m, standard deviation {sd} m; largest distance"
-                     f" {gnss['largest_m']:.3f} m ({gnss['largest_image']})"))  # fmt: skip
+                     f" mean {mean} m, standard deviation {sd} m"))  # fmt: skip
     if gnss is not None and gnss["reason"]:
         rows.append(("GNSS", gnss["reason"]))
     if fit is not None:
@@ -289,11 +241,10 @@ def cameras_text(report: CamerasReport) -> str:
     if (found := report.diagnosis) is not None:
         says = {True: "absorbed: ", False: "not absorbed: ", None: "no evidence: "}
         verdict = f"not known; give control points (--gcps), or {EXPORT}"
-        if found.absorbed is not None and found.decided_by is not None:
+        if found.decided_by is not None:
             have = "have" if found.absorbed else "have not"
-            verdict = (
-                f"the poses {have} absorbed the refraction, as {found.decided_by.shown_by} show"
-            )
+            shown_by = found.decided_by.shown_by
+            verdict = f"the poses {have} absorbed the refraction, as {shown_by} show"
         if found.likely_error_m is not None:
             verdict += f"; the likely error of heights is {found.likely_error_m:.2g} m"
         rows.append(("Refraction", verdict))
@@ -301,57 +252,16 @@ def cameras_text(report: CamerasReport) -> str:
         if found.absorbed:
             command, because = report.remedy
             rows += [("Next step", f"adjust the poses{because}:"), ("", command)]
-    return aligned(f"{r['path']}: {cameras.source or 'cameras'}", rows, cameras.notes)
+    return aligned(f"{r['path']}: {cameras.source or 'cameras'}", rows)
 
 
-def _sensor_rows(s: Plain) -> Rows:
-    """Return frame, focal length and pixel size of a sensor, and what is wrong with its lens."""
+def _sensor_words(s: Plain) -> str:
+    """Return frame, focal length and pixel size of a sensor."""
     low, high = f"{s['focal']:.6g}", f"{s['focal_most']:.6g}"
     words = f"{s['name'] or 'unnamed'}: {s['images']:,} images"
     words += f" with {s['lenses']:,} different lenses" if s["lenses"] > 1 else ""
     words += f", {s['width']:g} x {s['height']:g} {s['unit']}, focal length"
     words += f" {low if low == high else f'{low} to {high}'} {s['unit']}, {s['projection']}"
     words += ", distorted" if s["distorted"] else ""
-    words += f", GSD {100.0 * s['gsd_m']:.2f} cm at the water" if s["gsd_m"] is not None else ""
-    folded = f"the distortion folds within the frame: {100.0 * s['folded']:.2g} % of it is not used"
-    fold: Rows = [("", f"{folded}; check the radial coefficients")] if s["folded"] else []
-    return [("Sensor", words), *fold]
-
-
-def _short(crs: str | None) -> str:
-    """Return the name of a CRS, whose text may be pages long."""
-    if not crs or len(crs) < SHORT_CRS:
-        return crs or "not stated"
-    return crs.split('"')[1] if '"' in crs else crs[:SHORT_CRS] + " ..."
-
-
-def draw_footprints(plan: Axes, cameras: Cameras, level_m: float, **look: Any) -> bool:
-    """Draw footprints on a level, of at most `MOST_FOOTPRINTS` images; return whether any exist."""
-    is_drawn = False
-    for row in range(0, len(cameras), max(1, len(cameras) // MOST_FOOTPRINTS)):
-        border = footprint(cameras, row, level_m)
-        if len(border) and np.isfinite(border).all():
-            plan.plot(*np.vstack([border, border[:1]]).T, color=WATER, **look)
-            is_drawn = True
-    return is_drawn
-
-
-def block_figure(report: CamerasReport) -> Figure:
-    """Draw the block in plan, with the footprints of its frames, and from the south."""
-    cameras, xyz, level = report.cameras, report.sample_xyz, report.level_m
-    figure, (plan, side) = new_figure(8.0, 8.5, nrows=2, height_ratios=[5, 2])
-    shown = draw_cloud(figure, plan, xyz, level, label="cloud")
-    side.plot(shown[:, 0], shown[:, 2], ".", color="0.6", markersize=1)
-    if level is not None:
-        side.axhline(level, color=WATER)
-    elif len(xyz):
-        level = float(np.median(xyz[:, 2]))  # of the footprints: the middle of the cloud
-    if level is not None and draw_footprints(plan, cameras, level, linewidth=0.6, alpha=0.6):
-        plan.plot([], [], color=WATER, label=f"footprints at {level:.1f} m")
-    for axes, heights in ((plan, cameras.centres[:, 1]), (side, cameras.centres[:, 2])):
-        axes.plot(cameras.centres[:, 0], heights, "^", color=AFTER, markersize=4, label="cameras")
-    label_plan(plan, 20.0)
-    label_side(side)
-    side.tick_params(axis="x", labelrotation=20)
-    legend_below(plan)
-    return figure
+    gsd = f", GSD {100.0 * s['gsd_m']:.2f} cm at the water" if s["gsd_m"] is not None else ""
+    return words + gsd

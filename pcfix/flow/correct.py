@@ -23,7 +23,7 @@ from pcfix.flow.plausibility import CloudSample, Plausible, plausible
 from pcfix.flow.raster import command_for
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
-from pcfix.io.cameras.mistakes import likely_mistake
+from pcfix.io.cameras.georeference import likely_mistake
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header

@@ -255,8 +255,6 @@ class CamerasCheckOptions(
     absorbed refraction."""
     reference: File | None = option(None, basic=True)
     """Survey of land or bed: LiDAR (.las, .laz), grid (.tif) or CSV x,y,z."""
-    plot: File | None = option(None, writes=True, basic=True)
-    """PNG of the block in plan and from the side."""
 
 
 class WaterCheckOptions(OverwriteOption, SummaryOption, WaterOptions, panel=Panel.OUTPUT):

@@ -93,12 +93,6 @@ def label_plan(axes: Axes, turned_deg: float = 30.0) -> None:
     axes.set(xlabel="East (m)", ylabel="North (m)")
 
 
-def label_side(axes: Axes) -> None:
-    """Name the axes of a view from the south."""
-    axes.ticklabel_format(style="plain", useOffset=False)
-    axes.set(xlabel="East (m)", ylabel="Height (m)")
-
-
 def draw_cloud(
     figure: Figure, plan: Axes, xyz: FloatArray, level_m: float | None = None, **look: Any
 ) -> FloatArray:

@@ -305,7 +305,7 @@ def table() -> dict[str, str]:
         commands[f"cameras.{name}"] = f"cameras {{shared}}/cameras/{path} --summary summary.json"
     commands["cameras.scene"] = (
         "cameras {samples}/scene/cameras.csv --cloud {samples}/scene/cloud.laz --water 0.37"
-        " --summary summary.json --plot block.png"
+        " --summary summary.json"
     )
     signs = f"--gnss {FREE}/gnss.csv --gcps {FREE}/gcps.csv --summary summary.json"
     commands["cameras.free"] = f"cameras {SICK} {signs} --reference {{shared}}/rendered_a/lidar.laz"

@@ -1,11 +1,10 @@
 """Read camera poses of any software: one module per format behind one `read_cameras`.
 
 A format module has patterns by which `checks.recognises` knows its files, or ``recognises(source)``
-of its own, then ``read(source)`` and, where the format has tie points, ``tie_points(source,
-cameras)``. `read_cameras` turns what damaged contents raise into an `InputError`, and checks
-rotations and lenses; a module raises an `InputError` itself where its sentence is clearer. To add a
-format, write its module, an entry of `FORMATS` and a line in README.md of this folder. A module is
-loaded when its turn comes.
+of its own, then ``read(source)`` and, if the format has tie points, ``tie_points(source,
+cameras)``. `read_cameras` turns what damaged contents raise into an `InputError`, checks rotations
+and lenses, and collects warnings (`checks.warn`). A module raises an `InputError` itself if its
+sentence is clearer. README.md of this folder says how to add a format.
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import SettingError, bad_file
-from pcfix.io.cameras import checks
+from pcfix.errors import PcfixWarning, SettingError, bad_file
+from pcfix.io.cameras import checks, unsupported
 from pcfix.io.cameras.checks import Angles, Source, reading
-from pcfix.io.cameras.sensor import read_sensor, sensor_file
+from pcfix.io.cameras.table import read_sensor, sensor_file
 from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
@@ -30,10 +29,9 @@ from pcfix.options.declare import File
 LISTS = (
     *(".xml", ".csv", ".txt", ".json", ".geojson", ".psx", ".psz", ".xmlz", ".opf", ".out", ".nvm"),
 )
-"""Endings of files that may hold cameras."""
+"""Suffixes of possible camera files."""
 
 
-UNSUPPORTED = "unsupported"
 FORMATS = {
     "metashape": "Agisoft Metashape, PhotoScan",
     "pix4d": "Pix4D",
@@ -45,10 +43,8 @@ FORMATS = {
     "blocksexchange": "ContextCapture, iTwin Capture, DJI Terra",
     "realitycapture": "RealityCapture (XMP)",
     "table": "CSV table",
-    UNSUPPORTED: "a format that pcfix does not read",
 }
-"""The modules of this folder and their software, in the order in which they are asked: a plain
-table has the fewest marks."""
+"""The modules of this folder and their software, in the order in which they are asked."""
 TAKE_SENSOR = ("table", "realitycapture")
 """Modules that look for the sensor themselves."""
 
@@ -61,17 +57,10 @@ def read_cameras(
     Parameters
     ----------
     path : path
-        A file or folder that photogrammetry software wrote; its content decides which. Each
-        module of this folder states its files and their convention. Or a table with a
-        header line; columns, in any order, upper or lower case:
-
-        ``label, x, y, z``
-            Projection centres. Every camera is then a candidate for every point.
-        and ``omega, phi, kappa``; ``yaw, pitch, roll``; ``qw, qx, qy, qz``; or ``r11 ... r33``
-            Angles in degrees, or the rotation from world to camera. Yaw is clockwise from north,
-            pitch 0 straight down and positive when the view lifts towards the yaw direction,
-            roll positive when the right side goes down (the angles of Metashape, the table of
-            pyBathySfM). Needs the sensor.
+        A file or folder of photogrammetry software, recognised by its content, see the README
+        of this folder. Or a table with the columns ``label, x, y, z`` (projection centres) and
+        ``omega, phi, kappa``; ``yaw, pitch, roll``; ``qw, qx, qy, qz``; or ``r11 ... r33``:
+        angles in degrees, or the rotation from world to camera, see `pcfix.io.cameras.table`.
     sensor : path, optional
         For tables, and files of poses without lenses: a CSV table of one row for all images,
         ``focal, sensor_x, sensor_y`` in millimetres or ``focal_px, width_px, height_px, ...``, or a
@@ -84,12 +73,7 @@ def read_cameras(
     -------
     Cameras
         World to camera rotations in OpenCV axes, all in the frame of the file:
-        `pcfix.io.cameras.georeference.georeference` takes them to the cloud's CRS.
-
-    Warns
-    -----
-    PcfixWarning
-        When labels repeat: different positions are used, exact copies skipped.
+        `pcfix.io.cameras.georeference.georeference` transforms them to the cloud's CRS.
 
     Raises
     ------
@@ -106,7 +90,8 @@ def read_cameras(
     """
     source, form = _recognised(path, sensor, angles)
     try:
-        with reading(path):
+        with reading(path), warnings.catch_warnings(record=True) as shown:
+            warnings.simplefilter("always")
             cameras: Cameras = reader_of(form).read(source)
             sensor_path = sensor_file(source)
             if cameras.rotations is not None and cameras.lenses is None and sensor_path:
@@ -118,15 +103,16 @@ def read_cameras(
                     sentence = f"has {why}, so --sensor {sensor} has no effect. Omit it."
                     raise bad_file(source.path, "cameras.sensor_unused", sentence, sensor=sensor)
             elif cameras.lenses is None and form == "table":
-                raise checks.no_sensor(source.path, "focal,sensor_x,sensor_y (mm)")
+                raise checks.no_sensor(source.path)
             cameras = checks.checked(source.path, cameras)
     except SettingError as error:  # numbers that are finite in the file and not in the world
         raise checks.damaged(path, str(error).rstrip(".")) from error
     if not len(cameras):
         raise checks.no_pose(source.path)
-    for note in cameras.notes:
-        warnings.warn(note, stacklevel=2)
-    return cameras
+    for one in shown:
+        warnings.warn(one.message, one.category, stacklevel=2)
+    notes = [one.message for one in shown if isinstance(one.message, PcfixWarning)]
+    return replace(cameras, notes=tuple(notes), source=FORMATS[form])
 
 
 def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
@@ -147,7 +133,8 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
     source, form = _recognised(path, None, None)
     if not hasattr(reader_of(form), "tie_points"):
         raise checks.no_tie_points(source.path, f"the format ({FORMATS[form]}) has none")
-    with reading(path):
+    with reading(path), warnings.catch_warnings():
+        warnings.simplefilter("ignore", PcfixWarning)  # shown when the cameras were read
         ties: TiePoints = reader_of(form).tie_points(source, cameras)
     if not len(ties.views.camera):
         raise checks.no_tie_points(source.path, "no point is visible in its images")
@@ -162,20 +149,13 @@ def _recognised(path: File, sensor: File | None, angles: Angles | None) -> tuple
         None if sensor is None else check_input(sensor),
         angles,
     )
-    known = _format_of(source)
-    if known not in (None, UNSUPPORTED):
-        return source, known
-    inside = []  # camera files in a folder
+    if form := _format_of(source):
+        return source, form
     for file in sorted(p for p in where.glob("*") if p.suffix.lower() in LISTS and p.is_file()):
-        form = _format_of(Source(file))
-        if form not in (None, UNSUPPORTED):
-            inside.append((file.name, FORMATS[form]))
-    if inside:
-        listed = " and ".join(f"{name} ({software})" for name, software in inside[:3])
-        sentence = f"is a folder that holds {listed}. Give {where / inside[0][0]} itself."
-        raise bad_file(where, "cameras.folder", sentence, files=[name for name, _ in inside[:3]])
-    if known is not None:
-        return source, known
+        if form := _format_of(Source(file)):
+            sentence = f"is a folder with a camera file ({FORMATS[form]}). Give {file}."
+            raise bad_file(where, "cameras.folder", sentence, file=file.name)
+    unsupported.refuse(source)
     sentence = "is not a camera file that pcfix knows. Give a file that pcfix/io/cameras/README.md"
     sentence += " lists, or a CSV table with label, x, y, z and, if known, yaw, pitch, roll."
     raise bad_file(where, "cameras.unknown", sentence)
@@ -192,12 +172,8 @@ def reader_of(form: str) -> Any:
 
 
 def _format_of(source: Source) -> str | None:
-    """Return the first format that knows the content; one that damage hides is passed over.
-
-    Files of standard errors look like poses, so the refused parts of exports are asked first.
-    """
-    is_part = reader_of(UNSUPPORTED).is_part(source)
-    for form in [UNSUPPORTED] if is_part else FORMATS:
+    """Return the first format that recognises the content."""
+    for form in () if unsupported.is_part(source) else FORMATS:
         with suppress(Exception), np.errstate(all="ignore"):
             if checks.recognises(reader_of(form), source):
                 return form

@@ -2,56 +2,49 @@
 
 *Bundler*: N. Snavely, "Bundler v0.4 User's Manual", section "Output format", of files that begin
 with ``# Bundle file v0.3`` (https://www.cs.cornell.edu/~snavely/bundler/bundler-v0.4-manual.html).
-After the numbers of cameras and points come, for each camera, f k1 k2, a matrix R and a vector t,
-and then the points with their views (image, feature, x, y). ``X_cam = R X + t`` is in axes x right,
-y up, z backward, so the rows of y and z change sign for OpenCV's axes. The image is
-``f (1 + k1 r^2 + k2 r^4) (-X_cam / Z_cam)``, x right and y up from the middle of the frame. f = 0
-marks an image without a pose. Names are in ``list.txt``, a line for each camera.
+After the numbers of cameras and points come, for each camera, f k1 k2, R and t, and then the points
+with their views (image, feature, x, y). ``X_cam = R X + t`` is in axes x right, y up, z backward.
+The image is ``f (1 + k1 r^2 + k2 r^4) (-X_cam / Z_cam)``, x right and y up from the middle of the
+frame. f = 0 marks an image without a pose. ``list.txt`` has a name for each camera.
 
 *MVE* ("drews 1.0", https://github.com/simonfuhrmann/mve/wiki/MVE-File-Format) has OpenCV's axes, f
 in units of the longer side of the frame, and views (image, feature, nothing).
 
 *VisualSFM*: C. Wu, "VisualSFM: documentation", section "The output format: N-View Match"
-(http://ccwu.me/vsfm/doc.html#nvm). The first line may go on with the calibration that was held,
-``FixedK fx cx fy cy``. Then come models, up to a 0 or the end: a number of cameras, a line for each
-(name, f, quaternion with the scalar first, projection centre, k, 0), a number of points, a line for
-each (x y z, colour, n, then n times image, feature, x, y). A model without points holds the images
-that have no pose. In names, ``"`` stands for a space. The quaternion is world to camera in OpenCV's
-axes; ``NVM_V3_R9T`` has the matrix and the translation of ``x_cam = R x + t`` instead
-(``pba/src/pba/util.h`` of Multicore Bundle Adjustment). k is of the measured place:
-``(1 + k r^2) m / f`` is the undistorted one, with ``r = |m| / f``. Measured places m are counted
-from the principal point, which is the middle of the frame unless FixedK states another.
+(http://ccwu.me/vsfm/doc.html#nvm). The first line can state a fixed calibration, ``FixedK fx cx fy
+cy``. Then come models, up to a 0 or the end: a number of cameras, a line for each (name with ``"``
+for a space, f, quaternion with the scalar first, projection centre, k, 0), a number of points, a
+line for each (x y z, colour, n, then n times image, feature, x, y). A model without points has the
+images without a pose. The quaternion is world to camera in OpenCV's axes; ``NVM_V3_R9T`` has R and
+t of ``x_cam = R x + t`` instead. The undistorted place is ``(1 + k r^2) m / f`` with r = |m| / f;
+m is counted from the principal point, the middle of the frame unless FixedK states another.
 
 OpenSfM and ODM write .nvm files with places from the upper left corner, and scale the shorter side
-of the frame by its own length instead of the longer one's. Such a file is recognised by places none
-of which is negative and which are far from where the points project. The middle of its frame, and
-whether the shorter side is squeezed, then follow from the points themselves.
+of the frame by its own length instead of the longer one's. In such a file no place is negative, and
+places are far from the projected points, which then show the frame.
 
 None has the sizes of the images: they are those of the images next to the file, or else the
-smallest that hold all tie points. The files name no CRS.
+smallest that contain all tie points. The files name no CRS.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Seen, Source, damaged, note
+from pcfix.io.cameras.checks import Observations, Source, damaged
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_photogrammetric
 from pcfix.model import Cameras, FloatArray, TiePoints
 
-CONTENT = re.compile(r"\A\s*(#\s*Bundle file v\d+\.\d+|drews 1\.0|NVM_V3)")
-_BUNDLER = re.compile(r"#\s*Bundle file v(\d+\.\d+)")
-_VERSION = "0.3"
+CONTENT = r"\A\s*(#\s*Bundle file v0\.3|drews 1\.0|NVM_V3)"
+BUNDLER, MVE, VISUALSFM = "Bundler", "MVE", "VisualSFM"
 _CAMERA_NUMBERS = 15
 _FOCAL_OF_LIST = re.compile(r"\s+0\s+[\d.]+$")
 _NVM = re.compile(r"NVM_V3(_R9T)?\b(?:\s*FixedK\s+(.*))?")
@@ -66,34 +59,35 @@ _LEAST_VIEWS = 10
 
 
 class Model(NamedTuple):
-    """What a file holds: posed cameras without lenses, and points.
+    """The contents of a file: posed cameras without lenses, and points.
 
-    `least_px` is the width and height that hold the tie points of each image, 0 where there are
+    `least_px` is the width and height that contain the tie points of each image, 0 if there are
     none. The views of the `points` have u, v from the principal point, v down.
     """
 
     cameras: Cameras
     lenses: list[dict[str, float]]  # parameters; f is of the longer side in files of MVE
     least_px: FloatArray
-    points: Seen
+    points: Observations
+    software: str
 
 
 def read(source: Source) -> Cameras:
-    """Read the poses of the largest model, and its lenses where sizes are known."""
-    cameras, parameters, least_px, _ = _model(source)
-    frames, notes = _frame_sizes(source.path, cameras.labels, least_px)
+    """Read the poses of the largest model, and its lenses if sizes are known."""
+    cameras, parameters, least_px, _, software = _model(source)
+    frames = _frame_sizes(source.path, cameras.labels, least_px)
     lenses = []
     for given, (w, h) in zip(parameters, frames.tolist(), strict=False):
-        if cameras.source == "MVE":
+        if software == MVE:
             given["f"] *= max(w, h)
-        lenses.append(lens_by_name(given, w, h, inverse=cameras.source == "VisualSFM"))
-    return replace(cameras, lenses=tuple(lenses) or None, notes=(*cameras.notes, *notes))
+        lenses.append(lens_by_name(given, w, h, inverse=software == VISUALSFM))
+    return replace(cameras, lenses=tuple(lenses) or None)
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points of the largest model and where the images saw them."""
     model = _model(source)
-    if model.cameras.source == "MVE":
+    if model.software == MVE:
         raise checks.no_tie_points(source.path, "MVE writes no image coordinates")
     middles = [(one.principal_x, one.principal_y) for one in cameras.lenses or ()]
     uv = np.array(middles).reshape(-1, 2)[model.points.camera] + model.points.uv
@@ -101,63 +95,53 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
 
 
 def _model(source: Source) -> Model:
-    """Read a file of Bundler or MVE, or the largest model of VisualSFM."""
+    """Read a file of Bundler or MVE, or the largest model of a file of VisualSFM."""
     path = source.path
     if _NVM.match(source.text.lstrip()):
         return _read_nvm(path)
     head, *body = read_lines(path)
-    version = _BUNDLER.match(head)
-    if version and version[1] != _VERSION:
-        what = f"Bundler's format v{version[1]}"
-        raise checks.unsupported(path, what, f"Export v{_VERSION}", version=version[1])
+    is_mve = "drews" in head
     values = np.array(" ".join(body).split(), np.float64)
     count, end = int(values[0]), 2 + _CAMERA_NUMBERS * int(values[0])
     rows = values[2:end].reshape(count, _CAMERA_NUMBERS)
-    points = _points(path, values[end:], int(values[1]), count, 4 if version else 3)
-    rows, points, posed = _posed(path, rows, points, rows[:, 0] != 0.0)
-    kind = "camera" if version else "view"
+    points = _points(path, values[end:], int(values[1]), count, 3 if is_mve else 4)
+    kind = "view" if is_mve else "camera"
     names = _listed_names(path, count) or [f"{kind} {i}" for i in range(count)]
-    labels = tuple(names[i] for i in posed)
+    rows, points, labels = _posed(path, rows, points, names)
     rotations = checks.rotations(path, labels, rows[:, 3:12])
     centres, least = checks.centres(rotations, rows[:, 12:]), np.zeros((len(rows), 2))
-    if version:
+    if not is_mve:
         rotations = from_photogrammetric(rotations)
         points = points._replace(uv=points.uv * (1.0, -1.0))
-        least = _holding(points, len(rows))
+        least = _least_frames(points, len(rows))
     given = [dict(zip(("f", "k1", "k2"), row, strict=True)) for row in rows[:, :3].tolist()]
-    software, unposed = f"Bundler v{_VERSION}" if version else "MVE", _others(names, labels)
-    cameras = Cameras(labels, centres, rotations, unposed=unposed, source=software)
-    return Model(cameras, given, least, points)
+    cameras = Cameras(labels, centres, rotations, unposed=tuple(sorted({*names} - {*labels})))
+    return Model(cameras, given, least, points, MVE if is_mve else BUNDLER)
 
 
 def _posed(
-    path: Path, rows: FloatArray, points: Seen, has_pose: np.ndarray
-) -> tuple[FloatArray, Seen, list[int]]:
-    """Return the rows of images with a pose, the views with their new numbers, and the old ones."""
+    path: Path, rows: FloatArray, points: Observations, names: list[str]
+) -> tuple[FloatArray, Observations, tuple[str, ...]]:
+    """Return the rows, the views and the names of images with a pose; the first column is f."""
+    has_pose = rows[:, 0] > 0.0
     if not has_pose.any():
-        raise checks.no_pose(path, "no image has a pose (all focal lengths are 0)")
+        raise checks.no_pose(path)
     number = np.where(has_pose, np.cumsum(has_pose) - 1, -1)
     points = points._replace(camera=number[points.camera])
-    return rows[has_pose], points, np.flatnonzero(has_pose).tolist()
+    return rows[has_pose], points, tuple(names[i] for i in np.flatnonzero(has_pose))
 
 
-def _holding(points: Seen, count: int) -> FloatArray:
-    """Return the smallest frames about the principal points that hold the views of each image."""
+def _least_frames(points: Observations, count: int) -> FloatArray:
+    """Return the smallest frames about the principal points that contain all views, (count, 2)."""
     least, is_posed = np.zeros((count, 2)), points.camera >= 0
     np.maximum.at(least, points.camera[is_posed], 2.0 * np.abs(points.uv[is_posed]))
     return least
 
 
-def _others(names: Iterable[str], labels: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of images without a pose, each once."""
-    return tuple(name for name in dict.fromkeys(names) if name not in set(labels))
-
-
 def _listed_names(path: Path, count: int) -> list[str]:
     """Return the names in the first list next to a file that has one for each image."""
-    stem = path.name.removesuffix(".out")
-    own = (f"{one}.list.txt" for one in (stem, path.name, stem.removesuffix(".bundle")))
-    for place in (*map(path.with_name, (*own, "list.txt")), path.parent.parent / "list.txt"):
+    own = path.with_name(f"{path.name.removesuffix('.out').removesuffix('.bundle')}.list.txt")
+    for place in (own, path.with_name("list.txt"), path.parent.parent / "list.txt"):
         lines = [line.strip() for line in read_lines(place)] if place.is_file() else []
         if len(listed := [line for line in lines if line]) == count:
             return [_FOCAL_OF_LIST.sub("", line) for line in listed]
@@ -168,10 +152,10 @@ def _read_nvm(path: Path) -> Model:
     """Read the model with most posed images, of those with points if there are any."""
     head, *lines = [x for line in read_lines(path) if (x := line.strip()) and x[0] != "#"]
     found = _NVM.match(head)
-    matrix, held = found.groups() if found else (None, None)
+    matrix, stated = found.groups() if found else (None, None)
     width = _MATRIX_NUMBERS if matrix else _QUATERNION_NUMBERS
-    fixed = dict(zip(("fx", "cx", "fy", "cy"), map(float, (held or "").split()), strict=False))
-    models: list[tuple[list[str], FloatArray, Seen]] = []
+    fixed = dict(zip(("fx", "cx", "fy", "cy"), map(float, (stated or "").split()), strict=False))
+    models: list[tuple[list[str], FloatArray, Observations]] = []
     at = 0
     while at < len(lines) and (count := int(lines[at])) > 0:
         listed = [line.rsplit(None, width) for line in lines[at + 1 : at + 1 + count]]
@@ -183,11 +167,10 @@ def _read_nvm(path: Path) -> Model:
         models.append((names, numbers, _points(path, values, views, count, 4)))
         at += 1 + views
     if not models:
-        raise checks.no_pose(path, "has no model")
+        raise checks.no_pose(path)
     among = [model for model in models if len(model[2].xyz)] or models
     names, rows, points = max(among, key=lambda model: (model[1][:, 0] > 0.0).sum())
-    rows, points, posed = _posed(path, rows, points, rows[:, 0] > 0.0)
-    labels = tuple(names[i] for i in posed)
+    rows, points, labels = _posed(path, rows, points, names)
     if matrix:
         rotations = checks.rotations(path, labels, rows[:, 1:10])
         centres = checks.centres(rotations, rows[:, 10:13])
@@ -202,17 +185,17 @@ def _read_nvm(path: Path) -> Model:
         expected = rows[points.camera, :1] * np.column_stack([x / z, y / z])
         points, least = _from_the_middle(points, expected, rows[:, 0])
     given = [{"f": f, "k1": k1} | fixed for f, k1 in rows[:, [0, -2]].tolist()]
-    unposed = _others((name for model in models for name in model[0]), labels)
-    notes = (checks.several(path, len(among), len(labels)),) if len(among) > 1 else ()
-    cameras = Cameras(labels, centres, rotations, unposed=unposed, source="VisualSFM", notes=notes)
-    return Model(cameras, given, least, points)
+    unposed = tuple(sorted({name for model in models for name in model[0]} - {*labels}))
+    checks.warn_several(path, len(among), len(labels))
+    cameras = Cameras(labels, centres, rotations, unposed=unposed)
+    return Model(cameras, given, least, points, VISUALSFM)
 
 
-def _points(path: Path, body: FloatArray, count: int, images: int, width: int) -> Seen:
-    """Take apart a list of x y z, red green blue, n, and n views of `width` numbers.
+def _points(path: Path, body: FloatArray, count: int, images: int, width: int) -> Observations:
+    """Parse a list of x y z, red green blue, n, and n views of `width` numbers.
 
-    `count` is the number of points that the file announces, `images` that of its images, which the
-    first number of a view counts from 0; its last two are x and y.
+    `count` and `images` are the numbers of points and images of the file. The first number of a
+    view is its image, from 0; the last two are x and y.
     """
     xyz, parts, at = [], [], 0
     for i in range(count):
@@ -229,13 +212,13 @@ def _points(path: Path, body: FloatArray, count: int, images: int, width: int) -
     bad = ~((image >= 0) & (image < images))
     if bad.any():
         raise damaged(path, f"point {point[np.argmax(bad)]} is in image {image[np.argmax(bad)]}")
-    return Seen(np.array(xyz).reshape(-1, 3), point, image, views[:, -2:])
+    return Observations(np.array(xyz).reshape(-1, 3), point, image, views[:, -2:])
 
 
 def _from_the_middle(
-    points: Seen, expected: FloatArray, focal: FloatArray
-) -> tuple[Seen, FloatArray]:
-    """Return views from the principal point, and the least frame of each of the images.
+    points: Observations, expected: FloatArray, focal: FloatArray
+) -> tuple[Observations, FloatArray]:
+    """Return views from the principal point, and the smallest frame of each image.
 
     `expected` are the places without distortion, `focal` is that of each image.
     """
@@ -244,46 +227,33 @@ def _from_the_middle(
     known = np.isfinite(expected).all(axis=1)
     is_from_corner = ((seen >= 0.0) & (seen < _LARGEST_PX)).all() and known.any()
     if not (is_from_corner and np.median(np.abs(seen - expected)[known]) > _FAR_PX):
-        return points, _holding(points, len(focal))
+        return points, _least_frames(points, len(focal))
     least = np.zeros((len(focal), 2))
     for f in np.unique(focal[image[known]]):  # OpenSfM's, from the corner
         rows = focal[image] == f
-        if (rows & known).sum() >= _LEAST_VIEWS:
-            squeeze, frame = _squeeze_and_frame(expected[rows & known], seen[rows & known])
-            seen[rows] = (seen[rows] - frame / 2.0) / squeeze
+        here = rows & known
+        if here.sum() >= _LEAST_VIEWS:
+            # seen = side / longer side (expected + longer side / 2); medians tolerate outliers
+            half = np.median(seen[here] - expected[here], axis=0).max()
+            frame = np.round(2.0 * half * np.median(seen[here] / (expected[here] + half), axis=0))
+            seen[rows] = (seen[rows] - frame / 2.0) * frame.max() / frame
             least[focal == f] = frame
     return points._replace(uv=seen), least
 
 
-def _squeeze_and_frame(expected: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return by how much each axis is squeezed, and the frame in whole pixels.
-
-    The squeeze is 1, seen = expected + frame / 2, or the side in units of the longer one,
-    seen = squeeze (expected + longer / 2), whichever is nearer. Medians bear outliers.
-    """
-    half = np.median(seen - expected, axis=0)
-    squeeze = np.median(seen / (expected + half.max()), axis=0)
-    plain = np.median(np.abs(seen - expected - half), axis=0)
-    squeezed = np.median(np.abs(seen - squeeze * (expected + half.max())), axis=0)
-    frame = np.round(2.0 * np.where(squeezed < plain, squeeze * half.max(), half))
-    return np.where(squeezed < plain, frame / frame.max(), 1.0), frame
-
-
-def _frame_sizes(
-    path: Path, labels: tuple[str, ...], least_px: FloatArray
-) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
+def _frame_sizes(path: Path, labels: tuple[str, ...], least_px: FloatArray) -> FloatArray:
     """Return width and height of images, from the images themselves or from their tie points.
 
-    Where an image cannot be opened, its frame is the smallest that holds the tie points of all
-    images, about the middle of the frame. Where neither is known there are no sizes.
+    If an image cannot be opened, its frame is the smallest that contains the tie points of all
+    images, about the middle of the frame. Without tie points no size is returned.
     """
     sizes = np.array([checks.image_size(path.parent, one) or (0, 0) for one in labels], float)
     missing = sizes[:, 0] == 0
-    if not missing.any():
-        return sizes, ()
-    if not least_px.any():
-        return np.empty((0, 2)), ()
-    first = sizes[missing] = least_px.max(axis=0)
-    sentence = f"the size of {missing.sum()} images is unknown. Put the images next to the file;"
-    sentence += f" until then they are estimated as {first[0]:.0f} x {first[1]:.0f} px."
-    return sizes, (note(path, "cameras.frames_estimated", sentence, size_px=first.tolist()),)
+    if missing.any() and not least_px.any():
+        return np.empty((0, 2))
+    if missing.any():
+        width, height = sizes[missing] = least_px.max(axis=0)
+        sentence = f"the size of {missing.sum()} images is unknown; {width:.0f} x {height:.0f} px"
+        sentence += " is estimated. Put the images next to the file."
+        checks.warn(path, "cameras.frames_estimated", sentence, size_px=[width, height])
+    return sizes

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
+import warnings
 import zipfile
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from pathlib import Path, PureWindowsPath
@@ -42,7 +42,7 @@ _HEAD_BYTES = 4096
 
 @dataclass(frozen=True)
 class Source:
-    """A file or folder that may hold cameras, and what the user states about it.
+    """A file or folder that may have cameras, and the settings of the user for it.
 
     `sensor` is the ``--sensor`` file, `angles` the kind of angles of a table whose header does not
     name it.
@@ -66,11 +66,6 @@ class Source:
         is_archive = self.head.startswith(ZIP_MAGIC)
         return tables.decoded(read_document(self.path)[:_HEAD_BYTES] if is_archive else self.head)
 
-    @cached_property
-    def names(self) -> frozenset[str]:
-        """Names of the contents of a folder; none for a file."""
-        return frozenset(p.name for p in self.path.iterdir()) if self.path.is_dir() else frozenset()
-
 
 def recognises(form: Any, source: Source) -> bool:
     """Whether a format knows a file or folder: by a rule of its own, or by patterns.
@@ -80,7 +75,8 @@ def recognises(form: Any, source: Source) -> bool:
     if hasattr(form, "recognises"):
         return bool(form.recognises(source))
     if source.path.is_dir():
-        return any(re.fullmatch(getattr(form, "INSIDE", ""), name) for name in source.names)
+        pattern = re.compile(getattr(form, "INSIDE", ""))
+        return any(pattern.fullmatch(inside.name) for inside in source.path.iterdir())
     return re.search(form.CONTENT, source.text) is not None
 
 
@@ -100,32 +96,27 @@ def unsupported(path: Path, what: str, remedy: str, **values: Any) -> InputError
     return bad_file(path, "cameras.unsupported", f"{what} is not supported. {remedy}.", **values)
 
 
+def no_sensor(path: Path) -> InputError:
+    """Return the error for a table of poses without a lens."""
+    sentence = "has angles but no sensor. Give --sensor a table with focal,sensor_x,sensor_y (mm)."
+    return bad_file(path, "cameras.sensor_missing", sentence)
+
+
 def note(path: object, code: str, sentence: str, **values: Any) -> PcfixWarning:
-    """Return a note on what was done on reading a file."""
+    """Return a warning about a camera file."""
     return PcfixWarning(code, f"{path}: {sentence}", path=path, **values)
 
 
-def several(path: Path, count: int, images: int) -> PcfixWarning:
-    """Return a note on models that are not connected, of which the largest is read."""
-    sentence = f"has {count} separate models. Only the largest is read, with {images} images."
-    return note(path, "cameras.several_models", sentence, models=count, images=images)
+def warn(path: object, code: str, sentence: str, **values: Any) -> None:
+    """Warn about a camera file; `pcfix.read_cameras` also returns the warning in `notes`."""
+    warnings.warn(note(path, code, sentence, **values), stacklevel=3)
 
 
-def no_sensor(path: Path, columns: str) -> InputError:
-    """Return the error for a table of poses without a lens."""
-    sentence = f"has angles but no sensor. Give --sensor a table with the columns {columns}."
-    return bad_file(path, "cameras.sensor_missing", sentence, columns=columns)
-
-
-def repeated(path: Path, labels: Sequence[str], dropped: int = 0) -> tuple[PcfixWarning, ...]:
-    """Return a note where labels repeat: they are no key, and their images stay separate."""
-    names = [label for label, count in Counter(labels).items() if count > 1]
-    if not names:
-        return ()
-    copies = f"; {dropped} exact copies are ignored" if dropped else ""
-    listed = ", ".join(names[:10]) + (", ..." if len(names) > 10 else "")
-    sentence = f"{len(names)} labels repeat ({listed}). Different positions are all used{copies}."
-    return (note(path, "cameras.repeated", sentence, labels=names, dropped=dropped),)
+def warn_several(path: Path, count: int, images: int) -> None:
+    """Warn if a file has several models that are not connected, of which the largest is read."""
+    if count > 1:
+        sentence = f"has {count} separate models. Only the largest is read, with {images} images."
+        warn(path, "cameras.several_models", sentence, models=count, images=images)
 
 
 @contextmanager
@@ -182,7 +173,7 @@ def text_of(element: Element, name: str) -> str:
 
 
 def load_json(path: Path) -> Any:
-    """Return what a JSON file holds."""
+    """Return the contents of a JSON file."""
     with reading(path):
         return parse_json(path.read_bytes())
 
@@ -215,7 +206,7 @@ def rotations(path: Path, labels: Sequence[str], matrices: FloatArray) -> FloatA
     matrices = np.asarray(matrices, np.float64).reshape(-1, 3, 3)
     off = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     good = (off <= ROUNDING) & (np.linalg.det(np.nan_to_num(matrices, posinf=0.0)) > 0.0)
-    _check_rotations(path, labels, good, "the rotation of {} is mirrored or skewed")
+    _check_rotations(path, labels, good)
     for _ in range(2):  # Newton's iteration to the polar factor squares the rounding each time
         matrices = 1.5 * matrices - 0.5 * matrices @ matrices.transpose(0, 2, 1) @ matrices
     return matrices
@@ -226,14 +217,14 @@ def quaternions(path: Path, labels: Sequence[str], wxyz: FloatArray) -> FloatArr
     from scipy.spatial.transform import Rotation
 
     good = np.abs(np.linalg.norm(wxyz, axis=1) - 1.0) <= ROUNDING
-    _check_rotations(path, labels, good, "the quaternion of {} has not the length 1")
+    _check_rotations(path, labels, good)
     return np.asarray(Rotation.from_quat(np.roll(wxyz, -1, axis=1)).as_matrix())
 
 
-def _check_rotations(path: Path, labels: Sequence[str], good: BoolArray, what: str) -> None:
+def _check_rotations(path: Path, labels: Sequence[str], good: BoolArray) -> None:
     if not good.all():
         label = labels[int(np.argmin(good))]
-        sentence = f"{what.format(label)}. Export the poses again."
+        sentence = f"the rotation of {label} is mirrored, skewed or scaled. Export the poses again."
         raise bad_file(path, "cameras.rotation", sentence, image=label)
 
 
@@ -243,7 +234,7 @@ def centres(rotations: FloatArray, translations: FloatArray) -> FloatArray:
 
 
 def lens(path: Path, name: str, given: Lens) -> Lens:
-    """Return the lens when its numbers can be those of a camera."""
+    """Return the lens if its numbers can be those of a camera."""
     positive = min(given.focal, given.focal + given.b1, given.width, given.height) > 0.0
     every = np.hstack([v for v in astuple(given) if isinstance(v, float | tuple)])
     if not (positive and np.isfinite(every).all()):
@@ -269,8 +260,8 @@ def measured(
 ) -> GnssPositions | None:
     """Return the GNSS positions of images by their keys, with their standard deviations.
 
-    Numbers that are not finite are unknown; a position may lack its height only. None where no
-    image has a position.
+    Numbers that are not finite are unknown; a position may lack its height only. None if no image
+    has a position.
     """
     unknown = np.full((2, 3), np.nan)
     rows = [places.get(key, unknown) for key in keys]
@@ -325,10 +316,10 @@ def no_tie_points(path: Path, why: str) -> NoTiePointsError:
     return NoTiePointsError("cameras.no_tie_points", sentence, path=path)
 
 
-class Seen(NamedTuple):
+class Observations(NamedTuple):
     """Points, and observations of them in any order: row of the point and camera, u and v.
 
-    The camera -1 is one without a pose, the point -1 one that is not there.
+    The camera -1 has no pose, and the point -1 is not in the file.
     """
 
     xyz: FloatArray
@@ -338,18 +329,17 @@ class Seen(NamedTuple):
 
 
 def rows_of(wanted: IntArray, identifiers: IntArray) -> IntArray:
-    """Return the first row of each of the wanted in a list of identifiers, -1 where it is none."""
+    """Return the first row of each wanted one in a list of identifiers, -1 if it is not there."""
     if not len(identifiers):
         return np.full(len(wanted), -1)
-    order, rising = np.argsort(identifiers, kind="stable"), np.argsort(wanted)
-    place = np.empty(len(wanted), np.int64)  # a search in rising order is far quicker
-    place[rising] = np.searchsorted(identifiers[order], wanted[rising])
+    order = np.argsort(identifiers, kind="stable")
+    place = np.searchsorted(identifiers, wanted, sorter=order)
     row = order[np.minimum(place, len(order) - 1)]
     return np.where(identifiers[row] == wanted, row, -1)
 
 
-def tie_points(*parts: Seen) -> TiePoints:
-    """Join points and gather their observations by point, without those of a camera -1.
+def tie_points(*parts: Observations) -> TiePoints:
+    """Join points and sort their observations by point, without those of a camera or point -1.
 
     An observation that is not finite is skipped, and such a position is unknown.
     """
@@ -367,25 +357,21 @@ def tie_points(*parts: Seen) -> TiePoints:
 
 
 def image_size(folder: Path, name: str) -> tuple[int, int] | None:
-    """Return width and height of an image, None when it is not there or cannot be opened.
+    """Return width and height of an image; None if it is missing or cannot be opened.
 
-    It is looked for in the folder, one folder up, and in ``images``.
+    It can be in the folder, one folder up, or in ``images``.
     """
     from PIL import Image
 
     plain = name.replace("\\", "/")
     file = PureWindowsPath(name).name
     for place in (folder / plain, folder / file, folder.parent / plain, folder / "images" / file):
-        try:
-            if place.is_file():
-                with Image.open(place) as image:
-                    return image.size
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-            continue
+        with suppress(Exception), Image.open(place) as image:
+            return image.size
     return None
 
 
-# ---- what writers share ----
+# ---- shared by the writers ----
 
 
 def block_to_write(path: Path, cameras: Cameras) -> tuple[FloatArray, tuple[Lens, ...]]:

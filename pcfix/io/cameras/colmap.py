@@ -1,28 +1,21 @@
 """COLMAP's sparse models, as text or binary.
 
-A model is a folder with ``cameras``, ``images`` and ``points3D``, all ``.bin`` or all ``.txt``.
-``rigs`` and ``frames`` (COLMAP 3.12 and later) are not needed, as ``images`` has the pose of every
-image in rigs also. Definition: https://colmap.github.io/format.html.
+A model is a folder with ``cameras``, ``images`` and ``points3D``, all ``.bin`` or all ``.txt``;
+``rigs`` and ``frames`` (COLMAP 3.12 and later) repeat them. Definition:
+https://colmap.github.io/format.html. A pose is a unit quaternion, scalar first, and a translation,
+both world to camera, in OpenCV axes: ``x_cam = R x + t``. Pixels start at the upper left corner of
+the upper left pixel. An image point has the identifier of its point in space, -1 for none;
+``points3D`` lists the same as tracks.
 
-A pose is a unit quaternion, scalar first, and a translation, both world to camera, in OpenCV
-axes: ``x_cam = R x + t``, so the projection centre is ``-R' t``. Pixels start at the upper left
-corner of the upper left pixel. The files name no CRS, unless ``georeference.json`` of pcfix is next
-to them (``crs``, text or null, ``offset_m``, three numbers, ``written_by``): its offset is then
-added to centres and tie points, and its CRS is theirs.
+The parameters of a camera are those of https://colmap.github.io/cameras.html and, for newer models,
+``src/colmap/sensor/models`` of COLMAP 4. p1 and p2 are in OpenCV's order, except in the model of
+Project Aria's cameras (RAD_TAN_THIN_PRISM_FISHEYE), where they are in Brown's and the tangential
+and prism terms are of the radially distorted place.
 
-Binary files are little-endian, with counts before lists and names that end with a zero byte; text
-files have a line per camera and point, two per image, and ``#`` before comments. The parameters of
-a camera are those of COLMAP's own list, in its order (https://colmap.github.io/cameras.html and,
-for newer models, ``src/colmap/sensor/models`` of COLMAP 4). p1 and p2 are in OpenCV's order, except
-in the model of Project Aria's cameras (RAD_TAN_THIN_PRISM_FISHEYE), where they are in Brown's and
-the tangential and prism terms are of the radially distorted place.
-
-Images keep the order of the file. An image point belongs to the point in space whose identifier it
-has, -1 for none; ``points3D`` lists the same as tracks.
-
-Models are written in binary, without ``rigs`` and ``frames``, which COLMAP makes itself. Images
-and cameras are numbered from 1 in the order of the block, points in the order of the tie points.
-Positions are written minus an offset, which ``georeference.json`` keeps.
+The files name no CRS. pcfix writes positions minus an offset, and both to ``georeference.json``
+(``crs``, text or null, ``offset_m``, three numbers, ``written_by``), which it also reads. It writes
+binary models; images and cameras are numbered from 1 in the order of the block, points in the order
+of the tie points.
 """
 
 from __future__ import annotations
@@ -43,7 +36,7 @@ from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, damaged
 from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
 from pcfix.io.crs import is_topocentric
-from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints, Views
+from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 from pcfix.options.declare import File
 
 _PART = re.compile(r"(cameras|images|points3D|rigs|frames)\.(bin|txt)")
@@ -69,14 +62,13 @@ def read(source: Source) -> Cameras:
     used = dict.fromkeys(image.camera for image in images)
     lenses = {number: lens_of(listed, number, cameras[number]) for number in used}
     offset, crs = read_place(folder)
+    checks.warn_several(folder, len(others) + 1, len(images))
     return Cameras(
         labels=labels,
         centres=checks.centres(rotations, poses[:, 4:]) + offset,
         rotations=rotations,
         lenses=tuple(lenses[image.camera] for image in images),
         crs=crs,
-        notes=(checks.several(folder, len(others) + 1, len(images)),) if others else (),
-        source="COLMAP",
     )
 
 
@@ -92,7 +84,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     camera = np.repeat(np.arange(len(cameras)), [len(image.seen) for image in images])
     xyz = xyz + read_place(listed.parent)[0]
     row = checks.rows_of(seen["point"], identifiers)
-    return checks.tie_points(checks.Seen(xyz, row, camera, seen["xy"]))
+    return checks.tie_points(checks.Observations(xyz, row, camera, seen["xy"]))
 
 
 def _models_at(path: Path) -> list[Path]:
@@ -101,19 +93,17 @@ def _models_at(path: Path) -> list[Path]:
         part = _PART.fullmatch(path.name)
         listed = path.with_name(f"cameras.{part[2] if part else ''}")
         return [listed] if _is_model(listed) else []
-    for folder in (path, path / "sparse"):
-        inside = folder.iterdir() if folder.is_dir() else ()
-        for folders in ([folder], [one for one in inside if one.name.isdecimal()]):
-            lists = ([one / "cameras.bin", one / "cameras.txt"] for one in folders)
-            found = [found for two in lists if (found := next(filter(_is_model, two), None))]
-            if found:
-                size = {one: one.with_stem("images").stat().st_size for one in found}
-                return sorted(found, key=lambda one: (-size[one], one.parent.name))
+    for folders in ([path], path.glob("[0-9]*"), [path / "sparse"], path.glob("sparse/[0-9]*")):
+        lists = ([one / "cameras.bin", one / "cameras.txt"] for one in folders)
+        found = [found for two in lists if (found := next(filter(_is_model, two), None))]
+        if found:
+            size = {one: one.with_stem("images").stat().st_size for one in found}
+            return sorted(found, key=lambda one: (-size[one], one.parent.name))
     return []
 
 
 def _is_model(listed: Path) -> bool:
-    """Whether there is a list of cameras, and one of images next to it."""
+    """Whether there are a list of cameras and one of images."""
     if not (listed.is_file() and listed.with_stem("images").is_file()):
         return False
     with listed.open(encoding="utf-8-sig", errors="replace") as stream:
@@ -124,13 +114,11 @@ def read_place(folder: Path) -> tuple[FloatArray, str | None]:
     """Return the offset of a model's positions and their CRS, from pcfix's file next to it."""
     path = folder / FILE
     with checks.reading(path):
-        found = checks.load_json(path) if path.is_file() else None
-        if not isinstance(found, dict) or found.get("written_by") != WRITER:
+        found = checks.load_json(path) if path.is_file() else {}
+        if found.get("written_by") != WRITER:
             return np.zeros(3), None
         offset, crs = checks.triple(found["offset_m"]), found["crs"]
-        if not np.isfinite(offset).all() or not isinstance(crs, str | None):
-            raise checks.damaged(path, "it needs offset_m, three numbers, and crs")
-    return offset, crs if crs is None or is_topocentric(crs) else checks.crs(path, crs)
+        return offset, crs if crs is None or is_topocentric(crs) else checks.crs(path, crs)
 
 
 def place_text(offset_m: FloatArray, crs: str | None) -> str:
@@ -139,8 +127,6 @@ def place_text(offset_m: FloatArray, crs: str | None) -> str:
     return json.dumps(place, indent=2) + "\n"
 
 
-_SMALLEST_OMEGA = 1e-6
-"""Below, in radians, the FOV model is a perspective one to double precision."""
 BY_NAME = {
     "SIMPLE_PINHOLE": LensModel("f cx cy"),
     "PINHOLE": LensModel("fx fy cx cy"),
@@ -178,10 +164,8 @@ def lens_of(path: Path, identifier: int, camera: Camera) -> Lens:
     if model.projection is None:
         raise _no_model(path, identifier, name)
     given = dict(zip(model.names.split(), values, strict=True))
-    is_straight = model.projection == "fov" and abs(given["omega"]) < _SMALLEST_OMEGA
-    projection = "perspective" if is_straight else model.projection
-    more = {"projection": projection, "in_turn": model.in_turn, "sensor": f"{identifier} {name}"}
-    return lens_by_name(given, width, height, **more)
+    more = {"in_turn": model.in_turn, "sensor": f"{identifier} {name}"}
+    return lens_by_name(given, width, height, projection=model.projection, **more)
 
 
 def _no_model(path: Path, camera: object, model: object) -> InputError:
@@ -207,8 +191,6 @@ OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _COUNT, _CAMERA, _IMAGE = struct.Struct("<Q"), struct.Struct("<IiQQ"), struct.Struct("<I7dI")
 _POINT, _VIEW_BYTES = struct.Struct("<Q3d11xQ"), 8
 """Of a point its number, place and count of views, without colour and error."""
-_STATED = re.compile(r"^#.*Number of (?:cameras|images|points): (\d{1,15})\b", re.MULTILINE)
-_HEAD_CHARACTERS = 4096
 
 
 def _take(file: mmap.mmap, form: struct.Struct) -> tuple[Any, ...]:
@@ -228,14 +210,6 @@ def _lines(path: Path) -> Iterator[str]:
         for line in stream:
             if not line.lstrip().startswith("#"):
                 yield line.strip()
-
-
-def _check_count(path: Path, rows: int) -> None:
-    """Refuse a text that has fewer rows than its comments announce."""
-    with path.open(encoding="utf-8-sig", errors="replace") as stream:
-        stated = _STATED.search(stream.read(_HEAD_CHARACTERS))
-    if stated and rows < int(stated[1]):
-        raise damaged(path, f"{rows:,} rows instead of {int(stated[1]):,}")
 
 
 def read_list(path: Path) -> dict[int, Camera]:
@@ -259,7 +233,6 @@ def read_list(path: Path) -> dict[int, Camera]:
             if len(numbers) != len(BY_NAME[model].names.split()):
                 raise damaged(path, f"camera {name}: {len(numbers)} parameters of {model}")
             cameras[int(name)] = model, width, height, tuple(numbers)
-        _check_count(path, len(cameras))
     return cameras
 
 
@@ -293,7 +266,6 @@ def read_images(path: Path, *, points: bool) -> list[Image]:
             seen = np.empty(len(rows), OBSERVATION)
             seen["xy"], seen["point"] = rows[:, :2], rows[:, 2]
             images.append(Image(int(identifier), tuple(map(float, pose)), int(camera), name, seen))
-        _check_count(path, len(images))
         return images
 
 
@@ -302,7 +274,6 @@ def read_points(path: Path) -> tuple[IntArray, FloatArray]:
     with checks.reading(path):
         if path.suffix != ".bin":
             lines = [line.split(None, 4)[:4] for line in _lines(path) if line]
-            _check_count(path, len(lines))
             values = np.array([line[1:] for line in lines], float).reshape(-1, 3)
             return np.array([int(line[0]) for line in lines], np.int64), values
         data, at, rows = _open(path), _COUNT.size, []
@@ -317,7 +288,7 @@ def read_points(path: Path) -> tuple[IntArray, FloatArray]:
 
 
 WRITTEN = {k: model for k, model in BY_NAME.items() if k not in ("SIMPLE_FISHEYE", "FISHEYE")}
-"""Without the two for which older versions of COLMAP have one that does the same."""
+"""Models that are written: older versions of COLMAP do not know the two others."""
 GREY = (128, 128, 128)
 ROUND_M = 100.0
 
@@ -328,7 +299,7 @@ def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = 
     Parameters
     ----------
     folder : path
-        Made if need be.
+        Created if it does not exist.
     cameras : Cameras
         With rotations and lenses in pixels.
     tie_points : TiePoints, optional
@@ -338,59 +309,45 @@ def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = 
 
     target = Path(folder)
     rotations, lenses = checks.block_to_write(target, cameras)
-    for label in cameras.labels:  # of other names a file would cut off a part
+    for label in cameras.labels:  # the format would cut other names
         if not label == label.strip() != "" or {"\0", "\n"} & {*label}:
             sentence = f"the format cannot hold the image name {label!r}. Rename the image."
             raise bad_file(target, "output.label", sentence, image=label)
     middle = np.median(cameras.centres, axis=0)
-    middle[2] = 0.0  # heights are small, and easier to read as they are
+    middle[2] = 0.0  # heights are small numbers
     offset = np.round(middle / ROUND_M) * ROUND_M
-    distinct = list(dict.fromkeys(lenses))
-    number = {lens: i for i, lens in enumerate(distinct, start=1)}
-    nothing = Views(np.zeros(1, np.int64), np.empty(0, np.int64))
-    ties = tie_points or TiePoints(np.empty((0, 3)), nothing, np.empty((0, 2)))
-    counts = np.diff(ties.views.start)
-    used = np.isfinite(ties.xyz).all(axis=1) & (counts > 0)
-    of_used = np.repeat(used, counts)
-    camera = ties.views.camera[of_used]
-    order = np.argsort(camera, kind="stable")  # COLMAP lists the image points image by image
-    seen = np.empty(len(camera), OBSERVATION)
-    seen["xy"] = ties.image_xy[of_used][order]
-    seen["point"] = np.repeat(np.cumsum(used), counts)[of_used][order]
-    start = np.concatenate([[0], np.cumsum(np.bincount(camera, minlength=len(cameras)))])
-    listed = [struct.pack("<Q", len(distinct))]
-    for i, lens in enumerate(distinct, start=1):
+    # COLMAP lists observations by image, and in tracks as number of the image and place in its list
+    seen: list[list[tuple[list[float], int]]] = [[] for _ in cameras.labels]
+    points = list[bytes]()
+    if tie_points is not None:
+        xyz, start = tie_points.xyz - offset, tie_points.views.start
+        for row in np.flatnonzero(np.isfinite(xyz).all(axis=1) & (np.diff(start) > 0)).tolist():
+            views, track = slice(*start[row : row + 2]), list[int]()
+            number = len(points) + 1
+            images = tie_points.views.camera[views].tolist()
+            for image, uv in zip(images, tie_points.image_xy[views].tolist(), strict=True):
+                track += [image + 1, len(seen[image])]
+                seen[image].append((uv, number))
+            head = struct.pack("<Q3d3BdQ", number, *xyz[row], *GREY, 0.0, len(images))
+            points.append(head + struct.pack(f"<{len(track)}I", *track))
+    number_of = {lens: i for i, lens in enumerate(dict.fromkeys(lenses), start=1)}
+    listed = list[bytes]()
+    for lens, i in number_of.items():
         model, values = model_of(target, lens, WRITTEN, whole=True)
         size = int(lens.width), int(lens.height)
         listed.append(struct.pack("<IiQQ", i, MODELS.index(model), *size))
         listed.append(np.array([*values.values()], "<f8").tobytes())
     turns = np.roll(Rotation.from_matrix(rotations).as_quat(canonical=True), 1, axis=1)
     shifts = -np.einsum("kij,kj->ki", rotations, cameras.centres - offset)
-    images = [struct.pack("<Q", len(cameras))]
-    for i, (label, one) in enumerate(zip(cameras.labels, lenses, strict=True)):
-        first, last = start[i : i + 2]
-        images.append(struct.pack("<I7dI", i + 1, *turns[i], *shifts[i], number[one]))
-        images.append(label.encode() + b"\0" + struct.pack("<Q", last - first))
-        images.append(seen[first:last].tobytes())
+    posed = list[bytes]()
+    for i, (label, lens) in enumerate(zip(cameras.labels, lenses, strict=True)):
+        posed.append(struct.pack("<I7dI", i + 1, *turns[i], *shifts[i], number_of[lens]))
+        posed.append(label.encode() + b"\0" + struct.pack("<Q", len(seen[i])))
+        posed.append(np.array(seen[i], OBSERVATION).tobytes())
     contents = {
-        "cameras.bin": b"".join(listed),
-        "images.bin": b"".join(images),
-        "points3D.bin": _points(ties.xyz[used] - offset, seen["point"], start),
+        "cameras.bin": struct.pack("<Q", len(number_of)) + b"".join(listed),
+        "images.bin": struct.pack("<Q", len(cameras)) + b"".join(posed),
+        "points3D.bin": struct.pack("<Q", len(points)) + b"".join(points),
         FILE: place_text(offset, cameras.crs).encode(),
     }
     checks.write_new(target, contents)
-
-
-def _points(xyz: FloatArray, point: IntArray, image_start: IntArray) -> bytes:
-    """Return the points, each with image number and number in the image of its views; no errors."""
-    image = np.repeat(np.arange(len(image_start) - 1), np.diff(image_start))
-    within = np.arange(len(image)) - image_start[image]
-    order = np.argsort(point, kind="stable")
-    views = np.column_stack([image + 1, within])[order].astype("<u4")
-    start = np.cumsum(np.bincount(point, minlength=len(xyz) + 1))
-    parts = [struct.pack("<Q", len(xyz))]
-    for i, place in enumerate(xyz):
-        first, last = start[i : i + 2]
-        parts.append(struct.pack("<Q3d3BdQ", i + 1, *place, *GREY, 0.0, last - first))
-        parts.append(views[first:last].tobytes())
-    return b"".join(parts)

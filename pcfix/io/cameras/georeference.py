@@ -1,20 +1,18 @@
-"""From the frame of a camera file into the cloud's CRS.
+"""Transform cameras from the frame of their file to the cloud's CRS.
 
-Centres go through PROJ, point by point. A rotation is taken over at its own centre: the directions
-one metre along the source's axes become three vectors in the target, and the rotation next to them
-turns the camera. That is the meridian convergence between maps, and all of the rotation from
-geocentric or topocentric axes. What it cannot hold is the scale of the map against that of the
-heights, 0.9996 on the central meridian of UTM: points 100 m below are up to that part of their
-distance from the principal point elsewhere in the image, 0.8 px at the edge of 4000 px. A cloud
-in map coordinates has the same flaw.
+PROJ transforms every centre. A rotation is transformed at its own centre: steps along the source's
+axes become three vectors in the target, and the closest rotation turns the camera. This includes
+the meridian convergence between maps, and geocentric or topocentric axes. It excludes the scale of
+the map, 0.9996 on the central meridian of UTM, which heights do not have: 0.8 px at the edge of an
+image of 4000 px. A cloud in map coordinates has the same error.
 
-Heights are shifted only where both sides state what theirs are. Otherwise they do not change:
-ellipsoidal ones remain ellipsoidal, whatever the cloud's datum is.
+Heights are transformed only if both sides state their vertical datum. Otherwise they do not change.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -23,23 +21,23 @@ import numpy as np
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io import crs as systems
 from pcfix.io.cameras.checks import note
-from pcfix.io.cameras.mistakes import UNDULATION_M
 from pcfix.model import Cameras, FloatArray
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
-CENTRE_DISTANCE_M = (6.2e6, 7.0e6)
-"""Cameras are at no other distance from the centre of the earth."""
+LARGEST_DEG = 360.0 + 1e-6
 STEP_M, EARTH_RADIUS_M = 10.0, 6.4e6
 """About half the distance over which directions are compared."""
+LEAST_UNDULATION_M = 15.0
+"""Difference from the GNSS above which heights above ellipsoid and geoid are likely mixed."""
 
 
 class Frame(NamedTuple):
     """A frame that is tied to the earth.
 
-    `enter` takes points (n, 3) of it to `crs`, which is not geocentric, and is the frame itself
-    where it is `direct`. A `topocentric` one has axes east, north, up at a place.
+    `enter` transforms points (n, 3) to `crs`, which is not geocentric. In a `direct` frame they are
+    in `crs` already. A `topocentric` frame has axes east, north, up at a place.
     """
 
     crs: CRS
@@ -48,22 +46,18 @@ class Frame(NamedTuple):
     topocentric: bool = False
 
     def check(self, xyz: FloatArray, labels: Sequence[str], name: str) -> None:
-        """Raise InputError for numbers that are no place on the earth."""
+        """Raise InputError for numbers that are not on the earth."""
         if self.topocentric or self.crs.is_projected:
             return
-        if self.direct:
-            code, kind = "cameras.degrees", "longitude and latitude"
-            turn = 2.0 * np.pi / systems.plan_unit(self.crs)[1] * (1.0 + 1e-9)
-            bad = (np.abs(xyz[:, :2]) > [turn, turn / 4.0]).any(axis=1)
-        else:
+        code, kind = "cameras.degrees", "longitude and latitude"
+        bad = (np.abs(xyz[:, :2]) > [LARGEST_DEG, LARGEST_DEG / 4.0]).any(axis=1)
+        if not self.direct:
             code, kind = "cameras.geocentric", "geocentric coordinates"
-            radius, (least, most) = np.linalg.norm(xyz, axis=1), CENTRE_DISTANCE_M
-            bad = ~((radius > least) & (radius < most))
+            bad = np.abs(np.linalg.norm(xyz, axis=1) - EARTH_RADIUS_M) > 0.6e6
         if bad.any():
-            i = int(np.argmax(bad))
-            numbers = ", ".join(f"{number:.10g}" for number in xyz[i])
-            sentence = f"image {labels[i]}: {numbers} are not {kind}. Give --cameras-crs."
-            raise bad_file(name, code, sentence, image=labels[i], crs=self.crs.name)
+            label = labels[int(np.argmax(bad))]
+            sentence = f"the coordinates of image {label} are not {kind}. Give --cameras-crs."
+            raise bad_file(name, code, sentence, image=label, crs=self.crs.name)
 
 
 def frame_of(text: str, name: str) -> Frame:
@@ -106,11 +100,11 @@ class Georeference:
     offset: FloatArray  # (3,), added to points of the file first
     crs: str | None  # of the result, as in `Cameras.crs`
     notes: tuple[PcfixWarning, ...] = ()
-    frame: Frame | None = None  # of the file; None where the numbers are used as they are
+    frame: Frame | None = None  # of the file; None if the numbers do not change
     forward: systems.Points = lambda xyz: xyz
 
     def cameras(self, cameras: Cameras) -> Cameras:
-        """Return the cameras with centres and rotations there; `gnss` stays in its own CRS."""
+        """Return the cameras in the target; `gnss` stays in its own CRS."""
         centres, rotations = self.points(cameras.centres), cameras.rotations
         lost = ~np.isfinite(centres).all(axis=1)
         if lost.any():
@@ -120,25 +114,24 @@ class Georeference:
             sentence += f" {systems.shortened(self.crs or '')}. Check --cameras-crs."
             raise bad_file(self.name, "cameras.not_transformed", sentence, image=cameras.labels[i])
         if rotations is not None and self.frame is not None:
-            rotations = rotations @ self.turns(cameras.centres).transpose(0, 2, 1)
+            turns = self._turns(self.frame, cameras.centres + self.offset)
+            rotations = rotations @ turns.transpose(0, 2, 1)
         found = replace(cameras, centres=centres, rotations=rotations, crs=self.crs)
         return replace(found, project_crs=None, notes=cameras.notes + self.notes)
 
     def points(self, xyz: FloatArray) -> FloatArray:
-        """Return points (n, 3) there; NaN where one is not finite or has no place there."""
+        """Return points (n, 3) in the target; NaN for those that cannot be transformed."""
         return np.where(np.isfinite(found := self.forward(xyz + self.offset)), found, np.nan)
 
-    def turns(self, xyz: FloatArray) -> FloatArray:
+    def _turns(self, frame: Frame, at: FloatArray) -> FloatArray:
         """Return the rotations from the source's axes to the target's at points (n, 3)."""
-        if self.frame is None:
-            return np.broadcast_to(np.eye(3), (len(xyz), 3, 3))
-        crs, at, steps = self.frame.crs, xyz + self.offset, STEP_M * np.eye(3)
-        if self.frame.direct:  # about that many metres in the units of the axes
+        crs, steps = frame.crs, STEP_M * np.eye(3)
+        if frame.direct:  # about that many metres in the units of the axes
             unit = systems.plan_unit(crs)[1] * (EARTH_RADIUS_M if crs.is_geographic else 1.0)
             steps /= [unit, unit, abs(systems.metres_up(crs))]
         ahead, behind = (self.forward((at[:, None] + s).reshape(-1, 3)) for s in (steps, -steps))
         if not (np.isfinite(ahead).all() and np.isfinite(behind).all()):
-            return np.full((len(xyz), 3, 3), np.nan)
+            return np.full((len(at), 3, 3), np.nan)
         vectors = (ahead - behind).reshape(-1, 3, 3).transpose(0, 2, 1)
         if (np.linalg.det(vectors) < 0.0).any():
             sentence = f"the axes of {crs.name} are left-handed. Use another CRS."
@@ -162,22 +155,19 @@ def georeference(
     cameras : Cameras
         As a reader gave them, in the frame of their file.
     cloud_crs : str, CRS or None
-        Projected, in metres. None where the cloud names none: then they are brought to where
-        the software delivers clouds, mostly where the cameras are.
+        Projected, in metres. If it is None, the target is the CRS in which the software delivers
+        clouds, mostly that of the cameras.
     cameras_crs : str, optional
-        Overrides the CRS in the file. ``local``: the numbers are used as they are. A CRS without
-        heights states that these agree with the cloud's, and so does ``ENU:lat,lon,height``. For a
+        Overrides the CRS in the file. ``local``: the numbers do not change. A CRS without heights
+        states that these agree with the cloud's, and so does ``ENU:lat,lon,height``. For a
         file with geocentric positions it is the CRS in which its software delivers clouds, unless
         it is geocentric itself.
     offset_m : tuple of 3 float, optional
-        Added to the centres before all else, in the axes and the unit of the cameras' frame.
+        Added to the centres first, in the axes and the unit of the cameras' frame.
     name : str
-        What is being read, for messages.
+        Of the file, for messages.
     """
-    offset = np.zeros(3) if offset_m is None else np.asarray(offset_m, np.float64)
-    if offset.shape != (3,) or not np.isfinite(offset).all():
-        sentence = f"the offset {offset_m} is not three numbers. Give x, y, z."
-        raise bad_file(name, "cameras.offset", sentence, value=offset_m)
+    offset = np.zeros(3) if offset_m is None else np.array(offset_m, np.float64)
     cloud = None if cloud_crs is None else systems.parse_crs(cloud_crs, "the cloud")
     # the frame of the cameras, and the CRS in which their software delivers clouds
     stated, project, given = cameras.crs, _on_earth(cameras.project_crs, name), cameras_crs or ""
@@ -237,17 +227,14 @@ def _into(
     crs = systems.crs_text(target)
     own, there = systems.heights_of(frame.crs), systems.heights_of(target)
     unit, size = systems.plan_unit(frame.crs)
-    axes = [e.semi_major_metre for e in (frame.crs.ellipsoid, target.ellipsoid) if e is not None]
-    other_datum = bool(axes) and max(axes) - min(axes) > 1.0
-    is_guess = other_datum or (project is None and not frame.topocentric)
+    is_guess = project is None and not frame.topocentric
     assumed = ""
     if own == "unstated" and frame.crs.is_projected and size != 1.0:
         assumed = f"heights are assumed to be in {unit}, like x and y"
     elif own == "unstated" != there and not trusted:
         assumed = f"names no vertical datum; that of the cloud is assumed ({target.name})"
     elif own == "ellipsoidal" and there == "unstated" and is_guess and not trusted:
-        words = "names no vertical datum; ellipsoidal is assumed"
-        assumed = f"the cloud's CRS ({target.name}) {words}"
+        assumed = f"the cloud's CRS ({target.name}) names no vertical datum; ellipsoidal is assumed"
     notes = (note(name, "cameras.heights_assumed", f"{assumed}."),) if assumed else ()
     by_user = trusted and not frame.direct
     heights = not (by_user or systems.heights_agree(frame.crs, target))
@@ -265,7 +252,7 @@ def _into(
     if by_user and not frame.topocentric and systems.heights_of(target) == "gravity":
         up = adjusted_minus_gnss(found.cameras(cameras), name)[0][:, 2]
         off = float(np.median(up[np.isfinite(up)])) if np.isfinite(up).any() else 0.0
-        if abs(off) >= UNDULATION_M[0]:
+        if abs(off) >= LEAST_UNDULATION_M:
             side = "above" if off > 0.0 else "below"
             sentence = f"with the heights of --cameras-crs the cameras are {abs(off):.1f} m {side}"
             sentence += " their GNSS positions. Install the grid of the geoid instead."
@@ -275,18 +262,11 @@ def _into(
 
 
 def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatArray, str]:
-    """Return how far the adjusted centres are from where the GNSS stated that they were.
+    """Return adjusted centres minus GNSS positions, and the reason why some are not compared.
 
-    That is metres along the axes of the cameras' map, or east, north, up where they are in none,
-    shape (k, 3); NaN where a camera has no position, and where the two cannot be compared, which is
-    often so of heights. The text is the reason why they cannot.
-
-    Parameters
-    ----------
-    cameras : Cameras
-        As read or in the cloud's CRS.
-    name : str
-        Of their file, for messages.
+    The differences, shape (k, 3), are metres along the axes of the cameras' map, or else east,
+    north, up. They are NaN for cameras without a position, and if the two cannot be compared, which
+    often holds for heights. The cameras are as read or in the cloud's CRS; `name` is their file.
     """
     found = np.full((len(cameras), 3), np.nan)
     if cameras.gnss is None:
@@ -323,3 +303,76 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatA
         off[:, :2] = np.column_stack([metres * np.sin(azimuth), metres * np.cos(azimuth)])
     found[rows] = off * [1.0, 1.0, np.nan] if reason else off
     return found, reason
+
+
+# ---- cameras that are not over their cloud ----
+
+
+FOOT_M = 0.3048
+MARGIN_M = 100.0
+"""Distance from the cloud, beyond half of its sides, at which a block can still belong to it."""
+ABSURD_HEIGHTS = 3.0
+"""Largest height of cameras above the cloud, in widths of the cloud."""
+_SAMPLE = 200
+
+
+def likely_mistake(
+    centres: FloatArray, low: FloatArray, high: FloatArray, cloud_crs: str | CRS | None
+) -> str | None:
+    """Return what is likely wrong if a block does not match its cloud; None if it does.
+
+    Parameters
+    ----------
+    centres : array, shape (k, 3)
+        Projection centres, assumed to be in the cloud's CRS.
+    low, high : array, shape (3,)
+        Corners of the cloud, metres.
+    cloud_crs : str, CRS or None
+    """
+    centres = centres[:: max(1, len(centres) // _SAMPLE)]
+    width, margin = max((high - low)[:2].max(), MARGIN_M), 0.5 * (high - low)[:2] + MARGIN_M
+    middle = np.median(centres, axis=0)
+
+    def is_over(moved: FloatArray) -> bool:
+        """Whether the middle of a block is over the cloud, or not far from it."""
+        x, y = np.median(moved[:, :2], axis=0)
+        return bool((([x, y] >= low[:2] - margin) & ([x, y] <= high[:2] + margin)).all())
+
+    if is_over(centres):
+        if low[2] <= middle[2] <= high[2] + ABSURD_HEIGHTS * width:
+            return None
+        what = f"{middle[2] - high[2]:.0f} m above the cloud, which is {width:.0f} m wide"
+        if middle[2] < low[2]:
+            what = f"{low[2] - middle[2]:.0f} m below the lowest point of the cloud"
+        why = "check the unit and the vertical datum of both, or see --cameras-offset"
+        return f"The cameras are {what}: {why}."
+    for words, moved in _readings(centres, cloud_crs):
+        if is_over(moved):
+            return f"The cameras would be over the cloud {words}."
+    x, y = (low + high)[:2] / 2.0 - middle[:2]
+    away = float(np.hypot(x, y))
+    far = f"{away / 1000.0:,.1f} km" if away >= 1e4 else f"{away:.0f} m"
+    advice = f"check the CRS of both, or give an offset of {x:.0f}, {y:.0f} m by --cameras-offset"
+    return f"The cameras are {far} from the cloud in plan; {advice}."
+
+
+def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str, FloatArray]]:
+    """Yield other meanings of the numbers, the simplest first; to the metre or so."""
+    from pyproj import Transformer
+    from pyproj.exceptions import ProjError
+
+    yield "with x and y exchanged: their axes are likely swapped", centres[:, [1, 0, 2]]
+    yield "multiplied by 0.3048: they are likely in feet, it in metres", centres * FOOT_M
+    yield "divided by 0.3048: they are likely in metres, it in feet", centres / FOOT_M
+    plan = None if crs is None else systems.parts(systems.parse_crs(crs, "the cloud"))[0]
+    if plan is None or not plan.is_projected:
+        return
+    own = plan.utm_zone
+    codes = [("longitude and latitude in degrees", 4326), ("web Mercator", 3857)]
+    for zone in [(int(own[:-1]) + step - 1) % 60 + 1 for step in (0, -1, 1)] if own else []:
+        codes += [(f"UTM zone {zone}N", 32600 + zone), (f"UTM zone {zone}S", 32700 + zone)]
+    for words, code in codes:
+        with suppress(ProjError):  # of a CRS that is not a single map, such as EPSG:32600
+            to_cloud = Transformer.from_crs(code, plan, always_xy=True)
+            moved = np.column_stack(to_cloud.transform(centres[:, 0], centres[:, 1]))
+            yield f"read as {words}; set it with --cameras-crs EPSG:{code}", moved

@@ -34,7 +34,7 @@ class LensModel(NamedTuple):
     """A model of a package: the names of its parameters, in the order of its files."""
 
     names: str
-    projection: Projection | None = "perspective"  # None where it is no lens, but a panorama
+    projection: Projection | None = "perspective"  # None for a panorama, which is no lens
     in_turn: bool = False
 
 
@@ -58,21 +58,11 @@ def lens_by_name(given: Mapping[str, float], width: float, height: float, **more
 
 
 def model_of(
-    path: Path,
-    lens: Lens,
-    models: Mapping[str, LensModel],
-    *,
-    unit: str = "px",
-    whole: bool = False,
+    path: Path, lens: Lens, models: Mapping[str, LensModel], *, whole: bool = False
 ) -> tuple[str, dict[str, float]]:
     """Return the simplest model that is exactly this lens, and its parameters in their order.
 
-    With `whole` the sides of the frame must be whole numbers.
-
-    Raises
-    ------
-    InputError
-        Where there is none; `path` is what should be written.
+    With `whole` the frame must be whole pixels. An `InputError` if there is no model for `path`.
     """
     terms = {
         f"{letter}{i}": value
@@ -94,7 +84,7 @@ def model_of(
     }
     needed = {name for name, value in (terms | unlike_plain).items() if value}
     turns = any((*lens.tangential, *lens.thin_prism))
-    fits = lens.unit == unit and not (whole and (lens.width % 1.0 or lens.height % 1.0))
+    fits = not whole or (lens.unit == "px" and lens.width % 1.0 == lens.height % 1.0 == 0.0)
     for name in sorted(models, key=lambda one: models[one].names.count(" ")) if fits else ():
         model, names = models[name], models[name].names.split()
         is_alike = model.projection == lens.projection

@@ -1,15 +1,14 @@
-"""Agisoft Metashape and PhotoScan: exported cameras or markers, and whole projects.
+"""Agisoft Metashape and PhotoScan: exported cameras or markers, and projects.
 
 Read are the XML of *Export Cameras* and *Export Markers*, projects of one file (.psz, a zip) and
 projects with a folder (.psx, whose documents are zips in ``<name>.files``).
 
-Convention. ``camera/transform`` is a 4x4 matrix from the camera (x right, y down, z forward) to the
-chunk, whose origin, axes and scale mean nothing. The ``transform`` of the camera's component, or of
-the chunk, leads on to the world as s R X + t. With a CRS in ``reference`` the world is geocentric,
-on the datum of that CRS, whatever its kind, with ellipsoidal heights. With ``LOCAL_CS``, or no
-transform, it is local. The image of a slave camera (``master_id``) has the pose T_master [R, t],
-with the rotation and location of its sensor in the master's frame, t in the unit of the chunk. EXIF
-orientations turn only what is displayed: matrices and pixels are those of the image as stored.
+``camera/transform`` is a 4x4 matrix from the camera (x right, y down, z forward) to the chunk. The
+``transform`` of the camera's component, or of the chunk, leads on to the world as s R X + t. With
+a CRS in ``reference`` the world is geocentric, on the datum of that CRS, with ellipsoidal heights.
+With ``LOCAL_CS``, or no transform, it is local. The image of a slave camera (``master_id``) has the
+pose T_master [R, t], with the rotation and location of its sensor in the master's frame. EXIF
+orientations are ignored: matrices and pixels are those of the image as stored.
 
 The tie points of a frame are PLY files in one archive: ``points`` has x, y, z in the frame of the
 component and the id of the track, ``projections`` of each camera x and y in pixels from the corner
@@ -19,8 +18,7 @@ positions are the ``reference`` of each camera, in the CRS of the cameras or of 
 
 Calibration. The formula is that of `pcfix.model.Lens`, with cx and cy from the centre of the image.
 A fisheye is equidistant, and since version 2.3 can be equisolid. Files of PhotoScan up to 1.2 can
-have fx and fy instead of f (the version of the document does not show it): there cx and cy count
-from the corner, and p1 and p2 change places.
+have fx and fy instead of f: there cx and cy count from the corner, and p1 and p2 change places.
 
 References: "Agisoft Metashape User Manual, Professional Edition", appendix "Camera models";
 "Metashape Python Reference", Chunk.transform, Sensor.location, CoordinateSystem.geoccs;
@@ -40,9 +38,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning, bad_file
+from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Source, damaged, note, number, numbers, read_xml, text_of
+from pcfix.io.cameras.checks import Source, damaged, number, numbers, read_xml, text_of, warn
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.crs import LOCAL, crs_text, is_local, parse_crs, shortened, unbound
 from pcfix.io.ply import parse_header
@@ -72,16 +70,11 @@ CONTENT = re.compile(  # a project, chunks or a chunk, after the declaration and
 def read(source: Source) -> Cameras:
     """Read the aligned images of a chunk: geocentric, or in a ``local`` frame."""
     chunk = open_chunk(source.path)
-    images, unposed, notes = aligned_images(chunk)
+    images, unposed = aligned_images(chunk)
     crs, project_crs = _world(chunk)
-    gnss, of_gnss = _gnss_positions(chunk, images)
     in_world = np.array([image.place @ image.pose for image in images])
     scales = np.cbrt(np.linalg.det(in_world[:, :3, :3]))[:, None, None]
-    lenses: dict[Element, Lens] = {}
-    for image in images:
-        if image.sensor not in lenses:
-            lenses[image.sensor], of_lens = _lens(chunk.path, image.sensor, image.label)
-            notes += of_lens
+    lenses = {one: _lens(chunk.path, one) for one in dict.fromkeys(i.sensor for i in images)}
     return Cameras(
         labels=tuple(image.label for image in images),
         centres=in_world[:, :3, 3],
@@ -89,10 +82,8 @@ def read(source: Source) -> Cameras:
         lenses=tuple(lenses[image.sensor] for image in images),
         crs=crs,
         project_crs=project_crs,
-        gnss=gnss,
+        gnss=_gnss_positions(chunk, images),
         unposed=unposed,
-        notes=(*chunk.notes, *notes, *of_gnss),
-        source=chunk.software,
     )
 
 
@@ -100,12 +91,10 @@ def read(source: Source) -> Cameras:
 
 
 class Document(NamedTuple):
-    """An element, and the file or archive that contains it; of a chunk also what wrote it."""
+    """An element, and the file or archive that contains it."""
 
     root: Element
     path: Path
-    software: str = ""
-    notes: tuple[PcfixWarning, ...] = ()
 
     def path_to(self, element: Element) -> Path | None:
         """Return the archive that an element refers to; None if it has no path."""
@@ -130,37 +119,30 @@ class Document(NamedTuple):
 
 
 def open_chunk(path: Path) -> Document:
-    """Return the active chunk, or the first that has aligned images where that one has none."""
+    """Return the active chunk, or the first that has aligned images if that one has none."""
     named = path / "project.zip" if path.is_dir() else path
     top = Document(read_xml(named), named)
     if top.root.tag == "document" and (inside := top.root.get("path")):  # .psx: in its folder
         named = path.parent / inside.replace("{projectname}", path.stem)
         top = Document(read_xml(named), named)
-    chosen = top
-    notes: tuple[PcfixWarning, ...] = ()
-    if top.root.tag != "chunk":
-        parent = top.root.find("chunks")
-        active = None if parent is None else parent.get("active_id")
-        listed = top.root.findall("chunk") or top.root.findall("chunks/chunk")
-        listed.sort(key=lambda chunk: chunk.get("id") != active)
-        found = [top.follow(chunk) for chunk in listed]
-        posed = [one for one in found if one.root.find("cameras//camera/transform") is not None]
-        if not found:
-            raise checks.no_pose(path, "has no chunk")
-        chosen, *others = posed or found[:1]
-        if others:
-            names = [one.root.get("label") or "without a name" for one in (chosen, *others)]
-            sentence = f"several chunks have aligned images; {names[0]} is read. Activate another"
-            values = {"chunk": names[0], "others": names[1:]}
-            notes = (note(path, "cameras.several_chunks", f"{sentence} for that.", **values),)
-    about = top.properties("meta") | chosen.properties("meta")
-    software = about.get("Info/OriginalSoftwareName", "Agisoft Metashape")
-    original = about.get("Info/OriginalSoftwareVersion", "")
-    version = about.get("Info/LastSavedSoftwareVersion") or original
-    return chosen._replace(software=f"{software} {version}".strip(), notes=notes)
+    if top.root.tag == "chunk":
+        return top
+    parent = top.root.find("chunks")
+    active = None if parent is None else parent.get("active_id")
+    listed = top.root.findall("chunk") or top.root.findall("chunks/chunk")
+    listed.sort(key=lambda chunk: chunk.get("id") != active)
+    found = [top.follow(chunk) for chunk in listed]
+    posed = [one for one in found if one.root.find("cameras//camera/transform") is not None]
+    if not found:
+        raise checks.no_pose(path)
+    names = [name_of(one.root) for one in posed]
+    if len(names) > 1:
+        sentence = f"several chunks have aligned images; the active one, {names[0]}, is read."
+        warn(path, "cameras.several_chunks", sentence, chunk=names[0], others=names[1:])
+    return (posed or found)[0]
 
 
-# ---- images and their places ----
+# ---- images ----
 
 
 class Image(NamedTuple):
@@ -178,22 +160,15 @@ class Image(NamedTuple):
     place: FloatArray
 
 
-def aligned_images(chunk: Document) -> tuple[list[Image], tuple[str, ...], list[PcfixWarning]]:
-    """Return the images of a chunk that are read, the names of all others, and notes.
+def aligned_images(chunk: Document) -> tuple[list[Image], tuple[str, ...]]:
+    """Return the images of a chunk that are read, and the names of all others.
 
     The others are not aligned, disabled (they took no part in the dense cloud), not of a central
-    projection, or in a component without a place in the frame of the others. Photos may be in
-    groups; keyframes of animations are none.
+    projection, or in a component without a transform. Keyframes of animations are no images.
     """
     path, element = chunk.path, chunk.root
     places, _ = _places(path, element)
     sensors = {sensor.get("id"): sensor for sensor in element.iterfind("sensors/sensor")}
-    homes: dict[str, str | None] = {  # the component of each image
-        number: component.get("id")
-        for component in element.iterfind("components/component")
-        for ids in component.iter("camera_ids")
-        for number in (ids.text or "").split()
-    }
     photos = {
         camera.get("id") or f"#{i}": camera
         for i, camera in enumerate(element.iterfind("cameras//camera"))
@@ -202,22 +177,21 @@ def aligned_images(chunk: Document) -> tuple[list[Image], tuple[str, ...], list[
     own = dict[str, FloatArray]()  # poses in the chunk
     for name, camera in photos.items():
         if text := text_of(camera, "transform"):
-            where = f"image {camera.get('label')}"
-            matrix = numbers(path, f"{where}, transform", text, 16).reshape(4, 4)
-            own[name] = _rigid(path, where, matrix[:3, :3], matrix[:3, 3])
+            where = f"image {name_of(camera)}, transform"
+            own[name] = numbers(path, where, text, 16).reshape(4, 4)
     images, others, unused = list[Image](), list[str](), 0
     for name, camera in photos.items():
-        label, master = camera.get("label") or f"number {name}", camera.get("master_id") or ""
-        home = camera.get("component_id") or homes.get(name) or homes.get(master)
-        homes[name] = home
+        label, master = name_of(camera), camera.get("master_id") or ""
+        home = camera.get("component_id") or photos.get(master, camera).get("component_id")
         place = places.get(home, places[None])
         sensor, pose = sensors.get(camera.get("sensor_id")), own.get(name)
         if pose is None and master in own and sensor is not None:  # its sensor is on the master
-            where = f"sensor {name_of(sensor)}"
-            rotation = text_of(sensor, "rotation") or "1 0 0 0 1 0 0 0 1"
-            shift = numbers(path, where, text_of(sensor, "location") or "0 0 0", 3)
-            turn = numbers(path, where, rotation, 9)
-            pose = own[master] @ _rigid(path, where, turn, shift)
+            where, turn = f"sensor {name_of(sensor)}", text_of(sensor, "rotation")
+            on_master = np.eye(4)
+            on_master[:3, 3] = numbers(path, where, text_of(sensor, "location") or "0 0 0", 3)
+            if turn:
+                on_master[:3, :3] = numbers(path, where, turn, 9).reshape(3, 3)
+            pose = own[master] @ on_master
         if pose is None:
             others.append(label)
         elif sensor is None:
@@ -229,41 +203,30 @@ def aligned_images(chunk: Document) -> tuple[list[Image], tuple[str, ...], list[
             images.append(Image(name, label, camera, sensor, home, pose, place))
     why = "disabled, not from a frame or fisheye sensor, or in a component without transform"
     if not images:
-        named = element.get("label") or "without a name"
-        reason = f"{len(others) - unused} are not aligned, {unused} {why}"
-        raise checks.no_pose(path, f"of the {len(photos)} images of chunk {named} {reason}")
-    left_out = note(path, "cameras.left_out", f"{unused} aligned images are skipped: {why}.")
-    return images, tuple(others), [left_out] if unused else []
-
-
-def _rigid(path: Path, where: str, rotation: FloatArray, shift: FloatArray) -> FloatArray:
-    """Return the 4x4 matrix of a rotation, rounded in the file, and a translation."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = checks.rotations(path, [where], rotation)[0]
-    matrix[:3, 3] = shift
-    return matrix
+        raise checks.no_pose(path, f"no image is aligned, or all are {why}")
+    if unused:
+        warn(path, "cameras.left_out", f"{unused} aligned images are skipped: {why}.")
+    return images, tuple(others)
 
 
 def _places(path: Path, chunk: Element) -> tuple[dict[str | None, FloatArray | None], bool]:
     """Return the matrix of each component to the world, or None, and whether any has one.
 
-    The key None is for images in no component. Every component has its own frame. One with a
-    transform has a place in the world; one without has that of the chunk when it is the active or
-    only one, as the chunk's transform is that of its active component. Where none has a place, the
-    world is the frame of the chunk.
+    The key None is for images in no component. Every component has its own frame and its own
+    transform; the active one can have that of the chunk. If none has a transform, the world is the
+    frame of the chunk.
     """
-    of_chunk = _similarity(path, chunk.find("transform"))
-    places: dict[str | None, FloatArray | None] = {
-        one.get("id"): _similarity(path, one.find("transform"))
-        for one in chunk.iterfind("components/component")
-    }
-    has_place = of_chunk is not None or any(place is not None for place in places.values())
+    places: dict[str | None, FloatArray | None]
+    places = {None: _similarity(path, chunk.find("transform"))}
+    for one in chunk.iterfind("components/component"):
+        places[one.get("id")] = _similarity(path, one.find("transform"))
+    has_place = any(place is not None for place in places.values())
+    if not has_place:
+        places[None] = np.eye(4)
     parent = chunk.find("components")
     active = None if parent is None else parent.get("active_id")
-    main = active if active in places else next(iter(places), None)
-    places[None] = of_chunk if has_place else np.eye(4)
-    if places[main] is None:
-        places[main] = places[None]
+    if places.get(active) is None:
+        places[active] = places[None]
     return places, has_place
 
 
@@ -312,19 +275,16 @@ def _world(chunk: Document) -> tuple[str, str | None]:
 def read_calibration(path: Path) -> Lens:
     """Read a calibration that Metashape saved on its own (root element ``calibration``), pixels."""
     root = read_xml(path)
-    if root.tag != "calibration":
-        sentence = f"is not a calibration of Metashape ({root.tag}). Save one from its Tools menu."
-        raise bad_file(path, "cameras.no_calibration", sentence)
-    kind = (root.findtext("projection") or "frame").strip()
-    if kind not in PROJECTIONS:
-        remedy = f"Use a lens of type {', '.join(PROJECTIONS)}"
-        raise checks.unsupported(path, f"the projection '{kind}'", remedy, model=kind)
+    kind = text_of(root, "projection") or "frame"
+    if root.tag != "calibration" or kind not in PROJECTIONS:
+        sentence = f"is not a calibration of Metashape of type {', '.join(PROJECTIONS)}."
+        raise bad_file(path, "cameras.no_calibration", sentence, tag=root.tag, model=kind)
     size = [number(path, side, root.findtext(side)) for side in ("width", "height")]
     return _calibrated(path, path.stem, kind, root, size)
 
 
 def name_of(element: Element) -> str:
-    """Return the label of a sensor or marker, or its number."""
+    """Return the label of an image, sensor or marker, or its number."""
     return element.get("label") or f"number {element.get('id')}"
 
 
@@ -341,24 +301,19 @@ def _kind(sensor: Element) -> str:
     return (found is not None and found.get("type")) or sensor.get("type") or "frame"
 
 
-def _lens(path: Path, sensor: Element, image: str) -> tuple[Lens, list[PcfixWarning]]:
-    """Return the adjusted calibration, else the initial one; and a note on what is ignored."""
+def _lens(path: Path, sensor: Element) -> Lens:
+    """Return the adjusted calibration, else the initial one."""
     label, found = name_of(sensor), _calibration(sensor)
     sizes = [one.find("resolution") for one in (found, sensor) if one is not None]
     resolution = next((one for one in sizes if one is not None), None)
     if resolution is None or found is None:
-        sentence = f"sensor {label} of {image} has no calibration or no size. Align the images."
-        raise bad_file(path, "cameras.no_calibration", sentence, sensor=label)
+        raise damaged(path, f"sensor {label} has no calibration or no size")
     sides = (resolution.get(side) for side in ("width", "height"))
     size = [number(path, f"sensor {label}, resolution", side) for side in sides]
-    lens = _calibrated(path, label, _kind(sensor), found, size)
-    coefficients = found.findtext("corrections/coeffs")
-    if not coefficients:
-        return lens, []
-    where, count = f"sensor {label}, corrections", len(coefficients.split())
-    rms_px = float(np.linalg.norm(numbers(path, where, coefficients, count)) / 2.0**0.5)
-    sentence = f"the additional corrections of {label} are ignored ({rms_px:.2f} px rms)."
-    return lens, [note(path, "cameras.corrections", sentence, sensor=label, rms_px=rms_px)]
+    if found.findtext("corrections/coeffs"):
+        sentence = f"the additional corrections of sensor {label} are ignored."
+        warn(path, "cameras.corrections", sentence, sensor=label)
+    return _calibrated(path, label, _kind(sensor), found, size)
 
 
 def _calibrated(
@@ -384,20 +339,16 @@ def _calibrated(
 # ---- what was measured ----
 
 
-def _gnss_positions(
-    chunk: Document, images: list[Image]
-) -> tuple[GnssPositions | None, list[PcfixWarning]]:
-    """Return the reference positions of images, and notes on them.
+def _gnss_positions(chunk: Document, images: list[Image]) -> GnssPositions | None:
+    """Return the reference positions of images.
 
-    Positions that the user unticked are no measurement and skipped, unless all are, as is usual
-    when only control points determine the block.
+    Positions that the user unticked are skipped, unless all are, as is usual when only control
+    points determine the block.
     """
     path, given = chunk.path, [image.element.find("reference") for image in images]
     stated = {i: one.attrib for i, one in enumerate(given) if one is not None}
     ticked = {i: of for i, of in stated.items() if of.get("enabled") != "false"}
-    settings = {
-        name.replace("/", "_"): value for name, value in chunk.properties("settings").items()
-    }
+    settings = chunk.properties("settings")
     names = {"sxyz": "accuracy_cameras", "sxy": "accuracy_cameras_xy", "sz": "accuracy_cameras_z"}
     of_all = {name: settings.get(one, "") for name, one in names.items()}
     start = spreads(path, "settings of the chunk", of_all, np.full(3, np.nan))
@@ -412,18 +363,19 @@ def _gnss_positions(
     crs = own or text_of(chunk.root, "reference") or "LOCAL"
     found = checks.measured(range(len(images)), places, crs)
     if found is None:
-        return None, []
+        return None
     if crs.upper() == "LOCAL" or is_local(parsed := parse_crs(crs, str(path))):
-        return replace(found, crs=LOCAL), []
+        return replace(found, crs=LOCAL)
     largest = np.nanmax(np.abs(found.xyz[:, :2]), axis=0)
     if own or parsed.is_geographic or (largest > [180.0, 90.0]).any():
-        return found, []
+        return found
     sentence = "the camera positions are degrees in a CRS in metres; WGS 84 is assumed."
-    return replace(found, crs="EPSG:4979"), [note(path, "cameras.gnss_in_degrees", sentence)]
+    warn(path, "cameras.gnss_in_degrees", sentence)
+    return replace(found, crs="EPSG:4979")
 
 
 def spreads(path: Path, where: str, stated: dict[str, str], start: FloatArray) -> FloatArray:
-    """Return `start` with what is stated, the widest first: one number for its axes, or each."""
+    """Return `start` with the stated standard deviations: one number for all axes, or for each."""
     sigma = start.copy()
     for name, axes in SPREADS.items():
         if text := stated.get(name):
@@ -433,7 +385,7 @@ def spreads(path: Path, where: str, stated: dict[str, str], start: FloatArray) -
 
 
 def measured_marks(frame: Document) -> Iterator[tuple[str, str, FloatArray]]:
-    """Yield marker, camera and image coordinates of what was measured, not computed."""
+    """Yield marker, camera and image coordinates, without those that Metashape computed."""
     for marker in frame.root.iterfind("markers//marker"):
         for mark in marker.iterfind("location"):
             if "false" not in (mark.get("pinned"), mark.get("valid")):
@@ -444,13 +396,12 @@ def measured_marks(frame: Document) -> Iterator[tuple[str, str, FloatArray]]:
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
-    """Read the tie points of a project, then the markers, with what was measured of them.
+    """Read the tie points of a project, then the markers with their measurements.
 
-    A marker has no position (NaN), as the file has only its surveyed coordinates. Projections
-    that Metashape itself computed are skipped.
+    A marker has no position (NaN), as the file has only its surveyed coordinates.
     """
     chunk = open_chunk(source.path)
-    images, frame, seen = aligned_images(chunk)[0], chunk.frame, list[checks.Seen]()
+    images, frame, found = aligned_images(chunk)[0], chunk.frame, list[checks.Observations]()
     if frame is not None:
         row_of = {image.id: i for i, image in enumerate(images)}
         marks = [mark for mark in measured_marks(frame) if mark[1] in row_of]
@@ -458,15 +409,15 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
         point = np.array([names[name] for name, _, _ in marks], np.int64)
         camera = np.array([row_of[one] for _, one, _ in marks], np.int64)
         uv = np.array([uv for _, _, uv in marks]).reshape(-1, 2)
-        markers = checks.Seen(np.full((len(names), 3), np.nan), point, camera, uv)
-        seen = [*_tie_points(frame, images), markers]
-    if not any(len(part.point) for part in seen):
+        markers = checks.Observations(np.full((len(names), 3), np.nan), point, camera, uv)
+        found = [*_tie_points(frame, images), markers]
+    if not any(len(part.point) for part in found):
         why = "only a project (.psx with its folder) or markers have any"
         raise checks.no_tie_points(chunk.path, why)
-    return checks.tie_points(*seen)
+    return checks.tie_points(*found)
 
 
-def _tie_points(frame: Document, images: list[Image]) -> Iterator[checks.Seen]:
+def _tie_points(frame: Document, images: list[Image]) -> Iterator[checks.Observations]:
     """Yield the points of every component that has a place; their archive may be missing."""
     clouds = (*frame.root.iterfind("point_cloud"), *frame.root.iterfind("tie_points"))
     there = [one for one in clouds if (path := frame.path_to(one)) is None or path.is_file()]
@@ -494,7 +445,7 @@ def _tie_points(frame: Document, images: list[Image]) -> Iterator[checks.Seen]:
             point = checks.rows_of(np.concatenate([of_track for _, of_track in marks]), tracks)
             camera = np.repeat(rows, [len(uv) for uv, _ in marks])
             uv = np.concatenate([uv for uv, _ in marks])
-            yield checks.Seen(xyz @ place[:3, :3].T + place[:3, 3], point, camera, uv)
+            yield checks.Observations(xyz @ place[:3, :3].T + place[:3, 3], point, camera, uv)
 
 
 def _vertices(archive: zipfile.ZipFile, name: str | None, axes: str) -> tuple[FloatArray, IntArray]:

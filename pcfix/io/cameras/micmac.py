@@ -2,32 +2,30 @@
 
 `Externe` has the projection centre (`Centre`) and the matrix camera to world as rows L1, L2, L3
 (`CodageMatr`); the camera is x right, y down, z forward. The interior orientation is `Interne` in
-the same file, or in the file that `FileInterne` names from the folder in which MicMac ran; it is
-looked for next to the orientation first. `OrIntImaM2C` is an affine map from the camera's pixels to
-those of a scaled image. The formats do not say whether pixels begin at the corner or the centre of
-the first; they are taken as they are. The files name no CRS.
+the same file, or in the file that `FileInterne` names. Scanned images, with an `OrIntImaM2C`, are
+refused. The format does not say whether pixels begin at the corner or the centre of the first, so
+nothing is added. The files name no CRS.
 
-An ideal position F (x, y) / z + PP, in pixels, goes through the distortion to the observed one
-(eConvApero_DistM2C), or the observed to the ideal one (eConvApero_DistC2M). Read are the formulas
-that `pcfix.model.Lens` holds exactly, d being the distance from the centre of distortion: none;
-radial, d (k1 d^2 + k2 d^4 + ...); and Fraser's with decentring P1 (2 x^2 + d^2) + 2 P2 x y. The
-affinity b1 x + b2 y of Fraser's is of the ideal place, that of a lens of the distorted one: it is
-read where that makes no difference, up to `AFFINITY_PX`. mm3d ConvertCalib converts the others.
+An ideal position F (x, y) / z + PP, in pixels, is distorted to the observed one
+(eConvApero_DistM2C), or the observed to the ideal one (eConvApero_DistC2M). Read are no distortion;
+radial, d (k1 d^2 + k2 d^4 + ...) with d from the centre of distortion; and Fraser's with decentring
+P1 (2 x^2 + d^2) + 2 P2 x y. The affinity b1 x + b2 y of Fraser's is of the ideal place, that of
+`pcfix.model.Lens` of the distorted one; they differ by the product of affinity and distortion,
+mostly below 0.1 px. mm3d ConvertCalib converts other formulas.
 
-MMVII has the centre (`Center`) and the camera's axes in the world (`AxeI`, `AxeJ`, `AxeK`), the
-same matrix by columns, and the calibration in a file next to it: ideal places (X, Y) / Z to
-observed ones with K1, K2, ... radial, p1, p2, b1 and b2 as above; anything beyond is refused.
+MMVII has the centre (`Center`) and the camera's axes in the world (`AxeI`, `AxeJ`, `AxeK`), and the
+calibration in a file next to it: ideal places (X, Y) / Z to observed ones with K1, K2, ... radial,
+p1, p2, b1 and b2 as above.
 
 References: M. Pierrot-Deseilligny and others, "MicMac, Apero, Pastis and other beverages in a
 nutshell", https://github.com/micmacIGN/Documentation, "Distortion models" and ConvertCalib;
-include/XML_GEN/ParamChantierPhotogram.xml of https://github.com/micmacIGN/micmac for the elements;
-MMVII's files write the formula of each coefficient next to it.
+include/XML_GEN/ParamChantierPhotogram.xml of https://github.com/micmacIGN/micmac; MMVII's files
+write the formula of each coefficient next to it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from xml.etree.ElementTree import Element
 
@@ -45,9 +43,6 @@ CONTENT, INSIDE = "<OrientationConique|<NameInternalCalib>", rf"({PREFIX}|{PREFI
 UNIFIED = ("eModele_DRad_PPaEqPPs", "eModele_Fraser_PPaEqPPs")
 """Of `ModUnif`: radial and Fraser's about the principal point; five k, P1, P2, b1, b2."""
 NO_DISTORTION = ("ModNoDist", "eModelePolyDeg0")
-AFFINITY_PX = 0.1
-"""Largest distance in the frame that a lens with Fraser's affinity may be off."""
-
 NAMES = (*(f"k{i}" for i in range(1, 10)), "p1", "p2", "b1", "b2")
 _IS_INVERSE = {"": False, "eConvApero_DistM2C": False, "eConvApero_DistC2M": True}
 
@@ -66,7 +61,6 @@ def read(source: Source) -> Cameras:
         centres=np.array([centre for centre, _, _ in poses]),
         rotations=np.array([rotation for _, rotation, _ in poses]),
         lenses=tuple(lens for _, _, lens in poses),
-        source="MicMac",
     )
 
 
@@ -99,7 +93,12 @@ def _orientation(path: Path, known: dict[Path, Lens]) -> tuple[FloatArray, Float
         if inner is None:
             inner = _first(where, read_xml(where), "CalibrationInternConique")
         known[where] = _calibration(where, inner)
-    return centre, np.array(rows).T, _scanned(path, conic.find("OrIntImaM2C"), known[where])
+    scan = conic.find("OrIntImaM2C")
+    if scan is not None:
+        text = " ".join(scan.findtext(tag) or "" for tag in ("I00", "V10", "V01"))
+        if (numbers(path, "OrIntImaM2C", text, 6) != [0.0, 0.0, 1.0, 0.0, 0.0, 1.0]).any():
+            raise _not_held(path, "map to a scanned image (OrIntImaM2C)")
+    return centre, np.array(rows).T, known[where]
 
 
 def _calibration_file(path: Path, places: Sequence[Path]) -> Path:
@@ -140,6 +139,8 @@ def _calibration(path: Path, element: Element) -> Lens:
                 given[tag.lower()] = number(path, tag, model.findtext(tag, "0"))
         else:
             raise _not_held(path, name)
+    if _IS_INVERSE[convention] and (given.get("b1") or given.get("b2")):
+        raise _not_held(path, "affinity (b1, b2) of the observed place")
     # MicMac's coefficients are of places in pixels, those of a Lens of places over the focal length
     powers = {"p1": 1, "p2": 1, "b1": 0, "b2": 0}
     given = {k: value * focal ** powers.get(k, 2 * int(k[1:])) for k, value in given.items()}
@@ -160,31 +161,7 @@ def _lens(
     values |= {"cx": x + b1 * (x - cx) + b2 * (y - cy), "cy": y}
     middle = ((cx - x) / focal, (cy - y) / focal)
     more = {"distortion_centre": middle, "inverse": is_inverse, "sensor": path.stem}
-    lens = lens_by_name(values, width, height, **more)
-    if b1 or b2:  # held where it makes no difference that the lens has them after the distortion
-        farthest = np.hypot(*np.maximum(np.abs(centre), np.abs(size - centre))) / focal
-        r, radial = np.linspace(0.0, farthest, 50), lens.radial or (0.0,)
-        away = focal * np.abs(r**3 * np.polynomial.polynomial.polyval(r * r, radial)).max()
-        if is_inverse or not np.hypot(b1, b2) * away <= AFFINITY_PX:
-            raise _not_held(path, "affinity (b1, b2)")
-    return lens
-
-
-def _scanned(path: Path, element: Element | None, lens: Lens) -> Lens:
-    """Return the lens of an image that is an affine map of the camera's."""
-    if element is None:
-        return lens
-    tags = ("I00", "V10", "V01")
-    origin, *along = (numbers(path, tag, element.findtext(tag), 2) for tag in tags)
-    turn = np.column_stack(along)
-    if not origin.any() and (turn == np.eye(2)).all():
-        return lens
-    inner = turn @ np.array([[lens.focal + lens.b1, lens.b2], [lens.b3, lens.focal]])
-    (m00, m01), (m10, m11) = inner.tolist()
-    x, y = (origin + turn @ np.array([lens.principal_x, lens.principal_y])).tolist()
-    width, height = (np.abs(turn) @ np.array([lens.width, lens.height])).tolist()
-    scanned = replace(lens, focal=m11, b1=m00 - m11, b2=m01, b3=m10)
-    return replace(scanned, principal_x=x, principal_y=y, width=width, height=height)
+    return lens_by_name(values, width, height, **more)
 
 
 def _calibration_2(path: Path, root: Element) -> Lens:

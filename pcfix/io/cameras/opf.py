@@ -1,14 +1,13 @@
 """OPF, the Open Photogrammetry Format of PIX4Dmatic and PIX4Dcatch: a project and its parts.
 
-The project (``.opf``, JSON) names files by item and format. Of the item `calibration` come the
-calibrated cameras and the tracks; `input_cameras` has frames, pixel sizes and the GNSS positions;
-`camera_list` the names of the images; `scene_reference_frame` the CRS.
+The project (``.opf``, JSON) names files by item and format. The item `calibration` has the
+calibrated cameras and the tracks; `input_cameras` frames and GNSS positions; `camera_list` the
+names of the images; `scene_reference_frame` the CRS.
 
-Poses are in the processing CRS, which is right-handed and isometric: coordinates of the project's
-CRS times `scale`, with x and y exchanged where that is left-handed (`swap_xy`), plus `shift`. So
-its axes are east, north, up, as `Cameras` has them of a CRS with northing before easting too. A CRS
-without heights has ellipsoidal ones, in the unit of its plan. Omega, phi, kappa: Rx Ry Rz turns
-image axes x right, y up, z back to the processing CRS.
+Poses are in the processing CRS, which is right-handed: coordinates of the project's CRS times
+`scale`, with x and y exchanged if that is left-handed (`swap_xy`), plus `shift`. So its axes are
+east, north, up. A CRS without heights has ellipsoidal ones, in the unit of its plan. Omega, phi,
+kappa: Rx Ry Rz turns image axes x right, y up, z back to the processing CRS.
 
 Pixels start at the corner of the image; T1 and T2 are in OpenCV's order. A fisheye has an affine
 matrix [c d; e f] and a polynomial of 2 theta / pi, as in `pcfix.io.cameras.pix4d`.
@@ -29,9 +28,9 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning, bad_file
+from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import AffineFrame, Source, load_json, note, triple
+from pcfix.io.cameras.checks import AffineFrame, Source, load_json, triple
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.cameras.pix4d import fisheye
 from pcfix.io.crs import crs_text, parse_crs, plan_unit
@@ -50,45 +49,39 @@ def read(source: Source) -> Cameras:
     """Read calibrated poses and lenses, in the CRS of the project."""
     project = _open_project(source.path)
     path, calibrated = project.part("calibration", "calibrated-cameras")
-    _, given = project.part("input_cameras", "input-cameras", needed=False)
-    (frame, notes), names = _frame_of(project), dict[int, str]()
+    _, given = project.part("input_cameras", "input-cameras")
+    frame, names = _frame_of(project), dict[int, str]()
     for listed in project.files("camera_list", FORMAT.format("camera-list")):
         for camera in load_json(listed)["cameras"] if listed.is_file() else []:
             name = camera["uri"].replace("\\", "/").rpartition("/")[2]
             names[camera["id"]] = unquote(name.removesuffix("#page=0"))  # others keep their page
     shots = {shot["id"]: shot for shot in calibrated["cameras"]}
+    if not shots:
+        raise checks.no_pose(path)
     labels = tuple(names.get(i, f"camera {i}") for i in shots)
-    xyz = np.array([triple(shot["position"]) for shot in shots.values()]).reshape(-1, 3)
-    angles = np.array([triple(s["orientation_deg"]) for s in shots.values()]).reshape(-1, 3)
-    sensors = {sensor["id"]: sensor for sensor in given.get("sensors", [])}
-    known = {
-        sensor["id"]: _lens(path, sensor, sensors[sensor["id"]])
-        for sensor in calibrated["sensors"]
-        if "image_size_px" in sensors.get(sensor["id"], {})
-    }
-    lenses = [known[shot["sensor_id"]] for shot in shots.values() if shot["sensor_id"] in known]
+    xyz = np.array([triple(shot["position"]) for shot in shots.values()])
+    angles = np.array([triple(shot["orientation_deg"]) for shot in shots.values()])
+    sensors = {sensor["id"]: sensor for sensor in given["sensors"]}
+    lenses = {one["id"]: _lens(path, one, sensors[one["id"]]) for one in calibrated["sensors"]}
     captures = given.get("captures", [])
     captured = [shot["id"] for capture in captures for shot in capture.get("cameras", [])]
     return Cameras(
         labels=labels,
         centres=frame.points(xyz),
-        rotations=from_omega_phi_kappa(*angles.T) if len(shots) else None,
-        lenses=tuple(lenses) if shots and len(lenses) == len(shots) else None,
+        rotations=from_omega_phi_kappa(*angles.T),
+        lenses=tuple(lenses[shot["sensor_id"]] for shot in shots.values()),
         crs=frame.crs,
         project_crs=frame.project_crs,
-        notes=(*notes, *checks.repeated(path, labels)),
         gnss=_gnss(path, captures, list(shots)),
         unposed=tuple(names.get(i, f"camera {i}") for i in captured if i not in shots),
-        source=project.generator,
     )
 
 
 class Project(NamedTuple):
-    """The list of items of a project, and what wrote it."""
+    """The list of items of a project."""
 
     path: Path
     items: list[Part]
-    generator: str
 
     def files(self, kind: str, form: str) -> list[Path]:
         """Return the files of a format that items of a kind have."""
@@ -101,7 +94,7 @@ class Project(NamedTuple):
         ]
 
     def part(self, kind: str, form: str, *, needed: bool = True) -> tuple[Path, Part]:
-        """Return the one file of a format and what it holds; nothing where it is not needed."""
+        """Return the one file of a format and its contents, which are empty if not needed."""
         found = self.files(kind, FORMAT.format(form))
         if not found and not needed:
             return self.path, {}
@@ -120,16 +113,14 @@ def _open_project(path: Path) -> Project:
             sentence = f"belongs to one of {len(found)} OPF projects. Give the project file (.opf)."
             raise bad_file(path, "cameras.several_projects", sentence, projects=len(found))
         path, content = found[0], load_json(found[0])
-    generator = content.get("generator", {})
-    words = ("OPF", generator.get("name", ""), generator.get("version", ""))
-    return Project(path, content["items"], " ".join(map(str, words)).strip())
+    return Project(path, content["items"])
 
 
-def _frame_of(project: Project) -> tuple[AffineFrame, list[PcfixWarning]]:
-    """Return the frame of the processing, east, north, up, and notes on it."""
+def _frame_of(project: Project) -> AffineFrame:
+    """Return the frame of the processing: east, north, up."""
     path, scene = project.part("scene_reference_frame", "scene-reference-frame", needed=False)
     if not scene:  # the frame of the processing is arbitrary
-        return AffineFrame(np.eye(3), np.zeros(3), "local"), []
+        return AffineFrame(np.eye(3), np.zeros(3), "local")
     way = scene["base_to_canonical"]
     shift, scale = triple(way["shift"]), triple(way["scale"])
     if not (scale > 0.0).all():
@@ -138,12 +129,8 @@ def _frame_of(project: Project) -> tuple[AffineFrame, list[PcfixWarning]]:
         scale = scale[[1, 0, 2]]  # positions are east, north already, scales in the CRS's order
     stated = checks.crs(path, scene["crs"]["definition"])
     crs, unit = (stated, 1.0) if stated == "local" else _with_heights(stated, str(path))
-    size, notes = [1.0, 1.0, unit] / scale, list[PcfixWarning]()
-    if geoid_m := float(scene["crs"].get("geoid_height") or 0.0):
-        sentence = f"its heights refer to a constant geoid height of {geoid_m:g} m."
-        notes.append(note(path, "cameras.constant_geoid", sentence, geoid_m=geoid_m))
-    frame = AffineFrame(np.diag(size), -shift * size, crs, None if crs == stated else stated)
-    return frame, notes
+    size = [1.0, 1.0, unit] / scale
+    return AffineFrame(np.diag(size), -shift * size, crs, None if crs == stated else stated)
 
 
 def _with_heights(text: str, name: str) -> tuple[str, float]:
@@ -175,7 +162,7 @@ def _lens(path: Path, sensor: Part, given: Part) -> Lens:
 
 
 def _gnss(path: Path, captures: list[Part], ids: list[int]) -> GnssPositions | None:
-    """Return where captures were taken, at their reference cameras, in the CRS of the first."""
+    """Return the positions of captures, at their reference cameras, in the CRS of the first."""
     found = {
         capture["reference_camera_id"]: capture["geolocation"]
         for capture in captures
@@ -206,7 +193,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     project = _open_project(source.path)
     _, calibrated = project.part("calibration", "calibrated-cameras")
     row_of = {shot["id"]: i for i, shot in enumerate(calibrated["cameras"])}
-    (frame, _), found = _frame_of(project), list[checks.Seen]()
+    frame, found = _frame_of(project), list[checks.Observations]()
     for path in project.files("calibration", "model/gltf+json"):
         with checks.reading(path):
             model = load_json(path)
@@ -224,8 +211,10 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     return checks.tie_points(*found)
 
 
-def _matches(path: Path, model: Part, primitive: Part, row_of: dict[int, int]) -> checks.Seen:
-    """Return the points of a primitive, in the axes of its node, and where images saw them."""
+def _matches(
+    path: Path, model: Part, primitive: Part, row_of: dict[int, int]
+) -> checks.Observations:
+    """Return the points of a primitive, in the axes of its node, and their observations."""
     matches = primitive["extensions"][MATCHES]
     xyz = _accessor(path, model, primitive["attributes"]["POSITION"], 3).astype(np.float64)
     uv = _accessor(path, model, matches["imagePoints"]["pixelCoordinates"], 2).astype(np.float64)
@@ -239,7 +228,7 @@ def _matches(path: Path, model: Part, primitive: Part, row_of: dict[int, int]) -
         raise checks.damaged(path, "its points have more matches than there are")
     point = np.repeat(np.arange(len(count)), count)
     at = np.arange(len(point)) + np.repeat(first - (np.cumsum(count) - count), count)
-    return checks.Seen(xyz, point, rows[index[at]], uv[at])
+    return checks.Observations(xyz, point, rows[index[at]], uv[at])
 
 
 def _accessor(path: Path, model: Part, index: int, width: int) -> Any:

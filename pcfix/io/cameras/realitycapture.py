@@ -1,22 +1,20 @@
 """RealityCapture and RealityScan: .xmp files next to the images, one each.
 
 The fields of the namespace ``xcr`` are attributes or child elements. `Rotation` is world to
-camera by rows (x right, y down, z forward) and `Position` the projection centre. Lengths in the
-image are shares of its larger side, the focal length times 36 (the film of 35 mm cameras), the
-principal point from the centre of the image:
+camera by rows (x right, y down, z forward) and `Position` the projection centre. With
+scale = max(width, height) and f = FocalLength35mm / 36 scale:
 
-    scale = max(width, height),  f = FocalLength35mm / 36 scale
     u = width / 2 + U scale + f x' + Skew scale y'
     v = height / 2 + V scale + AspectRatio f y'
 
 The coefficients are k1, k2, k3, k4, t1, t2 of Brown's formula, in his order,
 x' = ... + t1 (r^2 + 2 x^2) + 2 t2 x y; models named brown3 leave k4 out, those without "t2" the
 last two. The division model undoes the distortion after the calibration matrix, about the centre
-of the image: m = m' / (1 + k1 |m'|^2), m and m' places in shares of the larger side.
+of the image: m = m' / (1 + k1 |m'|^2), m and m' divided by the scale.
 
-The size of an image is not in the file: it is that of the image next to it, or from the proportions
-of ``--sensor``. Positions called relative or rigid are in a local frame; absolute ones are in the
-CRS of the export, which the file does not name; its `latitude` and `longitude` are others.
+The size of an image is that of the image next to the file, or has the proportions of ``--sensor``.
+Positions called relative or rigid are in a local frame; absolute ones are in the CRS of the export,
+which the file does not name; its `latitude` and `longitude` are others.
 
 References: Epic Games, "RealityScan/RealityCapture XMP camera math" and RealityScan Help, "XMP
 Metadata" (tools/xmpalign). The software's own templates for OpenCV and projection matrices, and the
@@ -33,12 +31,11 @@ import numpy as np
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, image_size, number, numbers, read_xml
 from pcfix.io.cameras.lenses import lens_by_name
-from pcfix.io.cameras.sensor import read_frame, sensor_file
+from pcfix.io.cameras.table import FILM_MM, read_sensor, sensor_file
 from pcfix.model import Cameras, Lens
 
 NAMESPACE = "http://www.capturingreality.com/ns/xcr/"
 DESCRIPTION = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"
-FILM_MM = 36.0
 MODELS = {
     "perspective": "",
     "brown3": "k1 k2 k3",
@@ -62,35 +59,33 @@ def read(source: Source) -> Cameras:
     """Read the poses, and the lenses where the size of the images is known."""
     path = source.path
     folder = path if path.is_dir() else path.parent
-    beside = {p.stem: p.name for p in folder.iterdir() if p.suffix.lower() in IMAGES}
+    pictures = {p.stem: p.name for p in folder.iterdir() if p.suffix.lower() in IMAGES}
     images: dict[Path, dict[str, str]] = {}
     for file in _files(path):
-        if file.stem != "_common":  # which speaks of no image
-            images[file] = {}
-            for one in read_xml(file).iter(DESCRIPTION):
-                fields = one.attrib | {str(child.tag): child.text or "" for child in one}
-                own = {k: v.strip() for k, v in fields.items() if k.startswith("{" + NAMESPACE)}
-                images[file] |= {name.partition("}")[2]: text for name, text in own.items()}
-    names = {file: beside.get(file.stem, file.stem) for file in images}
+        images[file] = {}
+        for one in read_xml(file).iter(DESCRIPTION):
+            fields = one.attrib | {str(child.tag): child.text or "" for child in one}
+            own = {k: v.strip() for k, v in fields.items() if k.startswith("{" + NAMESPACE)}
+            images[file] |= {name.partition("}")[2]: text for name, text in own.items()}
+    names = {file: pictures.get(file.stem, file.stem) for file in images}
     posed = {f: of for f, of in images.items() if {"Rotation", "Position"} <= of.keys()}
     if not posed:
         raise checks.no_pose(path, "has no xcr:Rotation and xcr:Position")
     sensor = sensor_file(source)
-    given = None if sensor is None else read_frame(sensor)
+    lens = None if sensor is None else read_sensor(sensor)
+    given = None if lens is None else (lens.width, lens.height)
     frames = {file: image_size(folder, names[file]) or given for file in posed}
     lenses = [_lens(file, posed[file], *frame) for file, frame in frames.items() if frame]
     relative = any(of.get("Coordinates", "absolute") != "absolute" for of in posed.values())
     rotations = [numbers(f, "xcr:Rotation", of["Rotation"], 9) for f, of in posed.items()]
+    positions = [numbers(f, "xcr:Position", of["Position"], 3) for f, of in posed.items()]
     return Cameras(
         labels=tuple(names[file] for file in posed),
-        centres=np.array(
-            [numbers(f, "xcr:Position", of["Position"], 3) for f, of in posed.items()]
-        ),
+        centres=np.array(positions),
         rotations=np.array(rotations).reshape(-1, 3, 3),
         lenses=tuple(lenses) if len(lenses) == len(posed) else None,
         crs="local" if relative else None,
         unposed=tuple(names[file] for file in images if file not in posed),
-        source="RealityCapture",
     )
 
 
@@ -99,7 +94,8 @@ def _files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
     listed = sorted(p for p in path.iterdir() if p.suffix.lower() == ".xmp" and p.is_file())
-    return [file for file in listed if NAMESPACE.encode() in file.read_bytes()]
+    named = [file for file in listed if file.stem != "_common"]  # which is of no image
+    return [file for file in named if NAMESPACE.encode() in file.read_bytes()]
 
 
 def _lens(path: Path, fields: dict[str, str], width: float, height: float) -> Lens:

@@ -1,37 +1,40 @@
 """Plain tables of poses: a header line, then one image a row.
 
-Fields are separated by comma, semicolon, tab or spaces; the header may be a comment (#), and units
-may stand in it (x[m], omega[gon]). What its columns may be called is in `SPELLINGS`: the image, its
-projection centre (longitude and latitude in degrees of WGS 84 are EPSG:4326, or EPSG:4979 if the
-header calls the heights ellipsoidal), and how it is turned, or nothing:
+Fields are separated by comma, semicolon, tab or spaces; the header may be a comment (#), and have
+units (x[m], omega[gon]). `SPELLINGS` has the names of the columns: image, projection centre
+(degrees are of WGS 84, EPSG:4326, or EPSG:4979 if the header calls the heights ellipsoidal), and
+the rotation, or none. P are photogrammetric camera axes, x right, y up, z back:
 
-- omega, phi, kappa: photogrammetric camera axes (x right, y up, z back) go to the world by
-  Rx(omega) Ry(phi) Rz(kappa); a matrix next to them is ignored.
-- yaw, pitch, roll, 0 for a view straight down: those axes go to the world by
-  Rz(-yaw) Rx(pitch) Ry(roll). So are Metashape's reference angles, ODM's, and the heading,
-  pitch, roll of RealityCapture.
-- yaw, pitch, roll of a gimbal, -90 for a view straight down (``angles="aircraft"``, or
-  exiftool's GimbalPitchDegree): Rz(-yaw) Rx(90 + pitch) Rz(-roll). Angles that fit this better
-  than the former are refused until the user names their kind.
+- omega, phi, kappa: P to world is Rx(omega) Ry(phi) Rz(kappa); a matrix next to them is ignored.
+- yaw, pitch, roll, 0 for a view straight down (Metashape, ODM, RealityCapture's heading): P to
+  world is Rz(-yaw) Rx(pitch) Ry(roll).
+- yaw, pitch, roll of a gimbal, -90 for a view straight down (``angles="aircraft"``, or exiftool's
+  GimbalPitchDegree): Rz(-yaw) Rx(90 + pitch) Rz(-roll). If these fit better and the user has not
+  set the kind, the table is refused.
 - qw, qx, qy, qz: world to camera with axes x right, y down, z forward, as in COLMAP.
 - only r11 ... r33: world to camera, to either of the two axes; the cameras look down.
 
-Axes of the world are those of the CRS of the positions: its grid north, or for degrees the east,
-north and up of the place. Values called ``_est`` are adjusted ones; the others are then
-positions by GNSS, with the stated accuracies (Metashape's reference table).
+World axes are those of the CRS of the positions, or for degrees east, north and up. Values called
+``_est`` are adjusted ones; the others are then GNSS positions (Metashape's reference table).
 
 RealityCapture's ``f, px, py, k1 ... k4, t1, t2``: f in mm for a film of 36 mm along the larger side
-of the image, px and py in units of that side from the centre, Brown's distortion with t1 and t2 in
-his order.
+of the image, px and py in units of that side from the centre, Brown's distortion in his order.
 
-References: Agisoft Metashape User Manual; OpenDroneMap documentation, "Image Geolocation Files".
-The turn of RealityCapture is shown by one camera in XMP and in CSV at
+A block is written as ``cameras.csv`` (label, x, y, z, qw, qx, qy, qz, after a comment with the CRS)
+and ``sensor.csv`` (the one lens of all images, in pixels with OpenCV's names or, of an undistorted
+lens in mm, as focal, sensor_x, sensor_y).
+
+References: Agisoft Metashape User Manual; OpenDroneMap documentation, "Image Geolocation Files";
+one camera of RealityCapture in XMP and in CSV at
 https://forums.unrealengine.com/t/different-rotation-of-cameras-in-xmp-and-csv/710449 ; the scale of
-its f, px, py and the order of t1, t2 are those of AliceVision's reader of the same numbers.
+f, px, py and the order of t1, t2 as in AliceVision's reader.
 """
 
 from __future__ import annotations
 
+import csv
+import io
+import math
 import re
 from collections.abc import Iterable
 from dataclasses import replace
@@ -39,16 +42,16 @@ from pathlib import Path
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.errors import InputError, bad_file
 from pcfix.io import tables
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Angles, Source, note
-from pcfix.io.cameras.lenses import lens_by_name
-from pcfix.io.cameras.sensor import DISTORTION, FILM_MM, read_frame, sensor_file
-from pcfix.io.crs import shortened
+from pcfix.io.cameras.checks import Angles, Source
+from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
+from pcfix.io.crs import is_topocentric, shortened
 from pcfix.io.tables import Table
 from pcfix.lens import rotations
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens
+from pcfix.options.declare import File
 
 SPELLINGS: dict[str, tuple[str, ...]] = {
     "label": (
@@ -66,24 +69,21 @@ SPELLINGS: dict[str, tuple[str, ...]] = {
     "yaw": ("yaw", "heading", "gimbalyawdegree"),
     "pitch": ("pitch", "gimbalpitchdegree"),
     "roll": ("roll", "gimbalrolldegree"),
-    "longitude_ref": ("gpslongituderef",),
-    "latitude_ref": ("gpslatituderef",),
     "sigma_x": ("sigma_x", "accuracy_x", "accuracy_x/y", "accuracy_x/y/z", "accuracy_horz", "hacc"),
     "sigma_y": ("sigma_y", "accuracy_y", "accuracy_x/y", "accuracy_x/y/z", "accuracy_horz", "hacc"),
     "sigma_z": ("sigma_z", "accuracy_z", "accuracy_x/y/z", "accuracy_vert", "vacc"),
 }
-"""What a column is, and its names; where several are there, the first counts."""
+"""Roles of columns, and their names; if a table has several, the first counts."""
 POSE = ("x", "y", "z", "longitude", "latitude", "yaw", "pitch", "roll", "omega", "phi", "kappa")
 _OWN_NAMES = (
-    *("omega", "phi", "kappa", "qw", "qx", "qy", "qz", "enable", "tx", "ty", "tz"),
+    *("omega", "phi", "kappa", "qw", "qx", "qy", "qz", "enable"),
     *(f"r{i}{j}" for i in "123" for j in "123"),
     *("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"),
 )
 SPELLINGS |= {name: (name,) for name in _OWN_NAMES}
 SPELLINGS |= {f"{role}_est": (f"{role}_est",) for role in POSE}
-AXES, TRANSLATION = (("x", "y", "z"), ("longitude", "latitude", "z")), ("tx", "ty", "tz")
-POSITION = {"label", "x", "y", "z", "longitude", "latitude", "tx", "ty", "tz"}
-POSITION |= {"x_est", "y_est", "z_est"}
+AXES = (("x", "y", "z"), ("longitude", "latitude", "z"))
+POSITION = {"label", "x", "y", "z", "longitude", "latitude", "x_est", "y_est", "z_est"}
 MANY = ("label", *(f"sigma_{axis}" for axis in "xyz"))  # the first spelling counts
 
 
@@ -114,23 +114,19 @@ def read(source: Source) -> Cameras:
         columns = replace(columns, place=adjusted | {"label": place["label"]})
     by_gnss = any(name in tables.EXIF for name in columns.header)  # measured, not adjusted
     by_gnss |= columns.has("sigma_x")
-    xyz, unposed = centres(columns), list[str]()
-    first = dict[tuple[str, bytes], int]()  # an exact copy of a row counts once
-    for i, label in enumerate(columns.labels):
-        if (has_both or by_gnss) and np.isnan(xyz[i]).any():  # else it is a mistake
-            unposed.append(label)
-        else:
-            first.setdefault((label, xyz[i].tobytes()), i)
-    if not first:
-        raise checks.no_pose(source.path, "no image has a position")
-    rows = np.array(list(first.values()))
-    repeated = [label for label in columns.labels if label not in set(unposed)]
+    lost = np.isnan(centres(columns)).any(axis=1) & (has_both or by_gnss)  # else it is a mistake
+    if lost.all():
+        raise checks.no_pose(source.path)
+    unposed = columns.take(np.flatnonzero(lost)).labels
+    rows = np.flatnonzero(~lost)
     columns, measured = columns.take(rows), measured.take(rows)
     turns = _rotations(columns, source.angles)
-    system, notes = crs(measured)
+    system, unknown = crs(measured)
+    if unknown:
+        checks.warn(source.path, "cameras.crs_unknown", f"{unknown} The cloud's is assumed.")
     if by_gnss:
         sentence = "its positions are those of the GNSS, not adjusted ones."
-        notes += (note(columns.path, "cameras.not_adjusted", sentence),)
+        checks.warn(source.path, "cameras.not_adjusted", sentence)
     has_lens = turns is not None and columns.has("f", "px", "py")
     return Cameras(
         labels=tuple(columns.labels),
@@ -138,10 +134,8 @@ def read(source: Source) -> Cameras:
         rotations=turns,
         lenses=_own_lenses(columns, source) if has_lens else None,
         crs=system,
-        notes=(*checks.repeated(columns.path, repeated, len(repeated) - len(rows)), *notes),
         gnss=gnss_positions(measured) if has_both else None,
         unposed=tuple(unposed),
-        source="CSV table",
     )
 
 
@@ -161,21 +155,21 @@ def open_table(path: Path) -> Table:
         place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
         numbers, units = [i for i, _ in split], [""] * len(GEO)
         return Table(path, [*GEO], rows, numbers, place, units, crs=lines[0].strip())
-    kinds = [("label", *three) for three in (*AXES, ("x_est", "y_est", "z_est"), TRANSLATION)]
+    kinds = [("label", *three) for three in (*AXES, ("x_est", "y_est", "z_est"))]
     table = tables.read_table(path, *kinds, spellings=SPELLINGS)
     for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
         alike = [name for name in table.header if name in spellings]
         if len(alike) > 1 and role not in MANY and (role not in alike or alike.count(role) > 1):
             sentence = f"the columns {', '.join(alike)} may all be {role}. Remove all but one."
             raise bad_file(path, "table.columns_alike", sentence, columns=alike)
-    if table.has(*TRANSLATION) and axes(table.place) is None:
-        sentence = "tx, ty, tz may be translations. Give the projection centres as x, y, z."
-        raise bad_file(path, "table.translations", sentence)
+    projection = path.with_suffix(".prj")
+    if table.crs is None and projection.is_file():
+        return replace(table, crs=" ".join(tables.read_lines(projection)).strip() or None)
     return table
 
 
 def gnss_positions(columns: Table) -> GnssPositions | None:
-    """Return the positions by GNSS, or None where only adjusted ones are there."""
+    """Return the positions by GNSS, or None if there are only adjusted ones."""
     if axes(columns.place) is None:
         return None
     xyz = centres(columns)
@@ -193,48 +187,29 @@ def axes(place: Iterable[str]) -> tuple[str, str, str] | None:
 
 def centres(columns: Table, *, needed: bool = False) -> FloatArray:
     """Return positions, shape (k, 3), NaN for rows without when they are not `needed`."""
-    from pyproj import CRS
-
     three = axes(columns.place)
     if three is None:
         return np.full((len(columns.rows), 3), np.nan)
     xyz = columns.of(three) if needed else columns.where_there(three)
-    for i, side in enumerate(("longitude_ref", "latitude_ref")):
-        if columns.has(side):
-            texts = columns.column(side)
-            beyond = [text[:1].upper() in ("S", "W") for text in texts]
-            xyz[beyond, i] = -np.abs(xyz[beyond, i])
-    system = crs(columns)[0] or "local"
-    if three[0] == "longitude" or (system != "local" and CRS(system).is_geographic):
-        bad = (np.abs(xyz[:, :2]) > [360.0, 90.0]).any(axis=1)
-        if bad.any():
-            i = int(np.argmax(bad))
-            sentence = f"longitude {xyz[i, 0]:g}, latitude {xyz[i, 1]:g} is no place on earth."
-            raise columns.error(i, "cameras.degrees", sentence)
     xyz[np.isnan(xyz).any(axis=1)] = np.nan
     return xyz
 
 
-def crs(columns: Table) -> tuple[str | None, tuple[PcfixWarning, ...]]:
-    """Return the CRS that a table states or implies, and notes on it.
+def crs(columns: Table) -> tuple[str | None, str]:
+    """Return the CRS that a table states or implies, and a sentence if PROJ does not know it.
 
-    Longitude and latitude without more are those of WGS 84. Heights then are ellipsoidal only
-    if the header calls them so; else the CRS has no heights. A ``.prj`` of the table's name next
-    to it counts where the table itself states none.
+    Longitude and latitude without a CRS are those of WGS 84. Their heights are ellipsoidal only if
+    the header calls them so; else the CRS has no heights.
     """
-    stated, beside = columns.crs, columns.path.with_suffix(".prj")
-    if not stated and beside != columns.path and beside.is_file():
-        stated = " ".join(tables.read_lines(beside)).strip() or None
-    if stated is None:
+    if columns.crs is None:
         if axes(columns.place) != ("longitude", "latitude", "z"):
-            return None, ()
+            return None, ""
         ellipsoidal = columns.name("z").startswith("ellipsoid")
-        return WGS84_ELLIPSOIDAL if ellipsoidal else WGS84, ()
+        return WGS84_ELLIPSOIDAL if ellipsoidal else WGS84, ""
     try:
-        return checks.crs(columns.path, stated), ()
+        return checks.crs(columns.path, columns.crs), ""
     except InputError:
-        sentence = f"PROJ does not know its CRS '{shortened(stated)}'. The cloud's is assumed."
-        return None, (note(columns.path, "cameras.crs_unknown", sentence, crs=stated),)
+        return None, f"PROJ does not know its CRS '{shortened(columns.crs)}'."
 
 
 def is_geo(lines: list[str]) -> bool:
@@ -253,15 +228,15 @@ CONVERSIONS = {
 OMEGA_PHI_KAPPA, YAW_PITCH_ROLL, _ = (roles for roles, _ in CONVERSIONS.values())
 QUATERNION, MATRIX = ("qw", "qx", "qy", "qz"), tuple(f"r{i}{j}" for i in "123" for j in "123")
 LARGEST_DEG = 360.0
-LOOKS_DOWN_DEG = 80.0
-"""Largest tilt from the vertical of a camera that looks at the ground."""
+LOOKS_DOWN = 0.17
+"""Least cosine of the tilt, about 80 degrees, of a camera that looks at the ground."""
 
 
 def _rotations(columns: Table, angles: Angles | None) -> FloatArray | None:
-    """Return world to camera rotations, or None where the table has nothing that turns.
+    """Return world to camera rotations, or None if the table has none.
 
-    `angles` is their kind as the user names it. Where the header cannot, the view must decide: the
-    cameras look down at the ground.
+    `angles` is their kind if the user sets it. Otherwise the header decides, or the assumption that
+    the cameras look down at the ground.
     """
     path, wanted = columns.path, CONVERSIONS[angles][0] if angles else ()
 
@@ -294,12 +269,9 @@ def _rotations(columns: Table, angles: Angles | None) -> FloatArray | None:
     found, gimbal = rotations.from_yaw_pitch_roll(*values), rotations.from_aircraft(*values)
     if columns.name("yaw").startswith("gimbal"):
         return gimbal
-    tilt, other = (  # the angles between the views and straight down
-        np.degrees(np.arctan2(np.hypot(each[:, 2, 0], each[:, 2, 1]), -each[:, 2, 2]))
-        for each in (found, gimbal)
-    )
+    down, other = -found[:, 2, 2], -gimbal[:, 2, 2]  # cosines of the tilt from straight down
     reality_capture = columns.after_hash and columns.name("yaw") == "heading"
-    is_likely = other.max() < LOOKS_DOWN_DEG and np.median(other) < np.median(tilt)
+    is_likely = other.min() > LOOKS_DOWN and np.median(other) > np.median(down)
     if is_likely and not reality_capture:
         sentence = "yaw, pitch, roll are likely those of a gimbal. Give --angles aircraft, or"
         raise unclear(f"{sentence} --angles yaw-pitch-roll.")
@@ -321,8 +293,9 @@ def _own_lenses(columns: Table, source: Source) -> tuple[Lens, ...]:
     """Return the lens of each row from RealityCapture's columns, with the size of a sensor."""
     path = sensor_file(source)
     if path is None:
-        raise checks.no_sensor(columns.path, "width_px,height_px")
-    width, height = read_frame(path)
+        raise checks.no_sensor(columns.path)
+    frame = read_sensor(path)
+    width, height = frame.width, frame.height
     side, lenses = max(width, height), []
     distortion = np.nan_to_num(columns.where_there(DISTORTION))
     for focal, x, y, *brown in np.hstack([columns.of(("f", "px", "py")), distortion]).tolist():
@@ -330,3 +303,107 @@ def _own_lenses(columns: Table, source: Source) -> tuple[Lens, ...]:
         given |= {"cx": width / 2.0 + x * side, "cy": height / 2.0 + y * side}
         lenses.append(lens_by_name(given | {"f": focal * side / FILM_MM}, width, height))
     return tuple(lenses)
+
+
+# ---- sensors ----
+
+
+MILLIMETRES = ("focal", "sensor_x", "sensor_y")
+PIXELS = ("focal_px", "width_px", "height_px")
+OPENCV_NAMES = {"d1": "k4", "d2": "k5", "d3": "k6", "p2": "p1", "p1": "p2"}
+"""What OpenCV calls the parameters that have another name in `lenses`."""
+OPENCV = {"OpenCV": LensModel("f cx cy k1 k2 k3 d1 d2 d3 p2 p1")}
+TERMS = OPENCV["OpenCV"].names.split()[1:]
+CENTRED = {"centred": LensModel("f")}
+DISTORTION = ("k1", "k2", "k3", "k4", "t1", "t2")
+FILM_MM = 36.0
+"""Larger side of the film that 35 mm focal lengths mean."""
+
+
+def sensor_file(source: Source) -> Path | None:
+    """Return the file with the lens of all images: that of the user, or ``sensor.csv``."""
+    folder = source.path if source.path.is_dir() else source.path.parent
+    default = folder / "sensor.csv"
+    return source.sensor or (default if default.is_file() else None)
+
+
+def read_sensor(path: Path) -> Lens:
+    """Read the lens of all images.
+
+    Parameters
+    ----------
+    path : Path
+        A calibration of Metashape (XML), or a table of one row. Its columns are focal, sensor_x,
+        sensor_y in mm, with the principal point in the centre; or focal_px, width_px, height_px
+        and, if known, OpenCV's cx, cy (pixels from the upper left corner of the image),
+        k1 ... k6, p1, p2.
+    """
+    if Source(path).text.lstrip().startswith("<"):
+        from pcfix.io.cameras.metashape import read_calibration
+
+        return checks.lens(path, path.stem, read_calibration(path))
+    names = (*MILLIMETRES, *PIXELS, *(OPENCV_NAMES.get(one, one) for one in TERMS))
+    table = tables.read_table(
+        path, MILLIMETRES, PIXELS, spellings={name: (name,) for name in names}
+    )
+    if len(table.rows) != 1:
+        sentence = f"has {len(table.rows)} rows. Give one row for all images."
+        raise bad_file(path, "cameras.sensor_rows", sentence, rows=len(table.rows))
+    is_px = table.has(*PIXELS)
+    (focal, width, height), given = table.of(PIXELS if is_px else MILLIMETRES)[0].tolist(), {}
+    if is_px:
+        values = table.where_there(OPENCV_NAMES.get(one, one) for one in TERMS)[0].tolist()
+        given = {one: v for one, v in zip(TERMS, values, strict=True) if not math.isnan(v)}
+    lens = lens_by_name({"f": focal} | given, width, height, unit="px" if is_px else "mm")
+    checks.lens(path, path.stem, lens)
+    if not all(0.25 < at < 0.75 for at in (lens.principal_x / width, lens.principal_y / height)):
+        sentence = "cx, cy is far from the centre. Give pixels from the upper left corner."
+        raise bad_file(path, "cameras.principal_point", sentence)
+    return lens
+
+
+WRITTEN = ("label", "x", "y", "z", "qw", "qx", "qy", "qz")
+
+
+def write_table(folder: File, cameras: Cameras) -> None:
+    """Write ``cameras.csv`` and ``sensor.csv``.
+
+    Parameters
+    ----------
+    folder : path
+        Created if it does not exist.
+    cameras : Cameras
+        With rotations and lenses.
+    """
+    from scipy.spatial.transform import Rotation
+
+    target = Path(folder)
+    turns, lenses = checks.block_to_write(target, cameras)
+    if cameras.crs is not None and is_topocentric(cameras.crs):
+        sentence = f"a table cannot have the axes {cameras.crs}. Use a projected CRS."
+        raise bad_file(target, "output.crs", sentence, crs=cameras.crs)
+    given, *others = dict.fromkeys(lenses)
+    if others:
+        sentence = f"a table has one lens, but the images have {1 + len(others)}. Use another"
+        raise bad_file(target, "output.lens", f"{sentence} format.")
+    is_px = given.unit == "px"
+    _, values = model_of(target, given, OPENCV if is_px else CENTRED)
+    frame = (values.pop("f"), given.width, given.height)
+    sensor = dict(zip(PIXELS if is_px else MILLIMETRES, map(float, frame), strict=True))
+    sensor |= {OPENCV_NAMES.get(name, name): float(value) for name, value in values.items()}
+    quaternions = Rotation.from_matrix(turns).as_quat(canonical=True)
+    poses = np.column_stack([cameras.centres, np.roll(quaternions, 1, axis=1)]).tolist()
+    has_crs = cameras.crs is not None and cameras.crs.strip().lower() != "local"
+    comment = f"# CoordinateSystem: {' '.join((cameras.crs or '').split())}\n" if has_crs else ""
+    rows = [[label, *row] for label, row in zip(cameras.labels, poses, strict=True)]
+    contents = {
+        "cameras.csv": comment.encode() + _csv(WRITTEN, *rows),
+        "sensor.csv": _csv(sensor, sensor.values()),
+    }
+    checks.write_new(target, contents)
+
+
+def _csv(*rows: Iterable[object]) -> bytes:
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerows(rows)
+    return stream.getvalue().encode()

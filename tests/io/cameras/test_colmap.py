@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pcfix.io.cameras import read_tie_points
 from pcfix.io.cameras.colmap import BY_NAME, MODELS, lens_of
 from pcfix.lens.imaging import project
 from tests.utils.camera_files import read, read_ties
@@ -109,16 +108,6 @@ def test_largest_of_several_models(tmp_path):
     assert cameras.notes[0].values.items() >= {"models": 2, "images": 3}.items()
 
 
-def test_tie_points_that_are_not_finite(tmp_path):
-    points = POINTS.replace("6 1.5", "6 nan") + "10 1 2 3 0 0 0 0\n"
-    path = folder(tmp_path, images=IMAGES.replace("50 60 6", "inf 60 10"), points=points)
-    ties = read_tie_points(path, read(path))
-    assert np.isfinite(ties.xyz).all(axis=1).tolist() == [False, True, True, True]
-    assert np.isnan(ties.xyz[0]).all()
-    assert ties.image_xy.tolist() == [[7.0, 8.0], [10.0, 20.0]]
-    assert ties.views.start.tolist() == [0, 1, 2, 2, 2]
-
-
 @pytest.mark.parametrize("number", range(len(MODELS)))
 def test_binary_knows_the_models_by_their_numbers(tmp_path, number):
     pycolmap = pytest.importorskip("pycolmap")
@@ -144,7 +133,6 @@ def test_binary_knows_the_models_by_their_numbers(tmp_path, number):
         ("cameras", "500 510", "0 510", "cameras.lens"),
         ("images", "4 1 0 0 0", "4 2 0 0 0", "cameras.rotation"),
         ("images", IMAGES, "# none\n", "cameras.no_pose"),
-        ("cameras", "# Cam", "# Number of cameras: 3\n# Cam", "cameras.damaged"),
         ("images", "a.jpg\n\n", "a.jpg\n", "cameras.damaged"),
     ],
 )  # fmt: skip

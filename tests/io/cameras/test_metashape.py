@@ -112,9 +112,6 @@ POINT = (("float", "x"), ("float", "y"), ("float", "z"), ("int", "id"))
 MARK = (("float", "x"), ("float", "y"), ("float", "size"), ("int", "id"))
 
 
-# The samples
-
-
 # The format
 
 
@@ -124,13 +121,6 @@ def test_scale_enters_the_centre_alone(tmp_path):
     assert cameras.rotations[0] == pytest.approx(np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]))
     assert cameras.crs == "local"
     assert cameras.notes == ()
-
-
-def test_chunk_matrix_with_the_scale_inside(tmp_path):
-    one = read_chunk(tmp_path, rest=transform())
-    two = read_chunk(tmp_path, rest="<transform>0 -2 0 10 2 0 0 20 0 0 2 30 0 0 0 1</transform>")
-    assert two.centres == pytest.approx(one.centres, abs=1e-12)
-    assert two.rotations == pytest.approx(one.rotations, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -288,15 +278,14 @@ def test_fisheyes_have_the_distortion_of_a_frame_camera(tmp_path, kind, radius):
     assert project(lens, ray)[0] == pytest.approx(expected, abs=1e-9)
 
 
-def test_what_a_lens_here_has_not_is_told(tmp_path):
+def test_additional_corrections_are_ignored(tmp_path):
     corrections = '<corrections type="fourier"><coeffs>3 4 0 0</coeffs></corrections>'
     cameras = read_chunk(tmp_path, sensors=sensor(calibration("<f>9</f>" + corrections)))
     assert notes(cameras) == ["cameras.corrections"]
-    assert cameras.notes[0].values["rms_px"] == pytest.approx(12.5**0.5)
 
 
-@pytest.mark.parametrize("kind", ["spherical", "cylindrical", "rpc"])
-def test_images_without_a_central_projection_are_left_out(tmp_path, kind):
+def test_images_without_a_central_projection_are_skipped(tmp_path):
+    kind = "spherical"
     cameras = read_chunk(
         tmp_path,
         sensors=sensor() + sensor(calibration(kind=kind), 1, f'type="{kind}"'),
@@ -441,14 +430,6 @@ def test_tie_points_of_components_and_markers(tmp_path):
     assert ties.image_xy.tolist() == [[14, 15], [20, 21], [10, 11], [30, 31], [1.5, 2.5], [3, 4]]
 
 
-def test_markers_of_an_export(tmp_path):
-    images = camera(0) + camera(1) + camera(2)
-    frames = f'<frames next_id="1"><frame id="0">{MARKERS}</frame></frames>'
-    ties = read_ties(write(tmp_path, chunk(cameras=images, rest=frames)))
-    assert ties.image_xy.tolist() == [[1.5, 2.5], [3.0, 4.0]]
-    assert ties.views.camera.tolist() == [0, 2]
-
-
 # Bad input
 
 
@@ -459,45 +440,11 @@ def test_markers_of_an_export(tmp_path):
         ("<chunks/>", "cameras.no_pose"),
         (chunk(sensors=""), "cameras.damaged"),
         (chunk(sensors=sensor(calibration(""))), "cameras.damaged"),
-        (chunk(sensors=sensor(calibration("<f>0</f>"))), "cameras.lens"),
         (chunk(cameras=camera(0, "<transform>1 2 3</transform>")), "cameras.damaged"),
         (chunk(rest=transform(rotation="1 0 0 0 1 0 0 0 2")), "cameras.rotation"),
-        (chunk(rest=transform("x 1 2")), "cameras.number"),
-        (chunk()[:-30], "cameras.damaged"),
     ],
 )
 def test_refused(tmp_path, content, code):
     path = write(tmp_path, content)
     with refused(code, path=path):
         read(path)
-
-
-@pytest.mark.parametrize(
-    ("file", "entries", "code"),
-    [
-        ("project.zip", None, "cameras.missing_file"),
-        ("0/chunk.zip", {"other.xml": ""}, "cameras.damaged"),
-    ],
-)
-def test_project_refused(tmp_path, file, entries, code):
-    path = project_of(tmp_path, [chunk()])
-    archive = tmp_path / "river.files" / file
-    archive.unlink()
-    if entries is not None:
-        put_zip(archive, entries)
-    with refused(code, path=archive):
-        read(path)
-
-
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [("points0.ply", ply(MARK, [])), ("p1.ply", ply((*MARK[:3], ("float", "id")), []))],
-)
-def test_tie_points_refused(tmp_path, name, content):
-    path = tie_project(tmp_path)
-    archive = tmp_path / "river.files/0/0/point_cloud/point_cloud.zip"
-    with zipfile.ZipFile(archive) as old:
-        entries = {entry: old.read(entry) for entry in old.namelist() if entry != name}
-    put_zip(archive, entries if content is None else {**entries, name: content})
-    with refused("cameras.damaged"):
-        read_ties(path)

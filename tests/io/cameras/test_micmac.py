@@ -192,16 +192,20 @@ def test_version_2_distorts_the_ideal_place(tmp_path):
     assert project(lens, np.array([[x, y, 1.0]]))[0] == pytest.approx(expected, abs=1e-5)
 
 
+SCANNED = "<OrIntImaM2C><I00>9 9</I00><V10>0 1</V10><V01>1 0</V01></OrIntImaM2C>"
+
+
 @pytest.mark.parametrize(
     ("text", "code"),
     [
-        (embedded(NO_DISTORTION)[:-30], "cameras.damaged"),
-        (embedded().replace("<L2>-0.8", "<L2>0.8"), "cameras.rotation"),
         (embedded().replace("CodageMatr", "CodageAngulaire"), "cameras.unsupported"),
         (embedded(convention="eConvOriLib"), "cameras.unsupported"),
-        (embedded().replace("<SzIm>4000", "<SzIm>0"), "cameras.lens"),
         (embedded("<ModGridDef/>"), "cameras.unsupported"),
-        (embedded(STANDARD.format("<b1>2e-2</b1><b2>0</b2>")), "cameras.unsupported"),
+        (
+            embedded(STANDARD.format("<b1>2e-2</b1>"), convention="eConvApero_DistC2M"),
+            "cameras.unsupported",
+        ),
+        (orientation(f"<Interne>{interior()}</Interne>", more=SCANNED), "cameras.unsupported"),
         (orientation("<FileInterne>AutoCal.xml</FileInterne>"), "cameras.missing_file"),
     ],
 )

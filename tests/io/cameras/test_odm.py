@@ -208,9 +208,7 @@ def changed(name, value=None):
 @pytest.mark.parametrize(
     ("files", "code"),
     [
-        ({"shots": changed("filename")}, "cameras.damaged"),
         ({"shots": changed("filename", "0.jpg")}, "cameras.damaged"),
-        ({"shots": changed("focal", 0)}, "cameras.lens"),
         ({"shots": geojson(PLACES), "proj": "+proj=nowhere"}, "cameras.crs"),
         (
             {"reconstruction": reconstruction(PLACES), "transformation": "1 0 0\n0 1"},

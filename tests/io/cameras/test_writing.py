@@ -10,7 +10,7 @@ from pyproj import CRS
 from pcfix.errors import InputError, SettingError
 from pcfix.io.cameras import read_cameras, read_tie_points
 from pcfix.io.cameras.colmap import write_colmap
-from pcfix.io.cameras.sensor import write_table
+from pcfix.io.cameras.table import write_table
 from pcfix.lens.imaging import project
 from pcfix.model import Lens, TiePoints, Views
 from tests.utils.blocks import PLAIN, small_block, some_ties
@@ -190,18 +190,3 @@ def test_nothing_is_replaced(tmp_path, form, name):
     with pytest.raises(SettingError):
         write(form, tmp_path, small_block())
     assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
-@pytest.mark.parametrize(
-    ("text", "code"),
-    [
-        ("{", "cameras.damaged"),
-        ('{"written_by": "pcfix", "crs": 7, "offset_m": [1, 2, 3]}', "cameras.damaged"),
-        ('{"written_by": "pcfix", "crs": "EPSG:1", "offset_m": [1, 2, 3]}', "cameras.crs"),
-    ],
-)
-def test_georeference_refused(tmp_path, text, code):
-    write_colmap(tmp_path, small_block())
-    (tmp_path / "georeference.json").write_text(text)
-    with refused(code):
-        read_cameras(tmp_path)
