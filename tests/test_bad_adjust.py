@@ -66,7 +66,6 @@ CLOUD = ("--cloud", "cloud.las")
         ("option.choice", ("--free", "distance"), {}),
         ("option.choice", ("--lens-unknowns", "f,q9"), {}),
         ("adjust.parallel", ("--parallel", "water,floor"), {}),
-        ("adjust.fixed_image", ("--fixed-images", "a.jpg,b.jpg"), {"gnss": False}),
     ],
 )
 def test_words(refuse, code, words, given):

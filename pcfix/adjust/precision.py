@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import CODES, INDEX, PORT, SHAPE, lens_parameter, moved_lens, words_of
 from pcfix.adjust.normal import UNDAMPED, sparse_rows_of
+from pcfix.adjust.parameters import CODES, INDEX, PORT, SHAPE, lens_parameter, moved_lens, words_of
 from pcfix.adjust.problem import Problem, Solution, polynomial
 from pcfix.adjust.solve import moved_by, reduced_at, singular, solver
 from pcfix.errors import PcfixWarning
@@ -95,10 +95,8 @@ def precision_of(
     only_poses : bool
         Whether standard errors of the points and an ensemble are not wanted.
     """
-    matrix, state = reduced_at(problem, solution)[0], solution.state
-    k, g, free = len(problem.moves), len(problem.names), np.flatnonzero(problem.moves)
-    times = np.ones(6 + g) if factor is None else factor
-    variance, u = sigma0 * sigma0, len(matrix.diagonal())
+    matrix, k, g = reduced_at(problem, solution)[0], len(solution.lenses), len(problem.names)
+    times, u = np.ones(6 + g) if factor is None else factor, matrix.shape[0]
     solve_for = solver(matrix)
     if solve_for is None:
         raise singular(problem, solution)
@@ -115,30 +113,26 @@ def precision_of(
             inverse[:, rows] = columns
         if part is not None:
             of_part = columns[rows].reshape(len(part), 6, len(part), 6)
-            poses[free[part // 6]] = np.einsum("kikj->kij", of_part)
+            poses[part // 6] = np.einsum("kikj->kij", of_part)
     of_shared = columns[last]
-    diagonal = np.append(np.einsum("kii->ki", poses)[free], of_shared.diagonal())
+    diagonal = np.append(np.einsum("kii->ki", poses), of_shared.diagonal())[problem.fixed :]
     if not ((diagonal > 0.0) & (diagonal * matrix.diagonal() * SINGULAR < 1.0)).all():
         raise singular(problem, solution)
     of_shared = of_shared * times[6:] * times[6:, None]
     poses = poses * times[:6] * times[:6, None]
-    if problem.unknowns.poses == "similarity":
-        by = problem.pose_gradients(state)
-        poses = by @ of_shared[-7:, -7:] @ by.transpose(0, 2, 1)
     points: FloatArray | None = None
     members: Members | None = None
     if inverse is not None:
-        each = np.append(np.tile(times[:6], len(free)), times[6:])
+        each = np.append(np.tile(times[:6], k), times[6:])[problem.fixed :]
         inverse *= each
         inverse *= each[:, None]
-        spread = problem.spread(state)
-        points = sigma0 * _point_sigma(problem, solution, spread @ inverse @ spread.T)
+        points = sigma0 * _point_sigma(problem, solution, inverse)
         members = members_of(problem, solution, sigma0 * drawn(inverse))
     sigma = np.sqrt(np.diag(of_shared))
     correlation = of_shared / sigma / sigma[:, None]
     rows_of = zip(problem.names, solution.shared.tolist(), (sigma * sigma0).tolist(), strict=True)
     return Precision(
-        sigma0, variance * poses, tuple(SharedUnknown(*row) for row in rows_of), correlation,
+        sigma0, sigma0**2 * poses, tuple(SharedUnknown(*row) for row in rows_of), correlation,
         points, members,
     )  # fmt: skip
 
@@ -146,8 +140,8 @@ def precision_of(
 def _point_sigma(problem: Problem, found: Solution, inverse: FloatArray) -> FloatArray:
     """Return standard errors of the points for observations of unit weight, shape (m, 3).
 
-    Their variances are those of V^-1 + V^-1 W' S^-1 W V^-1. The inverse S^-1 has the shape
-    (6 k + g, 6 k + g), zero where poses are fixed.
+    Their variances are those of V^-1 + V^-1 W' S^-1 W V^-1. The inverse S^-1 of the free unknowns
+    has the shape (u, u).
     """
     sigma, first = np.full_like(found.state.xyz, np.nan), 0
     step = 1 + len(sigma) // MOST_POINTS
@@ -156,7 +150,7 @@ def _point_sigma(problem: Problem, found: Solution, inverse: FloatArray) -> Floa
         own = part.inverse.diagonal().reshape(-1, 3)
         for some in range(0, last - first, step * POINTS_AT_ONCE):
             rows = np.arange(some, min(some + step * POINTS_AT_ONCE, last - first), step)
-            coupling = part.coupling[(3 * rows[:, None] + np.arange(3)).ravel()]
+            coupling = part.coupling[(3 * rows[:, None] + np.arange(3)).ravel(), problem.fixed :]
             by_others = coupling.multiply(coupling @ inverse).sum(axis=1)
             # points that their rays do not fix have no variance
             square = np.where(own[rows] > 0.0, own[rows] + by_others.reshape(-1, 3), np.nan)
@@ -169,33 +163,24 @@ def _point_sigma(problem: Problem, found: Solution, inverse: FloatArray) -> Floa
 
 
 LIMITS = {
-    "level": 0.02, "tilt_x": 0.0005, "tilt_y": 0.0005, "index": 0.005, "scale": 0.001,
+    "level": 0.02, "tilt_x": 0.0005, "tilt_y": 0.0005, "index": 0.005,
     "distance": 0.002, "centre_x": 0.002, "centre_y": 0.002, "centre_z": 0.002,
+    "shape_xx": 1e-4, "shape_xy": 1e-4, "shape_yy": 1e-4,
 }  # fmt: skip
-"""Standard errors beyond which an unknown counts as undetermined."""
-
-LEAST_BEND_M = 0.02
-"""The same for the height by which curved water departs from a plane, as for its level."""
+"""Standard errors beyond which an unknown counts as undetermined; 1e-4 / m is 2 cm at 14 m."""
 
 STRONG = 0.95
 """Correlation of two unknowns that are hardly separated."""
 
 
-def undetermined(precision: Precision, reach_m: float = 0.0) -> list[PcfixWarning]:
+def undetermined(precision: Precision) -> list[PcfixWarning]:
     """Return a warning for each unknown whose standard error is too large to be useful.
 
     It names the unknown from which this one is hardly separated, if there is one.
-
-    Parameters
-    ----------
-    reach_m : float
-        RMS distance of the points under water from their middle.
     """
     notes, shared = [], precision.shared
     for i, row in enumerate(shared):
         (what, unit), limit = words_of(row.name), LIMITS.get(row.name, np.inf)
-        if row.name.startswith("shape") and reach_m:
-            limit = LEAST_BEND_M / reach_m**2
         if row.sigma <= limit:
             continue
         words = (
@@ -330,7 +315,7 @@ def members_of(problem: Problem, found: Solution, steps: FloatArray) -> Members:
     codes = [CODES[name] for name in names]
     before = [[lens_parameter(lens, code) for code in codes] for lens in found.lenses]
     turn, shift, lens, water = [], [], [], []
-    for step in steps:
+    for step in np.hstack([np.zeros((len(steps), problem.fixed)), steps]):
         moved = moved_by(problem, found, step, np.zeros_like(state.xyz))
         if moved is None:
             continue

@@ -23,8 +23,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import fdtri
 
-from pcfix.adjust.block import CX, CY, FOCAL
 from pcfix.adjust.normal import UNDAMPED, sparse_matrix, sparse_rows_of
+from pcfix.adjust.parameters import CX, CY, FOCAL
 from pcfix.adjust.precision import Precision
 from pcfix.adjust.problem import Problem, Solution
 from pcfix.adjust.solve import reduced_at, solver
@@ -63,7 +63,7 @@ def disagreement_of(problem: Problem, found: Solution, formal: Precision) -> Flo
     place += given.group[given.camera] * (place.max(initial=0) + 1)
     frame = np.unique(place, return_inverse=True)[1]
     matrix, right = reduced_at(problem, found)
-    solve_for, spread = solver(matrix), problem.spread(found.state)
+    solve_for, free = solver(matrix), slice(problem.fixed, None)
     least = len(np.unique(randomly))
     if least < LEAST_GROUPS or solve_for is None:
         return 1.0 + added
@@ -71,7 +71,7 @@ def disagreement_of(problem: Problem, found: Solution, formal: Precision) -> Flo
     drawn = np.random.default_rng(1).normal(0.0, formal.sigma0, given.image_xy.shape)
     groups = [randomly, randomly, near, given.camera]
     *pulls, field, rest = _pulls_of(problem, found, groups, frame, drawn)
-    by_chance, *shares = (_share_of(problem, formal, solve_for(spread.T @ p.T)) for p in pulls)
+    by_chance, *shares = (_share_of(formal, solve_for(p[:, free].T)) for p in pulls)
     for group, share in zip(groups[1:], shares, strict=True):
         count = len(np.unique(group))
         is_more = share > fdtri(count - 1, least - 1, SURE) * by_chance
@@ -80,10 +80,10 @@ def disagreement_of(problem: Problem, found: Solution, formal: Precision) -> Flo
         if group is randomly:
             by_chance = by_chance + more
     if frame.max() + 1 >= LEAST_GROUPS:
-        field = field @ spread
+        field = field[:, free]
         rest -= field @ solve_for(np.column_stack([field.T, right]))
         likely = _likely_field(problem, frame, formal.sigma0, rest) @ field
-        added = added + _share_of(problem, formal, solve_for(likely.T))
+        added = added + _share_of(formal, solve_for(likely.T))
     return np.sqrt(1.0 + added)
 
 
@@ -106,17 +106,17 @@ def _tiles(xy: FloatArray, count: int) -> IntArray:
     return np.asarray(place[:, 0] * int(last[1] + 1.0) + place[:, 1])
 
 
-def _share_of(problem: Problem, formal: Precision, moved: FloatArray) -> FloatArray:
+def _share_of(formal: Precision, moved: FloatArray) -> FloatArray:
     """Return variances over the formal ones, (6 + g,), for poses their mean.
 
     `moved`, shape (u, n), are the movements of the free unknowns by each of n groups.
     """
-    poses = np.einsum("kii->ki", formal.pose_covariance)[problem.moves]
-    variance = np.append(poses.ravel(), [row.sigma**2 for row in formal.shared])
-    share = (moved**2).sum(axis=1) / variance
-    of_poses, of_shared = np.split(share, [poses.size])
-    mean = of_poses.reshape(-1, 6).mean(axis=0) if poses.size else np.zeros(6)
-    return np.append(mean, of_shared)
+    of_poses, of_shared = np.split((moved**2).sum(axis=1), [len(moved) - len(formal.shared)])
+    share = of_shared / [row.sigma**2 for row in formal.shared]
+    if not len(of_poses):
+        return np.append(np.zeros(6), share)
+    poses = np.einsum("kii->ki", formal.pose_covariance)
+    return np.append((of_poses.reshape(-1, 6) / poses).mean(axis=0), share)
 
 
 def _pulls_of(
@@ -128,7 +128,7 @@ def _pulls_of(
     Then, for shifts along u and v of the t tiles of the frame: B', shape (2 t, 6 k + g), and C
     with their right sides, shape (2 t, 2 t + 1).
     """
-    size, count = 6 * len(problem.moves) + problem.given.shared, 2 * (int(frame.max(initial=0)) + 1)
+    size, count = 6 * len(found.lenses) + problem.given.shared, 2 * (int(frame.max(initial=0)) + 1)
     pulls = [np.zeros((int(group.max(initial=0)) + 1, size)) for group in groups]
     field, rest = np.zeros((count, size)), np.zeros((count, count + 1))
     for part in sparse_rows_of(found.state, problem.given, UNDAMPED):

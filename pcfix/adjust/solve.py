@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import INDEX, moved_lens, words_of
 from pcfix.adjust.collinearity import State
 from pcfix.adjust.normal import SQUARES, UNDAMPED, Rule, normal_equations, point_steps, residuals
+from pcfix.adjust.parameters import INDEX, moved_lens, words_of
 from pcfix.adjust.problem import Problem, Solution, cost_at, port_of, port_row, prior_rows
 from pcfix.errors import GeometryError, PcfixError
 from pcfix.lens.imaging import lens_table
 from pcfix.model import FloatArray
+from pcfix.running import current
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8
 MOST_STEPS = 60
@@ -36,20 +37,10 @@ WEAK = 1e-11
 """Eigenvalue of the matrix with unit diagonal below which a combination is undetermined."""
 
 
-Progress = Callable[[str], None]
-"""Called with a line after each step."""
-
-
 # Steps
 
 
-def solve(
-    problem: Problem,
-    start: Solution,
-    loss: int = SQUARES,
-    progress: Progress | None = None,
-    close: float = CLOSE,
-) -> Solution:
+def solve(problem: Problem, start: Solution, loss: int = SQUARES, close: float = CLOSE) -> Solution:
     """Minimise the weighted squared residuals.
 
     Parameters
@@ -59,39 +50,33 @@ def solve(
     close : float
         Two steps in a row that lower the cost by less than this share end the round.
     """
-    rule = Rule(loss)
-    now = replace(start, cost=cost_at(problem, start, rule), rounds=start.rounds + 1)
-    if not np.isfinite(now.cost):
-        raise GeometryError(
-            "adjust.no_start", "The adjustment has no finite start. Check the poses and the water."
-        )
-    damping, up, calm = FIRST_DAMPING, 2.0, 0
+    now = replace(start, cost=cost_at(problem, start, loss))
+    damping, up, calm, steps = FIRST_DAMPING, 2.0, 0, 0
     # with exact observations the cost ends at zero, of which there is no share
     least_cost = EXACT * max(int(problem.used.sum()), 1)
-    last = start.steps + MOST_STEPS
-    while now.steps < last and calm < 2 and damping <= MOST_DAMPING:
-        trial = _trial(problem, now, rule._replace(damping=damping))
+    while steps < MOST_STEPS and calm < 2 and damping <= MOST_DAMPING:
+        trial = _trial(problem, now, Rule(loss, damping))
         gain = np.nan if trial is None else (now.cost - trial.cost) / max(now.cost, least_cost)
         if trial is not None and gain >= 0.0:
-            now = replace(trial, steps=now.steps + 1)
+            now, steps = trial, steps + 1
             damping, up = max(damping / 10.0, LEAST_DAMPING), 2.0
             calm = calm + 1 if gain < close else 0
-            show(progress, problem, now)
+            show(problem, now)
         elif gain > -ROUNDING:
             break
         else:
             damping, up = damping * up, 2.0 * up  # a shorter step
-    if trial is None and now.steps == start.steps:
+    if trial is None and steps == 0:
         raise singular(problem, now)
     return now
 
 
-def show(progress: Progress | None, problem: Problem, now: Solution) -> None:
-    """Describe the last step to whoever follows the progress."""
-    if progress is not None:
+def show(problem: Problem, now: Solution) -> None:
+    """Show the residuals after a step, if the command shows its progress."""
+    if (say := current().say) is not None:
         r = residuals(now.state, problem.given)[problem.used]
         rms_px = np.sqrt(np.nansum(r * r) / max(r.size, 1))
-        progress(f"round {now.rounds}, step {now.steps}, {len(r):,} observations, {rms_px:.3f} px")
+        say(f"{len(r):,} observations, residuals {rms_px:.3f} px")
 
 
 def _trial(problem: Problem, now: Solution, rule: Rule) -> Solution | None:
@@ -103,28 +88,21 @@ def _trial(problem: Problem, now: Solution, rule: Rule) -> Solution | None:
     step = solve_for(right)
     if not np.isfinite(step).all():
         return None
-    points = point_steps(now.state, problem.given, rule, problem.spread(now.state) @ step)
-    moved = moved_by(problem, now, step, points)
-    return None if moved is None else replace(moved, cost=cost_at(problem, moved, rule))
+    step = np.append(np.zeros(problem.fixed), step)
+    moved = moved_by(problem, now, step, point_steps(now.state, problem.given, rule, step))
+    return None if moved is None else replace(moved, cost=cost_at(problem, moved, rule.loss))
 
 
 def moved_by(
     problem: Problem, now: Solution, step: FloatArray, points: FloatArray
 ) -> Solution | None:
-    """Return a solution with steps of the free unknowns and of the points added.
+    """Return a solution with steps of poses and shared unknowns, (6 k + g,), and points added.
 
     None if a parameter leaves its range.
     """
-    state, given, count = now.state, problem.given, 6 * int(problem.moves.sum())
-    poses, shared = np.zeros((len(problem.moves), 6)), step[count:]
-    poses[problem.moves] = step[:count].reshape(-1, 6)
-    centres = state.centres + poses[:, 3:]
+    state, given, count = now.state, problem.given, 6 * len(now.lenses)
+    poses, shared = step[:count].reshape(-1, 6), step[count:]
     rotations = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ state.rotations
-    if problem.unknowns.poses == "similarity":
-        t, phi, s = np.split(shared[given.shared :], [3, 6])
-        turn = Rotation.from_rotvec(phi).as_matrix()
-        centres = problem.pivot + t + (1.0 + s[0]) * (centres - problem.pivot) @ turn.T
-        rotations = rotations @ turn.T
     water, free = state.water.copy(), given.column >= 0
     water[free] += shared[given.column[free]]
     if not 1.0 <= water[INDEX] < 3.0:
@@ -146,8 +124,8 @@ def moved_by(
     return replace(
         now,
         state=State(
-            centres, np.ascontiguousarray(rotations), np.ascontiguousarray(table),
-            state.xyz + points, water, port_row(port),
+            state.centres + poses[:, 3:], np.ascontiguousarray(rotations),
+            np.ascontiguousarray(table), state.xyz + points, water, port_row(port),
         ),
         lenses=tuple(lenses),
         shared=now.shared + shared,
@@ -161,6 +139,7 @@ def reduced_at(problem: Problem, found: Solution, rule: Rule = UNDAMPED) -> tupl
     """Return the equations of the free unknowns at a solution, with prior knowledge.
 
     The matrix, shape (u, u), is dense or scipy's sparse one; the right side has the shape (u,).
+    These are the last u of all 6 k + g unknowns.
     """
     from scipy.sparse import diags_array
 
@@ -169,8 +148,8 @@ def reduced_at(problem: Problem, found: Solution, rule: Rule = UNDAMPED) -> tupl
     extra = rows.T @ rows
     # the damping is a factor on the diagonal before the points were eliminated
     extra = extra + diags_array(rule.damping * (diagonal + extra.diagonal()))
-    spread = problem.spread(found.state)
-    return spread.T @ (total + extra) @ spread, spread.T @ (right + rows.T @ left)
+    free = slice(problem.fixed, None)
+    return (total + extra)[free, free], (right + rows.T @ left)[free]
 
 
 def solver(matrix: Any) -> Callable[[FloatArray], FloatArray] | None:
@@ -217,7 +196,7 @@ def singular(problem: Problem, solution: Solution) -> GeometryError:
     from scipy.sparse import csc_array, diags_array
     from scipy.sparse.linalg import eigsh
 
-    matrix, poses = reduced_at(problem, solution)[0], np.flatnonzero(problem.moves)
+    matrix = reduced_at(problem, solution)[0]
     diagonal = matrix.diagonal()
     weak, why = ~(diagonal > 0.0), "no observation depends on them"
     if not weak.any():
@@ -229,8 +208,8 @@ def singular(problem: Problem, solution: Solution) -> GeometryError:
         vectors = vectors[:, values < max(WEAK, 10.0 * float(values.min()))]
         weak = np.linalg.norm(vectors, axis=1) > 1e-4
         why = "the observations do not separate them"
-    of_poses, of_names = np.split(weak, [6 * len(poses)])
-    images = poses[of_poses.reshape(-1, 6).any(axis=1)]
+    of_poses, of_names = np.split(weak, [len(weak) - len(problem.names)])
+    images = np.flatnonzero(of_poses.reshape(-1, 6).any(axis=1))
     labels = [problem.block.cameras.labels[i] for i in images]
     names = [name for name, is_weak in zip(problem.names, of_names, strict=True) if is_weak]
     words = [f"the {words_of(name)[0]}" for name in names]
@@ -241,7 +220,7 @@ def singular(problem: Problem, solution: Solution) -> GeometryError:
     if set(names) & BED and not problem.block.wet.any():
         remedy = "fix them, as no point is under water"
     elif labels:
-        remedy = "give GNSS positions, three control points or a free network, or fix images"
+        remedy = "give GNSS positions, three control points or a free network"
     return GeometryError(
         "adjust.singular",
         f"The adjustment cannot determine {', '.join(words)}: {why}. To solve it, {remedy}.",

@@ -13,7 +13,7 @@ may sink or lift whole beaches.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +27,7 @@ from pcfix.model import BoolArray, Cameras, Correction, FloatArray, IntArray, Ou
 from pcfix.refract.batch import Optics, optics_of
 from pcfix.refract.choice import views_in_frame
 from pcfix.refract.tiling import spatial_order
-from pcfix.sums import MOST, Sums
+from pcfix.sums import Sums
 
 MAX_STEPS = 12
 CLOSE_M = 1e-6
@@ -43,8 +43,6 @@ POINTS_AT_ONCE = 100_000
 MOST_APART = 0.1
 """Share of the flying height between two centres of one image; refraction moves a block, with its
 datum and scale, by a few hundredths."""
-
-REASON = "fewer than two original cameras image them"
 
 
 # Points
@@ -191,22 +189,17 @@ class TransferCounts(Sums):
     points: int
     not_moved: int
     land: int
-    sum_m: FloatArray  # shape (4,): of the shift along the axes, and of its square
-    most_m: float = field(metadata=MOST)
+    sum_z_m: float
+    sum_squares_m2: float  # of the length of the shift
 
     @classmethod
     def of(cls, step: Transferred, correction: Correction) -> TransferCounts:
         """Return those of a chunk, with the correction that `Transferred.whole` returned."""
         followed = step.moved & ~correction.uncorrected
         shift = (step.xyz - step.original_xyz)[followed]
-        length2 = (shift**2).sum(axis=1)
-        return cls(
-            points=len(shift),
-            not_moved=int((~step.moved).sum()),
-            land=int((correction.outcome[followed] == Outcome.LAND).sum()),
-            sum_m=np.array([*shift.sum(axis=0), length2.sum()]),
-            most_m=float(np.sqrt(length2.max(initial=0.0))),
-        )
+        land = int((correction.outcome[followed] == Outcome.LAND).sum())
+        not_moved, squares = int((~step.moved).sum()), float((shift**2).sum())
+        return cls(len(shift), not_moved, land, float(shift[:, 2].sum()), squares)
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,24 +253,23 @@ class CloudTransfer:
         """Refuse a cloud that the original cameras do not see."""
         if counts.points == 0 and counts.not_moved:
             words = (
-                f"{name}: no point could be transferred to the adjusted cameras, because {REASON}."
-                " Check that --adjusted-from is the model of the cloud, in its CRS."
+                f"{name}: no point could be transferred to the adjusted cameras, because fewer than"
+                " two original cameras image them. Check that --adjusted-from is the model of the"
+                " cloud, in its CRS."
             )
             raise GeometryError("adjusted_from.no_overlap", words, path=name)
 
     def as_dict(self, counts: TransferCounts) -> dict[str, Any]:
         """Return the statistics as plain values, metres."""
-        mean = counts.sum_m / max(counts.points, 1)
-        shift = {
-            "mean_x": mean[0], "mean_y": mean[1], "mean_z": mean[2], "rms": np.sqrt(mean[3]),
-            "max": counts.most_m,
-        }  # fmt: skip
+        count = max(counts.points, 1)
         return {
             "points": counts.points,
             "land": counts.land,
             "not_transferred": counts.not_moved,
-            "not_transferred_reason": REASON,
-            "shift_m": {name: round(float(value), 4) for name, value in shift.items()},
+            "shift_m": {
+                "mean_z": round(counts.sum_z_m / count, 4),
+                "rms": round(float(np.sqrt(counts.sum_squares_m2 / count)), 4),
+            },
         }
 
     def provenance(self) -> dict[str, Any]:

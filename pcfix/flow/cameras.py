@@ -293,9 +293,7 @@ def cameras_text(report: CamerasReport) -> str:
         verdict = f"not known; give control points (--gcps), or {EXPORT}"
         if found.absorbed is not None and found.decided_by is not None:
             have = "have" if found.absorbed else "have not"
-            verdict = (
-                f"the poses {have} absorbed the refraction, as {found.decided_by.shown_by} show"
-            )
+            verdict = f"the poses {have} absorbed the refraction, as {found.decided_by.name} show"
         if found.likely_error_m is not None:
             verdict += f"; the likely error of heights is {found.likely_error_m:.2g} m"
         rows.append(("Refraction", verdict))

@@ -100,7 +100,7 @@ def diagnose_in_passing(
     )
     if decided is not None:
         have = "have" if diagnosis.absorbed else "have not"
-        words = f"{have} absorbed the refraction, as {decided.shown_by} show"
+        words = f"{have} absorbed the refraction, as {decided.name} show"
         words += "; see the warning" if sentence else ""
     signs = diagnosis.as_dict()["signs"]
     return {"absorbed": diagnosis.absorbed, "words": words, "signs": signs}, warning

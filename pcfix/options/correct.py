@@ -329,10 +329,8 @@ class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
     lens_unknowns: tuple[LensUnknown, ...] | None = option(None, parse=_lens_names, metavar="NAMES")
     """Unknowns of the lens: none, or any of f,cx,cy,k1...,p1,p2,b1,b2. [default: those that the
     block determines]"""
-    poses: Literal["free", "fixed", "similarity"] = option("free")
-    """Adjust each pose, none, or all together by one similarity transformation."""
-    fixed_images: tuple[str, ...] = option((), parse=words, metavar="A,B")
-    """Images whose poses are held fixed."""
+    poses: Literal["free", "fixed"] = option("free")
+    """Adjust the poses, or hold them fixed."""
     datum: Literal["observed", "free"] = option("observed")
     """Datum of the block: from observations, or free: mean position, direction and scale of the
     original poses."""
@@ -340,10 +338,6 @@ class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
     """Use measured tie points, or points of the cloud; auto: measured if there are any."""
     gnss_sigma: float | None = option(None, above=0)
     """Standard deviation of GNSS positions that state none. [m] [default: from their residuals]"""
-    sigma_image: float | None = option(None, above=0)
-    """Standard deviation of tie points in the images. [px] [default: from their residuals]"""
-    outliers: bool = option(True)
-    """Search for outliers and exclude them."""
 
 
 class AdjustOptions(

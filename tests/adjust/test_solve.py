@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import Unknowns
+from pcfix.adjust.parameters import Unknowns
 from pcfix.adjust.precision import precision_of, undetermined
 from pcfix.adjust.problem import solved_cameras, water_of
 from pcfix.model import WaterPlane
@@ -85,28 +85,6 @@ def test_lens_and_water_come_home():
     assert abs(plane.a + plane.b * x + plane.c * y - made.water.a) < HOME_M
 
 
-def test_fixed_image():
-    """A fixed image and the place of another are a datum; the water level tells the height."""
-    made = scene()
-    k = len(made.cameras)
-    first = made.cameras.labels[0]
-    poses = [np.where(np.arange(k)[:, None] == 0, made.true_cameras.centres, made.cameras.centres)]
-    turns = np.where(
-        np.arange(k)[:, None, None] == 0, made.true_cameras.rotations, made.cameras.rotations
-    )
-    cameras = replace(made.cameras, centres=poses[0], rotations=turns)
-    block = block_of(made, exact=True, cameras=cameras)
-    only = np.arange(k) == k - 1
-    block = replace(
-        block,
-        gnss_xyz=np.where(only[:, None], block.gnss_xyz, np.nan),
-        gnss_sigma_m=np.where(only[:, None], block.gnss_sigma_m, np.inf),
-    )
-    problem, found = adjusted(block, Unknowns(lens=(), fixed_images=(first,)))
-    assert max(misses(made, problem, found)) < HOME_M
-    assert (found.state.centres[0] + problem.origin == made.true_cameras.centres[0]).all()
-
-
 def test_free_network():
     """With the water level fixed, the images tell height and tilt; the rest is the start's."""
     made = scene()
@@ -152,18 +130,6 @@ def test_index(points):
     else:
         assert precision.sigma_of("index") > 0.005
         assert (notes[0].code, notes[0].values["unknown"]) == ("adjust.undetermined", "index")
-
-
-def test_similarity():
-    made = scene()
-    true, pivot = made.true_cameras, made.true_cameras.centres.mean(axis=0)
-    turn = Rotation.from_rotvec([0.004, -0.006, 0.02]).as_matrix()
-    centres = pivot + [1.5, -0.8, 0.6] + 1.01 * (true.centres - pivot) @ turn.T
-    cameras = replace(made.cameras, centres=centres, rotations=true.rotations @ turn.T)
-    for given in ({"gnss": True}, {"gnss": False, "control": True}):
-        block = block_of(made, exact=True, cameras=cameras, start_xyz=disturbed(made), **given)
-        problem, found = adjusted(block, Unknowns(poses="similarity", lens=()))
-        assert max(misses(made, problem, found)) < HOME_M
 
 
 @pytest.mark.parametrize("tilt", [None, 2.0], ids=["level", "tilted"])

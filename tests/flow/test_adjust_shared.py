@@ -9,7 +9,7 @@ import rasterio
 from scipy.interpolate import RegularGridInterpolator
 
 import pcfix
-from pcfix.adjust.block import usable_ties
+from pcfix.adjust.ties import usable_ties
 from pcfix.flow.adjust import adjust_cameras
 from tests.utils.nightly import mostly_nightly
 from tests.utils.shared import needs
