@@ -55,7 +55,6 @@ CLOUD = ("--cloud", "cloud.las")
     ("code", "words", "given"),
     [
         ("cameras.no_ties", (), {"model": "bare"}),
-        ("cameras.no_ties", (*CLOUD, "--ties", "measured"), {"model": "bare"}),
         ("adjust.no_datum", (), {"gnss": False}),
         ("adjust.no_datum", CLOUD, {"model": "bare", "gnss": False}),
         ("adjust.cloud_needs_datum", (*CLOUD, "--datum", "free"), {"model": "bare", "gnss": False}),

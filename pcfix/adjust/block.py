@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pcfix.adjust.parameters import Unknowns
-from pcfix.adjust.ties import LEAST_VIEWS, with_places
 from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.lens.imaging import straight_images, unproject
 from pcfix.model import (
     BoolArray,
     Cameras,
@@ -30,8 +30,18 @@ from pcfix.water.surface import surface_above
 WATER = "water"
 """The name of the water among the surfaces of control points."""
 
+LEAST_VIEWS = 2
 LEAST_POINTS_IN_IMAGE = 4
 """A pose has up to four solutions with three points."""
+
+LEAST_ANGLE_DEG = 2.0
+"""Between the rays of a tie point; the depth of points with smaller angles is hardly determined."""
+
+LEAST_DETERMINANT = 1e-5
+"""Of the normal matrix of unit rays: two at a third of a degree."""
+
+TIE_POINTS = 150_000
+"""At most; more reduce only the noise, which is no longer the largest error then."""
 
 LEAST_GNSS_SIGMA_M = 0.02
 MOST_OFFSET_M, MOST_OFFSET_SIGMAS = 1.0, 10.0
@@ -143,14 +153,9 @@ def block_of(
 ) -> Block:
     """Return the block of tie points and control points.
 
-    Parameters
-    ----------
-    ties : TiePoints
-        Apparent points, in the frame of the cameras.
-    inside : callable, optional
-        Whether points, by x and y, may be under water; everywhere without it.
-    level_sigma_m : float
-        Standard deviation of the water level, infinite if it is free.
+    The tie points are apparent points in the frame of the cameras. They may be under water where
+    `inside`, a function of x and y, says so; everywhere without it. The standard deviation of the
+    water level is infinite if it is free.
     """
     wet = np.ones(len(ties.xyz), np.bool_) if inside is None else inside(*ties.xyz[:, :2].T)
     begin = replace(ties, xyz=true_start(ties.xyz, water, refractive_index, wet))
@@ -209,7 +214,7 @@ def marks_of(control: GroundControl) -> tuple[TiePoints, FloatArray]:
 
 
 def true_start(
-    xyz: FloatArray, water: WaterSurface | None, n: float, allowed: BoolArray | None = None
+    xyz: FloatArray, water: WaterSurface | None, n: float, allowed: BoolArray
 ) -> FloatArray:
     """Return apparent points with their depths times n, as start values of the true points.
 
@@ -219,9 +224,83 @@ def true_start(
     if water is None:
         return true
     level = surface_above(water, xyz).height_m
-    wet = level > xyz[:, 2] if allowed is None else (level > xyz[:, 2]) & allowed
+    wet = (level > xyz[:, 2]) & allowed
     true[wet, 2] = level[wet] - n * (level - xyz[:, 2])[wet]
     return true
+
+
+# Tie points
+
+
+def some_ties(ties: TiePoints, rows: IntArray) -> TiePoints:
+    """Return some of the tie points, in the given order."""
+    first, counts = ties.views.start[rows], np.diff(ties.views.start)[rows]
+    begin = np.cumsum(counts) - counts
+    where = np.repeat(first - begin, counts) + np.arange(counts.sum())
+    return TiePoints(ties.xyz[rows], ties.views.take(rows), ties.image_xy[where])
+
+
+def usable_ties(ties: TiePoints, cameras: Cameras, most: int = TIE_POINTS) -> TiePoints:
+    """Return the tie points that can be adjusted; a random part of them if there are very many.
+
+    They have coordinates, two images or more, and a sufficient angle between their rays: twice the
+    largest angle between a ray and the mean ray of its point.
+    """
+    seen = np.diff(ties.views.start) >= LEAST_VIEWS
+    rows = np.flatnonzero(np.isfinite(ties.xyz).all(axis=1) & seen)
+    some = some_ties(ties, rows)
+    owner = np.repeat(np.arange(len(rows)), np.diff(some.views.start))
+    ray = cameras.centres[some.views.camera] - some.xyz[owner]
+    ray /= np.linalg.norm(ray, axis=1)[:, None]
+    mean = np.zeros((len(rows), 3))
+    np.add.at(mean, owner, ray)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
+    cosine = np.full(len(rows), 1.0)
+    np.minimum.at(cosine, owner, np.einsum("oi,oi->o", ray, mean[owner]))
+    angle_deg = 2.0 * np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    rows = rows[angle_deg >= LEAST_ANGLE_DEG]
+    if len(rows) > most:
+        rows = np.sort(np.random.default_rng(0).choice(rows, most, replace=False))
+    return some_ties(ties, rows)
+
+
+def with_places(ties: TiePoints, cameras: Cameras) -> TiePoints:
+    """Return tie points in which those without coordinates are intersected by straight rays.
+
+    The sum of squared distances from the rays is minimised, which is good enough as a start.
+    """
+    lost = np.flatnonzero(~np.isfinite(ties.xyz).all(axis=1) & (np.diff(ties.views.start) >= 2))
+    rotations, lenses = np.asarray(cameras.rotations), cameras.lenses or ()
+    some = some_ties(ties, lost)
+    owner, camera = np.repeat(np.arange(len(lost)), np.diff(some.views.start)), some.views.camera
+    ray = np.full((len(owner), 3), np.nan)
+    for c in np.unique(camera):
+        ray[camera == c] = unproject(lenses[c], some.image_xy[camera == c]) @ rotations[c]
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+    middle = cameras.centres.mean(axis=0)
+    normal, right = np.zeros((len(lost), 3, 3)), np.zeros((len(lost), 3))
+    np.add.at(normal, owner, across)
+    np.add.at(right, owner, np.einsum("oij,oj->oi", across, cameras.centres[camera] - middle))
+    known = np.linalg.det(normal) > LEAST_DETERMINANT  # NaN is not
+    xyz = ties.xyz.copy()
+    xyz[lost[known]] = np.linalg.solve(normal[known], right[known][:, :, None])[:, :, 0] + middle
+    return replace(ties, xyz=xyz)
+
+
+def ties_of_cloud(
+    xyz: FloatArray, views: Views, cameras: Cameras, least: int = LEAST_VIEWS
+) -> TiePoints:
+    """Return apparent points in enough images, shape (m, 3), as tie points with straight rays.
+
+    The views say which cameras contributed to them, or have them in their frame.
+    """
+    owner = np.repeat(np.arange(len(xyz)), np.diff(views.start))
+    image = straight_images(xyz[owner], np.asarray(views.camera), cameras)
+    seen = np.isfinite(image).all(axis=1)
+    counts = np.bincount(owner[seen], minlength=len(xyz))
+    start = np.concatenate([[0], np.cumsum(counts)])
+    tracks = Views(start, np.asarray(views.camera)[seen])
+    return some_ties(TiePoints(xyz, tracks, image[seen]), np.flatnonzero(counts >= least))
 
 
 # Some of the images
@@ -304,16 +383,9 @@ def gnss_with_sigma(
 ) -> tuple[GnssPositions | None, list[PcfixWarning]]:
     """Return GNSS positions with standard deviations (infinite for unknown ones), and warnings.
 
-    Parameters
-    ----------
-    centres : array, shape (k, 3)
-        Projection centres, metres.
-    found : GnssPositions
-        In the same frame, as read: NaN where unknown.
-    name : str
-        Their file, for messages.
-    sigma_m : float or None
-        For positions without one; None estimates it from their scatter about the centres.
+    They are in the frame of the centres, shape (k, 3), metres; `name` is their file. Positions that
+    state no standard deviation get `sigma_m`, or None estimates it from their scatter about the
+    centres.
     """
     known = np.isfinite(found.xyz)
     if not known.any():

@@ -25,9 +25,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.adjust.block import plain_block, true_start, used_as_dry
+from pcfix.adjust.block import plain_block, some_ties, true_start, used_as_dry
 from pcfix.adjust.parameters import similarity_gradients
-from pcfix.adjust.ties import some_ties
 from pcfix.errors import GeometryError
 from pcfix.model import (
     Cameras,
@@ -118,11 +117,8 @@ class Diagnosis:
         land = [sign for sign in self.signs if sign.name == "heights of land" and sign.speaks]
         return (land or [self.decided_by])[-1].error_m
 
-    def sentence(self, command: str, because: str = "") -> str:
-        """Return a warning with the command that helps; empty if the poses seem right.
-
-        `because` says why the command has what was not given.
-        """
+    def sentence(self, command: str) -> str:
+        """Return a warning with the command that helps; empty if the poses seem right."""
         if not self.absorbed or self.decided_by is None:
             return ""
         likely = self.likely_error_m
@@ -130,7 +126,7 @@ class Diagnosis:
         have = "seem to have" if self.decided_by.name == ORDER[-1] else "have"
         return (
             f"The poses {have} absorbed the refraction: {self.decided_by.words}.{error} Correcting"
-            f" only the cloud makes them worse. Adjust the poses first{because}: {command}"
+            f" only the cloud makes them worse. Adjust the poses first: {command}"
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -163,17 +159,10 @@ def _absorbed_words(share: float, sigma: float) -> str:
 def tie_point_sign(
     straight: Intersected, refracted: Intersected, depth_m: FloatArray
 ) -> Sign | None:
-    """Compare residuals of tie points with and without refraction, with the poses as they are.
+    """Compare residuals of the same tie points with straight and refracted rays.
 
-    Parameters
-    ----------
-    straight, refracted : Intersected
-        The same m points from the same observations.
-    depth_m : array, shape (m,)
-        Of the straight intersection below the water; negative on land.
+    Their depths, shape (m,), are those of the straight intersection; negative on land.
 
-    Notes
-    -----
     With the residuals s without and r with refraction, d = s - r is what straight rays cannot fit.
     With true poses r is noise, which is independent of d; with poses that absorbed the refraction s
     is noise. So b = -(r . d) / (d . d) is 0 or 1, whatever the noise. Its standard error is that of
@@ -220,14 +209,9 @@ def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, undon
     The pattern is the centres minus those that an adjustment with water finds without the GNSS
     (`pcfix.adjust.from_cloud.undo_absorption`).
 
-    Parameters
-    ----------
-    centres, off_m, sigma_m : array, shape (k, 3)
-        Adjusted centres, adjusted minus GNSS (NaN where there is none), and the stated standard
-        deviations of the GNSS (NaN if not).
+    All arrays have the shape (k, 3): adjusted centres, adjusted minus GNSS (NaN where there is
+    none), and the stated standard deviations of the GNSS (NaN if not).
 
-    Notes
-    -----
     off = b pattern + shift, turn and scale of the block + noise, by least squares. The noise is
     that of the residuals, or that stated of the GNSS if it is larger.
     """
@@ -304,13 +288,9 @@ def bed_sign(apparent_m: FloatArray, true_m: FloatArray, refractive_index: float
 def neighbours_sign(share: float, sigma: float, *, is_fused: bool) -> Sign:
     """Look at the discontinuities between image footprints that the corrected bed still has.
 
-    Parameters
-    ----------
-    share, sigma : float
-        See `Verdict.straight` of `pcfix.refract`. On four rendered blocks it is 0.02 to 0.25
-        with true poses, and 0.76 to 0.96 with those of an ordinary adjustment.
-    is_fused : bool
-        Whether the cloud is of fused depth maps; others can have discontinuities all the same.
+    Their share is `Verdict.straight` of `pcfix.refract`. On four rendered blocks it is 0.02 to 0.25
+    with true poses, and 0.76 to 0.96 with those of an ordinary adjustment. Clouds that are not of
+    fused depth maps can have discontinuities all the same.
     """
     words = (
         f"{100.0 * share:.0f} % of the discontinuities between image footprints are left in the"
@@ -339,22 +319,10 @@ def diagnosed(
 ) -> Diagnosis:
     """Look for every sign that the evidence allows.
 
-    Parameters
-    ----------
-    cameras : Cameras
-        In the cloud's CRS.
-    n : float
-        Refractive index.
-    gnss : GnssPositions, optional
-        In the frame of the cameras, NaN if unknown.
-    view : pcfix.flow.surfaces.CloudView, optional
-        The cloud, for its heights and in place of tie points.
-    reference : pcfix.compare.match.Reference, optional
-        A survey of land and bed.
-    neighbours : Sign, optional
-        Of `neighbours_sign`.
-    in_passing : bool
-        Whether it must be quick: GNSS positions are used only if nothing else decides.
+    Cameras and GNSS positions (NaN if unknown) are in the cloud's CRS; n is the refractive index.
+    The view (`pcfix.flow.surfaces.CloudView`) gives heights of the cloud, and points in place of
+    tie points; the reference (`pcfix.compare.match.Reference`) is a survey of land and bed. If it
+    must be quick (`in_passing`), GNSS positions are used only if nothing else decides.
     """
     signs = [neighbours]
     if not isinstance(water, WaterDimension):  # which has heights at points of the cloud only

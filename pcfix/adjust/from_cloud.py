@@ -31,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from pcfix.adjust.block import Block, plain_block, some_cameras, true_start
+from pcfix.adjust.block import Block, plain_block, some_cameras, ties_of_cloud, true_start
 from pcfix.adjust.collinearity import SHARED
 from pcfix.adjust.normal import UNDAMPED, linearised, point_steps, residuals
 from pcfix.adjust.parameters import Unknowns
@@ -46,7 +46,6 @@ from pcfix.adjust.problem import (
 )
 from pcfix.adjust.result import Adjusted, adjusted_of
 from pcfix.adjust.solve import moved_by, reduced_at, show
-from pcfix.adjust.ties import ties_of_cloud
 from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, WaterSurface
 from pcfix.refract.choice import views_in_frame
@@ -90,19 +89,12 @@ def adjust_cloud(
     *,
     choose_lens: bool = False,
 ) -> Adjusted:
-    """Adjust a block by the cloud that its original poses made.
+    """Adjust a block whose tie points are points of the cloud that its original cameras made.
 
-    Parameters
-    ----------
-    block : Block
-        Its tie points are points of the cloud; its cameras are the start.
-    original : Cameras
-        Those that made the cloud, in the same order.
-    apparent_xyz : array, shape (m, 3)
-        Where the cloud has the points of the block; control points as surveyed.
-    choose_lens : bool
-        Whether of the lens only the focal length is free, unless all parameters of the unknowns
-        lower the misfit of GNSS and control points by more than chance does.
+    The cameras of the block are the start. `apparent_xyz`, shape (m, 3), is where the cloud has the
+    points of the block; control points as surveyed. With `choose_lens`, of the lens only the focal
+    length is free, unless all parameters of the unknowns lower the misfit of GNSS and control
+    points by more than chance does.
     """
     _check(block, unknowns)
 
@@ -124,7 +116,7 @@ def adjust_cloud(
     if lens != unknowns.lens:
         more = trial(unknowns.lens, chosen.sigma_px)
     if more is not None:
-        extra = (len(unknowns.lens) - len(lens)) * len(chosen.problem.groups)
+        extra = (len(unknowns.lens) - len(lens)) * (len(chosen.problem.given.first_lens) - 1)
         gain = (chosen.misfit - more.misfit) / max(chosen.misfit / chosen.redundancy, 1.0)
         chosen = more if gain > chdtri(extra, SURE) else chosen
     # only GNSS and control points have noise; the precision is about that with tie points of the
@@ -199,15 +191,9 @@ def _trial(
 def solve_unaware(problem: Problem, start: Solution, tests: FloatArray) -> Solution:
     """Find poses, lens and points whose residuals are orthogonal to the original columns.
 
-    Parameters
-    ----------
-    problem, start : Problem, Solution
-        Of `pcfix.adjust.problem.prepare`; points of the cloud were observed where the original
-        cameras image them.
-    tests : array, shape (t, 2, 9 + g)
-        Jacobians of the straight collinearity at the original solution, by pose, point and shared
-        unknowns, for the points of the cloud. The others, control points, are adjusted by least
-        squares.
+    Points of the cloud were observed where the original cameras image them. The tests, shape
+    (t, 2, 9 + g), are the Jacobians of the straight collinearity at the original solution, by pose,
+    point and shared unknowns, for these points. Control points are adjusted by least squares.
     """
     given = problem.given._replace(tests=tests)
     tested, now, size = replace(problem, given=given), start, np.inf
@@ -262,10 +248,7 @@ def undo_absorption(
 ) -> Undone:
     """Return the poses that an adjustment with water would have found; the block stays in place.
 
-    Parameters
-    ----------
-    xyz : array, shape (m, 3)
-        Points of the apparent cloud, or tie points, spread over it; a thousand or two.
+    The points, shape (m, 3), are a thousand or two of the apparent cloud or of its tie points.
     """
     least, in_frame = LEAST_IMAGES_OF_POINT, views_in_frame(xyz, cameras)
     shown = ties_of_cloud(xyz, in_frame, cameras, least).views.camera

@@ -17,15 +17,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
-from pcfix.adjust.block import Block
+from pcfix.adjust.block import LEAST_VIEWS, Block
 from pcfix.adjust.normal import CAUCHY, HUBER, SQUARES, residuals
 from pcfix.adjust.parameters import CODES, NAMES, Unknowns
-from pcfix.adjust.precision import Precision, precision_of
+from pcfix.adjust.precision import Precision, common_errors, disagreement_of, precision_of
 from pcfix.adjust.problem import Problem, Solution, prepare
 from pcfix.adjust.result import Adjusted, adjusted_of, sigma0_of
-from pcfix.adjust.shared_errors import common_errors, disagreement_of
 from pcfix.adjust.solve import reduced_at, solve, solver
-from pcfix.adjust.ties import LEAST_VIEWS
 from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.model import FloatArray
 
@@ -45,11 +43,8 @@ OUTLIER_ROUNDS = 3
 def adjust_ties(block: Block, unknowns: Unknowns, *, choose_lens: bool = True) -> Adjusted:
     """Adjust a block of measured tie points; their noise is estimated from the residuals.
 
-    Parameters
-    ----------
-    choose_lens : bool
-        Whether lens parameters that the block does not determine are fixed, and those that lower
-        the residuals freed; else exactly those of the unknowns are free.
+    With `choose_lens`, lens parameters that the block does not determine are fixed, and those that
+    lower the residuals are freed; else exactly those of the unknowns are free.
     """
     problem, now = prepare(block, unknowns)
     counted = np.isfinite(block.sigma_px) & problem.of_ties
@@ -191,12 +186,7 @@ def weak_lens_parameters(problem: Problem, found: Solution, precision: Precision
 def missing_lens_parameters(problem: Problem, now: Solution, sigma0: float) -> list[str]:
     """Return lens parameters that lower the squares by more than chance does, the best first.
 
-    Parameters
-    ----------
-    problem, now : Problem, Solution
-        Adjusted with the parameters that the lenses have.
-    sigma0 : float
-        A-posteriori standard deviation of unit weight.
+    The solution is adjusted with the parameters that the lenses have.
     """
     names = problem.unknowns.lens
     if any(lens.projection != "perspective" for lens in problem.block.cameras.lenses or ()):

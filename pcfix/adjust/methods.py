@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from pcfix.adjust.block import Block, marks_of, plain_block, restricted, some_cameras, well_seen
 from pcfix.adjust.from_cloud import adjust_cloud
 from pcfix.adjust.from_ties import adjust_ties
-from pcfix.adjust.parameters import Unknowns
-from pcfix.adjust.precision import undetermined
+from pcfix.adjust.parameters import Unknowns, words_of
+from pcfix.adjust.precision import Precision
 from pcfix.adjust.problem import intersect_fixed
 from pcfix.adjust.result import Adjusted
 from pcfix.errors import GeometryError, PcfixWarning
-from pcfix.model import Cameras, FloatArray, GroundControl, WaterSurface
+from pcfix.model import Cameras, FloatArray, GroundControl
 from pcfix.water.surface import surface_above
 
 SMALL_WATER = 10
@@ -44,13 +45,8 @@ def adjust_block(
 ) -> Adjusted:
     """Adjust a block by measured tie points, or by the apparent cloud that it made.
 
-    Parameters
-    ----------
-    cloud : (Cameras, array of shape (m, 3)), optional
-        The original cameras, and the apparent points of the cloud that the block has in place of
-        tie points.
-    choose_lens : bool
-        Whether the observations decide which lens parameters are free.
+    `cloud` has the original cameras, and the apparent points, shape (m, 3), that the block has in
+    place of tie points. `choose_lens`: the observations decide which lens parameters are free.
     """
     # 1. Images with too few observations are excluded
     water, xyz, count = block.water, block.xyz[: block.tie_points], len(block.cameras)
@@ -88,36 +84,14 @@ def adjust_block(
 # Checks of what goes in
 
 
-def check_images(name: str, cameras: Cameras, water: WaterSurface) -> None:
-    """Check that the cameras are above the water."""
-    level = surface_above(water, cameras.centres).height_m
-    wet = np.flatnonzero(level > cameras.centres[:, 2])
-    if not len(wet):
-        return
-    image, z = cameras.labels[wet[0]], cameras.centres[wet[0], 2]
-    words = (
-        f"{name}: {len(wet)} of {len(cameras)} cameras are below the water (first {image},"
-        f" {z:.2f} m). Check the water level and the CRS of both; for underwater images give"
-        " --port."
-    )
-    values = {"path": name, "images": len(wet), "image": image}
-    raise GeometryError("cameras.under_water", words, **values)
-
-
 def check_marks(
     control: GroundControl, cameras: Cameras, name: str, *, is_placed: bool = False
 ) -> None:
     """Refuse control points whose marks are somewhere else altogether, before any adjustment.
 
     Each point is intersected from the original cameras by straight rays. All may be offset alike,
-    as the block may be if nothing else places it; one that is offset differently is a mistake.
-
-    Parameters
-    ----------
-    name : str
-        Of the file.
-    is_placed : bool
-        Whether GNSS positions have placed the block already.
+    as the block may be unless GNSS positions have placed it (`is_placed`); one that is offset
+    differently is a mistake. `name` is that of the file.
     """
     marks, _ = marks_of(control)
     found = intersect_fixed(plain_block(cameras, marks))
@@ -150,7 +124,7 @@ def check_marks(
 
 
 def _land_notes(found: Adjusted) -> list[PcfixWarning]:
-    """Return a warning if there is hardly any land; refuse that for a free water surface."""
+    """Refuse a free water surface if there is hardly any land; warn if it is fixed."""
     above, count = int((found.is_observed & ~found.is_wet).sum()), int(found.is_observed.sum())
     if found.block.water is None or above >= SMALL_WATER:
         return []
@@ -211,3 +185,42 @@ def _bed_notes(found: Adjusted) -> list[PcfixWarning]:
         " or a calibrated lens."
     )
     return [PcfixWarning("adjust.imprecise_bed", words, sigma_m=sigma_m, gsd=gsd)]
+
+
+# What is known poorly
+
+
+LIMITS = {
+    "level": 0.02, "tilt_x": 0.0005, "tilt_y": 0.0005, "index": 0.005,
+    "distance": 0.002, "centre_x": 0.002, "centre_y": 0.002, "centre_z": 0.002,
+    "shape_xx": 1e-4, "shape_xy": 1e-4, "shape_yy": 1e-4,
+}  # fmt: skip
+"""Standard errors beyond which an unknown counts as undetermined; 1e-4 / m is 2 cm at 14 m."""
+
+STRONG = 0.95
+"""Correlation of two unknowns that are hardly separated."""
+
+
+def undetermined(precision: Precision) -> list[PcfixWarning]:
+    """Return a warning for each unknown whose standard error is too large to be useful.
+
+    It names the unknown from which this one is hardly separated, if there is one.
+    """
+    notes, shared = [], precision.shared
+    for i, row in enumerate(shared):
+        (what, unit), limit = words_of(row.name), LIMITS.get(row.name, np.inf)
+        if row.sigma <= limit:
+            continue
+        words = (
+            f"the {what} is undetermined: standard error {row.sigma:.2g}{unit} (limit"
+            f" {limit:.2g}{unit})."
+        )
+        values: dict[str, Any] = {"unknown": row.name, "sigma": row.sigma}
+        r = np.where(np.arange(len(shared)) == i, 0.0, precision.correlation[i])
+        other = int(np.abs(r).argmax())
+        if abs(r[other]) > STRONG:
+            pair, values["correlated_with"] = words_of(shared[other].name)[0], shared[other].name
+            words += f" It is strongly correlated with the {pair} (r = {r[other]:.3f})."
+        words += " Fix it to a measured value, or give control points at several heights."
+        notes.append(PcfixWarning("adjust.undetermined", words, **values))
+    return notes

@@ -88,8 +88,8 @@ FEW_IMAGES = 5.0
 """Images per lens, on average, below which the lenses of one sensor share their corrections."""
 
 
-def sensor_groups(lenses: tuple[Lens, ...]) -> tuple[IntArray, list[list[int]]]:
-    """Return the sensor of each of k lenses, and the rows of each sensor.
+def sensor_groups(lenses: tuple[Lens, ...]) -> IntArray:
+    """Return the number of the sensor of each of k lenses, in the order in which they appear.
 
     Images that have a calibration each, but one sensor and frame, share the corrections.
     """
@@ -99,8 +99,7 @@ def sensor_groups(lenses: tuple[Lens, ...]) -> tuple[IntArray, list[list[int]]]:
     is_own = distinct > len(set(sensors)) and len(lenses) / distinct >= FEW_IMAGES
     keys: Sequence[object] = lenses if is_own else sensors
     number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
-    group = np.array([number[key] for key in keys], np.int64)
-    return group, [np.flatnonzero(group == i).tolist() for i in range(len(number))]
+    return np.array([number[key] for key in keys], np.int64)
 
 
 def usable_codes(lens: Lens, names: tuple[str, ...]) -> tuple[int, ...]:
@@ -129,7 +128,7 @@ def lens_parameter(lens: Lens, code: int) -> float:
     return float(values[place]) if place < len(values) else 0.0
 
 
-def moved_lens(lens: Lens, codes: tuple[int, ...], by: FloatArray) -> Lens:
+def moved_lens(lens: Lens, codes: Sequence[int], by: FloatArray) -> Lens:
     """Return a lens with corrections added to some of its parameters."""
     changes: dict[str, Any] = {}
     radial, tangential = [*lens.radial], [*lens.tangential]

@@ -64,8 +64,7 @@ class Problem:
     unknowns: Unknowns
     origin: FloatArray  # (3,), of the coordinates in `given` and in states
     given: Given  # what the kernels need
-    groups: list[list[int]]  # rows of the cameras of each sensor
-    codes: list[tuple[int, ...]]  # free lens parameters of each sensor
+    lens_unknowns: list[tuple[int, int]]  # of each the first image of its sensor, and the code
     names: list[str]  # of the g shared unknowns
 
     @property
@@ -87,10 +86,7 @@ class Problem:
     def lens_effects(self) -> FloatArray:
         """Image movement at the corner of the frame per unit of each lens unknown."""
         lenses = self.block.cameras.lenses or ()
-        pairs = zip(self.groups, self.codes, strict=True)
-        return np.array([
-            effect_at_corner(lenses[images[0]], code) for images, codes in pairs for code in codes
-        ])  # fmt: skip
+        return np.array([effect_at_corner(lenses[i], code) for i, code in self.lens_unknowns])
 
     def weighted(self, weight: FloatArray) -> Problem:
         """Return the problem with other weights of its observations."""
@@ -113,8 +109,11 @@ def prepare(
     """Return a problem and its start; the origin is the rounded mean of the cameras by default."""
     cameras, water, lenses = block.cameras, block.water, block.cameras.lenses or ()
     origin = np.round(cameras.centres.mean(axis=0)) if origin is None else origin
-    group, groups = sensor_groups(lenses)
-    codes = [usable_codes(lenses[images[0]], unknowns.lens) for images in groups]
+    group = sensor_groups(lenses)
+    first_images = np.unique(group, return_index=True)[1].tolist()
+    codes = [usable_codes(lenses[i], unknowns.lens) for i in first_images]
+    pairs = zip(first_images, codes, strict=True)
+    lens_unknowns = [(i, code) for i, of_sensor in pairs for code in of_sensor]
     numbers = surface_numbers(block, origin)
     planes, plane_names, axis, alike = _planes(block, origin, numbers)
     # columns of the shared unknowns: lenses, then surface and planes
@@ -126,9 +125,8 @@ def prepare(
     for number, other in alike.items():
         column[number] = column[other]
     names = [
-        NAMES[code] if len(groups) == 1 else f"{NAMES[code]} of sensor {i}"
-        for i, of_sensor in enumerate(codes, start=1)
-        for code in of_sensor
+        NAMES[code] if len(codes) == 1 else f"{NAMES[code]} of sensor {group[i] + 1}"
+        for i, code in lens_unknowns
     ]
     names += [name for name, one in zip((*WATER_NAMES, *plane_names), is_free, strict=True) if one]
     row, table = lens_table(lenses)
@@ -148,7 +146,7 @@ def prepare(
         origin=origin,
         curved=bool(unknowns.surface.get("shape")),
         first_lens=first_lens,
-        code=np.array([code for of_sensor in codes for code in of_sensor], np.int64),
+        code=np.array([code for _, code in lens_unknowns], np.int64),
         column=column,
         shared=len(names),
         surveyed_xyz=np.where(surveyed_weight > 0.0, surveyed_xyz - origin, 0.0),
@@ -158,7 +156,7 @@ def prepare(
         axis=axis,
         tests=np.zeros((0, 2, SHARED + len(names))),
     )
-    problem = Problem(block, unknowns, origin, given, groups, codes, names)
+    problem = Problem(block, unknowns, origin, given, lens_unknowns, names)
     state = State(
         centres, np.ascontiguousarray(cameras.rotations, np.float64), table, block.xyz - origin,
         np.concatenate([numbers, planes]), port_row(block.port),
@@ -287,12 +285,8 @@ def polynomial(water: FloatArray, x: FloatArray | float, y: FloatArray | float) 
 def prior_rows(problem: Problem, found: Solution) -> tuple[csc_array, FloatArray]:
     """Return prior knowledge of poses, lens and water as weighted observations of them.
 
-    Returns
-    -------
-    rows : sparse array, shape (n, 6 k + g)
-        Derivatives by poses and shared unknowns, over the standard deviation.
-    left : array, shape (n,)
-        Observed minus current value, over the standard deviation.
+    These are the derivatives by poses and shared unknowns, a sparse array of shape (n, 6 k + g),
+    and observed minus current values, shape (n,), both over the standard deviations.
     """
     from scipy import sparse
 
@@ -347,20 +341,19 @@ def survey_cost(problem: Problem, found: Solution) -> float:
     """Return the weighted squares of all observations that are no images."""
     given, left = problem.given, prior_rows(problem, found)[1]
     off = given.surveyed_weight * (given.surveyed_xyz - found.state.xyz) ** 2
-    on_surfaces = off_surfaces(problem, found.state)[1]
-    return float(off.sum() + left @ left + on_surfaces @ on_surfaces)
+    off_surfaces = _off_surfaces(problem, found.state)
+    return float(off.sum() + left @ left + off_surfaces @ off_surfaces)
 
 
-def off_surfaces(problem: Problem, state: State) -> tuple[IntArray, FloatArray]:
-    """Return points that lie on surfaces, and surface minus point in standard deviations.
+def _off_surfaces(problem: Problem, state: State) -> FloatArray:
+    """Return surface minus point, in standard deviations, of points that lie on surfaces.
 
-    Both have the shape (n,); points that their rays and surface do not fix are missing.
+    Points that their rays and surface do not fix are missing.
     """
     if not len(problem.given.on):
-        return np.zeros(0, np.int64), np.zeros(0)
+        return np.zeros(0)
     rows = linearised(state, problem.given, UNDAMPED, problem.block.tie_points, len(state.xyz))
-    is_condition = ~rows.is_image & rows.columns[:, 0, POINT:SHARED].any(axis=1)
-    return problem.block.owner[rows.observation[is_condition]], rows.r[is_condition, 0]
+    return rows.r[~rows.is_image & rows.columns[:, 0, POINT:SHARED].any(axis=1), 0]
 
 
 # Intersection with fixed poses

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import WATER, Block
+from pcfix.adjust.block import LEAST_VIEWS, Block
 from pcfix.adjust.normal import residuals
 from pcfix.adjust.parameters import INDEX, NAMES, PORT, SHAPE, WATER_NAMES, Unknowns, lens_parameter
 from pcfix.adjust.precision import Precision
@@ -18,13 +18,11 @@ from pcfix.adjust.problem import (
     Solution,
     intersect_fixed,
     intersected,
-    off_surfaces,
     port_of,
     solved_cameras,
     surface_numbers,
     water_of,
 )
-from pcfix.adjust.ties import LEAST_VIEWS
 from pcfix.errors import PcfixWarning, plain
 from pcfix.model import BoolArray, Cameras, FloatArray, WaterPlane, WaterSurface
 from pcfix.port.shapes import Port
@@ -214,7 +212,6 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
         "lens": _lens(a),
         "water": _surface(a, "water"),
         "port": _surface(a, "port"),
-        "on_surfaces": _on_surfaces(a.problem, a.solution),
         "poses": _poses(a),
         "precision": _precision(a.precision),
         "gnss": _gnss(a),
@@ -248,17 +245,16 @@ def _residuals(a: Adjusted, before: Intersected, points: BoolArray) -> Plain:
 def _lens(a: Adjusted) -> list[Plain]:
     """Return the free parameters of each lens: the first of the shared unknowns."""
     original, adjusted = a.block.cameras.lenses or (), a.cameras.lenses or ()
-    sensors = enumerate(zip(a.problem.groups, a.problem.codes, strict=True), start=1)
-    free = [(i, images[0], code) for i, (images, codes) in sensors for code in codes]
+    rows = zip(a.problem.lens_unknowns, a.precision.shared, strict=False)
     return [
         {
-            "sensor": original[image].sensor or f"sensor {i}",
+            "sensor": original[i].sensor or f"sensor {a.problem.given.group[i] + 1}",
             "name": NAMES[code],
-            "before": lens_parameter(original[image], code),
-            "after": lens_parameter(adjusted[image], code),
+            "before": lens_parameter(original[i], code),
+            "after": lens_parameter(adjusted[i], code),
             "sigma": unknown.sigma,
         }
-        for (i, image, code), unknown in zip(free, a.precision.shared, strict=False)
+        for (i, code), unknown in rows
     ]
 
 
@@ -285,23 +281,6 @@ def _surface(a: Adjusted, kind: str) -> Plain | None:
             "free": name in free,
         }
     return found
-
-
-def _on_surfaces(problem: Problem, now: Solution) -> list[Plain]:
-    """Return the stated and found distances of marked points from each surface, metres."""
-    (names, on, sigma_m), (points, left) = problem.block.surfaces, off_surfaces(problem, now.state)
-    sigma_m = sigma_m[points]
-    rows = [(name, on[points] == i) for i, name in enumerate((WATER, *names))]
-    return [
-        {
-            "surface": name,
-            "points": is_on.sum(),
-            "sigma_m": rms(sigma_m[is_on]),
-            "rms_m": rms((left * sigma_m)[is_on]),
-        }
-        for name, is_on in rows
-        if is_on.any()
-    ]
 
 
 def _poses(a: Adjusted) -> Plain:

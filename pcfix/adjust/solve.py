@@ -19,7 +19,7 @@ from pcfix.adjust.parameters import INDEX, moved_lens, words_of
 from pcfix.adjust.problem import Problem, Solution, cost_at, port_of, port_row, prior_rows
 from pcfix.errors import GeometryError, PcfixError
 from pcfix.lens.imaging import lens_table
-from pcfix.model import FloatArray
+from pcfix.model import FloatArray, Lens
 from pcfix.running import current
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8
@@ -33,22 +33,14 @@ EXACT = 1e-10
 ROUNDING = 1e-12
 """Share of the cost by which it may rise at the minimum."""
 
-WEAK = 1e-11
-"""Eigenvalue of the matrix with unit diagonal below which a combination is undetermined."""
-
 
 # Steps
 
 
 def solve(problem: Problem, start: Solution, loss: int = SQUARES, close: float = CLOSE) -> Solution:
-    """Minimise the weighted squared residuals.
+    """Minimise the weighted squared residuals, or a robust loss of `pcfix.adjust.normal`.
 
-    Parameters
-    ----------
-    loss : int
-        `SQUARES`, `HUBER` or `CAUCHY` of `pcfix.adjust.normal`.
-    close : float
-        Two steps in a row that lower the cost by less than this share end the round.
+    Two steps in a row that lower the cost by less than the share `close` end the round.
     """
     now = replace(start, cost=cost_at(problem, start, loss))
     damping, up, calm, steps = FIRST_DAMPING, 2.0, 0, 0
@@ -111,23 +103,21 @@ def moved_by(
         port = port_of(problem.block, water)
     except PcfixError:  # a distance below zero, or a dome that does not contain the camera
         return None
-    lenses = list(now.lenses)
-    parts = np.split(shared, given.first_lens[1:])
-    for rows, codes, by in zip(problem.groups, problem.codes, parts, strict=False):
-        # images with one lens keep one
-        new = {lens: moved_lens(lens, codes, by) for lens in {lenses[i] for i in rows}}
-        for i in rows:
-            lenses[i] = new[lenses[i]]
+    pairs, moved = [*zip(now.lenses, given.group.tolist(), strict=True)], dict[Any, Lens]()
+    for lens, sensor in set(pairs):  # images with one lens keep one
+        own = slice(*given.first_lens[sensor : sensor + 2])
+        moved[lens, sensor] = moved_lens(lens, given.code[own].tolist(), shared[own])
+    lenses = tuple(moved[pair] for pair in pairs)
     if not all(lens.focal > 0.0 for lens in lenses):
         return None
-    table = lens_table(tuple(lenses))[1]
+    table = lens_table(lenses)[1]
     return replace(
         now,
         state=State(
             state.centres + poses[:, 3:], np.ascontiguousarray(rotations),
             np.ascontiguousarray(table), state.xyz + points, water, port_row(port),
         ),
-        lenses=tuple(lenses),
+        lenses=lenses,
         shared=now.shared + shared,
     )  # fmt: skip
 
@@ -184,30 +174,15 @@ def solver(matrix: Any) -> Callable[[FloatArray], FloatArray] | None:
 # What is undetermined
 
 
-BED = {"level", "index", "tilt_x", "tilt_y", "shape_xx", "shape_xy", "shape_yy"}
-
-
 def singular(problem: Problem, solution: Solution) -> GeometryError:
     """Return an error that names the unknowns that the observations leave undetermined.
 
-    These have no observation at all, or a component in an eigenvector of an eigenvalue of zero of
-    the reduced matrix with unit diagonal: 1e-4 makes a variance a thousand times larger.
+    These are the ones on which no observation depends, or if there are none, all of them.
     """
-    from scipy.sparse import csc_array, diags_array
-    from scipy.sparse.linalg import eigsh
-
     matrix = reduced_at(problem, solution)[0]
-    diagonal = matrix.diagonal()
-    weak, why = ~(diagonal > 0.0), "no observation depends on them"
+    weak, why = ~(matrix.diagonal() > 0.0), "no observation depends on them"
     if not weak.any():
-        scale = diags_array(1.0 / np.sqrt(diagonal))
-        start = np.random.default_rng(0).normal(size=len(diagonal))
-        few = min(8, len(diagonal) - 1)
-        scaled = csc_array(scale @ matrix @ scale)
-        values, vectors = eigsh(scaled, k=few, sigma=-1e-9, which="LM", v0=start)
-        vectors = vectors[:, values < max(WEAK, 10.0 * float(values.min()))]
-        weak = np.linalg.norm(vectors, axis=1) > 1e-4
-        why = "the observations do not separate them"
+        weak, why = np.ones(len(weak), np.bool_), "the observations do not separate them"
     of_poses, of_names = np.split(weak, [len(weak) - len(problem.names)])
     images = np.flatnonzero(of_poses.reshape(-1, 6).any(axis=1))
     labels = [problem.block.cameras.labels[i] for i in images]
@@ -216,14 +191,10 @@ def singular(problem: Problem, solution: Solution) -> GeometryError:
     if labels:
         some = f"of {', '.join(labels[:3])}" if len(labels) <= 3 else f"of {len(labels)} images"
         words.append(f"the poses {some}")
-    remedy = "fix some of them"
-    if set(names) & BED and not problem.block.wet.any():
-        remedy = "fix them, as no point is under water"
-    elif labels:
-        remedy = "give GNSS positions, three control points or a free network"
+    datum = ", or give GNSS positions or three control points" if labels else ""
     return GeometryError(
         "adjust.singular",
-        f"The adjustment cannot determine {', '.join(words)}: {why}. To solve it, {remedy}.",
+        f"The adjustment cannot determine {', '.join(words)}: {why}. Fix some of them{datum}.",
         unknowns=names,
         images=labels,
     )

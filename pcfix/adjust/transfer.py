@@ -53,21 +53,9 @@ def transfer(
 ) -> tuple[FloatArray, BoolArray]:
     """Intersect the images of points again, with adjusted cameras.
 
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Apparent points, metres, world frame.
-    views : Views
-        Cameras that intersect each point; weights do not count.
-    original, adjusted : Cameras
-        The same images, in the same order, with angles and lenses.
-
-    Returns
-    -------
-    shift_m : array, shape (n, 3)
-        Zero for points that stay.
-    moved : array of bool, shape (n,)
-        Points that two cameras or more image, before and after.
+    The cameras are the same images in the same order, with angles and lenses. Points and shifts
+    have the shape (n, 3), metres, world frame. Returns the shifts, zero for points that stay, and
+    which points two cameras or more image, before and after.
     """
     shift, moved = np.zeros((len(xyz), 3)), np.zeros(len(xyz), np.bool_)
     start, camera = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
@@ -211,21 +199,12 @@ class CloudTransfer:
     row: IntArray  # (o,), row here of each original camera as read, -1 if it was not adjusted
 
     def step(self, xyz: FloatArray, listed: Views | None) -> Transferred:
-        """Transfer points.
-
-        Parameters
-        ----------
-        xyz : array, shape (n, 3)
-            Metres, world frame.
-        listed : Views or None
-            Of the original cameras, as read.
-        """
+        """Transfer points, shape (n, 3), metres; `listed` are views of the original cameras."""
         original, adjusted = self.original, self.adjusted
         shift, moved = np.zeros((len(xyz), 3)), np.zeros(len(xyz), np.bool_)
         views = None if listed is None else renumbered(listed, self.row)[0]
         if views is not None:
-            # whatever kind of list it is for the correction, these images show the point
-            shift, moved = transfer(xyz, replace(views, kind="tracks"), original, adjusted)
+            shift, moved = transfer(xyz, views, original, adjusted)
         left = np.flatnonzero(~moved)
         left = left[spatial_order(np.ascontiguousarray(xyz[left]))]
         for first in range(0, len(left), POINTS_AT_ONCE):

@@ -5,19 +5,26 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.adjust.block import WATER, block_of, check_datum, gnss_with_sigma
-from pcfix.adjust.methods import adjust_block, check_control, check_images, check_marks
+from pcfix.adjust.block import (
+    LEAST_VIEWS,
+    WATER,
+    block_of,
+    check_datum,
+    gnss_with_sigma,
+    some_ties,
+    ties_of_cloud,
+    usable_ties,
+    with_places,
+)
+from pcfix.adjust.methods import adjust_block, check_control, check_marks
 from pcfix.adjust.parameters import Unknowns, default_lens
 from pcfix.adjust.result import Adjusted, adjustment_dict, before_of
-from pcfix.adjust.ties import LEAST_VIEWS, some_ties, ties_of_cloud, usable_ties, with_places
 from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.diagnosis import flags_of, water_word
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
@@ -51,6 +58,7 @@ from pcfix.port.shapes import FlatPort, Port
 from pcfix.refract.choice import views_in_frame
 from pcfix.report.adjustment import adjustment_page
 from pcfix.running import running, threads
+from pcfix.water.checks import check_above_water
 from pcfix.water.index import index_of
 
 if TYPE_CHECKING:
@@ -142,7 +150,7 @@ def adjust_into(
         )
         raise SettingError("water.dimension", words, value=str(water))
     if water is not None:
-        check_images(name, original, water)
+        check_above_water(original, water)
     _check_free(given, water, inputs.port)
     gnss, reason, notes = _gnss(original, name, given)
     control = given.gcps
@@ -161,7 +169,7 @@ def adjust_into(
     if ties is not None:
         ties = usable_ties(with_places(ties, original), original)
     if ties is None or len(ties.xyz) < LEAST_TIES:
-        ties = _ties_of_cloud(view, original, name, given, 0 if ties is None else len(ties.xyz))
+        ties = _ties_of_cloud(view, original, name, 0 if ties is None else len(ties.xyz))
         cloud_points = original, ties.xyz
     cameras, unknowns = original, _unknowns(given, original)
     if given.lens is not None:
@@ -271,15 +279,12 @@ def _unknowns(given: AdjustOptions, cameras: Cameras) -> Unknowns:
     return Unknowns(given.poses, lens, surface, free_network=given.datum == "free")
 
 
-def _ties_of_cloud(
-    view: CloudView | None, cameras: Cameras, name: str, given: AdjustOptions, measured: int
-) -> TiePoints:
+def _ties_of_cloud(view: CloudView | None, cameras: Cameras, name: str, measured: int) -> TiePoints:
     """Return random points of the cloud in all images that show them, as tie points."""
-    if view is None or given.ties == "measured":
-        cloud_too = "" if given.ties == "measured" else ", and there is no --cloud"
+    if view is None:
         words = (
-            f"{name}: has {measured} usable tie points ({LEAST_TIES} are needed){cloud_too}."
-            f" {_EXPORTS}"
+            f"{name}: has {measured} usable tie points ({LEAST_TIES} are needed), and there is no"
+            f" --cloud. {_EXPORTS}"
         )
         raise InputError("cameras.no_ties", words, path=name, ties=measured, least=LEAST_TIES)
     count = min(CLOUD_POINTS, view.points)
@@ -319,16 +324,17 @@ def _write_models(folder: Path, found: Adjusted) -> None:
         start = np.concatenate([[0], np.cumsum(counts)])
         ties = TiePoints(found.xyz[:m], Views(start, block.camera[used]), block.image_xy[used])
         ties = some_ties(ties, np.flatnonzero(counts >= LEAST_VIEWS))
-    write_table_too = partial(write_table, folder, cameras)
+    failed = ""
     try:
         write_colmap(folder / MODELS[0], cameras, ties)
     except InputError as error:
-        words = f"{MODELS[0]} was not written: {str(error).replace(f'{folder}/', '')}"
-        found.notes.append(PcfixWarning("output.format", words, name=MODELS[0]))
-        write_table_too()
-    else:
-        with suppress(InputError):  # the table is for blocks with one simple lens
-            write_table_too()
+        failed = f"{MODELS[0]} was not written: {str(error).replace(f'{folder}/', '')}"
+        found.notes.append(PcfixWarning("output.format", failed, name=MODELS[0]))
+    try:
+        write_table(folder, cameras)
+    except InputError:  # the table is for blocks with one simple lens
+        if failed:
+            raise
 
 
 def correct_words(found: Adjusted, model: File, out_dir: File, options: AdjustOptions) -> str:

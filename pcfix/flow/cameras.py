@@ -86,7 +86,7 @@ def check_cameras(
         cameras, problem = read, str(error)
     if given.gnss is not None:
         cameras = read_gnss(given.gnss, cameras)
-    diagnosis, remedy = None, ("", "")
+    diagnosis, remedy = None, ""
     if view is not None and surface is not None:
         reference = None if given.reference is None else read_reference(given.reference)
         if reference is not None:
@@ -142,7 +142,7 @@ class CamerasReport:
     sample_xyz: FloatArray  # points of the cloud, shape (m, 3), for a picture
     level_m: float | None  # mean height of the water
     diagnosis: Diagnosis | None  # whether the poses have absorbed the refraction
-    remedy: tuple[str, str]  # the command that corrects the poses, and a remark
+    remedy: str  # the command that corrects the poses
 
 
 def sensors_of(cameras: Cameras, above_m: FloatArray | None) -> list[Plain]:
@@ -299,8 +299,7 @@ def cameras_text(report: CamerasReport) -> str:
         rows.append(("Refraction", verdict))
         rows += [(s.name[:1].upper() + s.name[1:], says[s.speaks] + s.words) for s in found.signs]
         if found.absorbed:
-            command, because = report.remedy
-            rows += [("Next step", f"adjust the poses{because}:"), ("", command)]
+            rows += [("Next step", "adjust the poses:"), ("", report.remedy)]
     return aligned(f"{r['path']}: {cameras.source or 'cameras'}", rows, cameras.notes)
 
 

@@ -334,8 +334,8 @@ class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
     datum: Literal["observed", "free"] = option("observed")
     """Datum of the block: from observations, or free: mean position, direction and scale of the
     original poses."""
-    ties: Literal["auto", "measured", "cloud"] = option("auto")
-    """Use measured tie points, or points of the cloud; auto: measured if there are any."""
+    ties: Literal["auto", "cloud"] = option("auto")
+    """Use points of the cloud as tie points; auto: only if there are no measured ones."""
     gnss_sigma: float | None = option(None, above=0)
     """Standard deviation of GNSS positions that state none. [m] [default: from their residuals]"""
 

@@ -19,13 +19,8 @@ WHERE = (("land", "on land"), ("water", "under water"))
 MOST_LISTED = 12
 """Surveyed points in the text; the page has all of them."""
 _FACTS: RowTable = (
-    ("Lens", "fixed", "lens_is_fixed"),
-    ("Water", "{water[surface]}", "has_shape"),
-    ("Water", "none", "no_water"),
+    ("Water", "{water[surface]}", "water"),
     ("Port", "--port {port[surface]}", "port"),
-    ("{label}", "{after:.6g}{unit}, fixed", "*held"),
-    ("On {surface}", "{points:,} marked points, distance RMS {rms_m:z.4f} m (given {sigma_m:g} m)",
-     "*on_surfaces"),
     ("Poses", "{poses_words}", "images"),
     ("", "centres moved by {poses[moved_rms_m]:.3f} m, rotated by {poses[turned_rms_deg]:.4f} deg"
      " (RMS)", "moved"),
@@ -74,7 +69,7 @@ def adjustment_page(d: Plain) -> str:
     how = "with refraction at the housing port" if d["port"] else how
     lead = f"{_head(d)}, {how}. Residuals: {_residuals(d)} (RMS of a coordinate)."
     head = Table("In short", [], [list(row) for row in _facts(d)])
-    tables = [_change_table(d), _residual_table(d), _survey_table(d), _correlation_table(d)]
+    tables = [_change_table(d), _residual_table(d), _survey_table(d)]
     tables = [table for table in tables if table.rows]
     return render(Report(TITLE, lead, head, all_notes(d), tables))
 
@@ -99,21 +94,12 @@ def _residuals(d: Plain) -> str:
 
 def _facts(d: Plain) -> Rows:
     """Return labels and values of what the table of changes does not have."""
-    o, water, is_free = d["observations"], d["water"], d["unknowns"]["poses"] == "free"
+    o, is_free = d["observations"], d["unknowns"]["poses"] == "free"
     kinds = {"tie points": "measured tie points", "cloud": "points of the cloud in original images"}
-    # a level surface has no tilt to show
-    held = [
-        row | {"label": label.capitalize(), "unit": unit}
-        for name, row in _surface(d)
-        for label, unit in [words_of(name)]
-        if not row["free"] and not (name.startswith("tilt") and row["after"] == 0.0)
-    ]
     network = ", a free network" if d["unknowns"]["free_network"] else ""
     return filled(_FACTS, d | {
         "poses_words": f"free{network}" if is_free else "fixed", "o": o, "kind": kinds[d["source"]],
         "o_share": share(o["left_out"], o["used"] + o["left_out"]),
-        "has_shape": water is not None and not water["surface"].startswith("level"),
-        "lens_is_fixed": not d["lens"], "held": held, "no_water": water is None,
         "moved": is_free and d["poses"]["moved_rms_m"], "is_precise": is_free,
         "bed_if": "" if is_free else ", if the fixed poses are right",
         "bed_m": (d["residuals"]["water"]["sigma_xyz_m"] or [None])[-1],
@@ -166,16 +152,6 @@ def _change_table(d: Plain) -> Table:
 def _length(values: list[float | None]) -> float:
     """Return the length of a vector, of its known components."""
     return float(np.sqrt(sum(value**2 for value in values if value is not None)))
-
-
-def _correlation_table(d: Plain) -> Table:
-    p = d["precision"]
-    names = [row["name"].replace("_", " ") for row in p["shared"]]
-    rows = [
-        [name, *(fixed(value, 3, "+") for value in row)]
-        for name, row in zip(names, p["correlation"], strict=True)
-    ]
-    return Table("Correlations of the shared unknowns", ["", *names], rows if len(rows) > 1 else [])
 
 
 def _survey_table(d: Plain) -> Table:

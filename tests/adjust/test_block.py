@@ -5,8 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from pcfix.adjust.block import block_of, restricted, well_seen
-from pcfix.adjust.ties import usable_ties
+from pcfix.adjust.block import block_of, restricted, usable_ties, well_seen
 from pcfix.model import TiePoints, Views
 from tests.utils.codes import refused
 from tests.utils.tie_points import simulate_tie_points

@@ -6,11 +6,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pcfix.adjust.block import block_of
+from pcfix.adjust.block import block_of, ties_of_cloud
 from pcfix.adjust.from_cloud import adjust_cloud
 from pcfix.adjust.from_ties import adjust_ties
 from pcfix.adjust.parameters import Unknowns
-from pcfix.adjust.ties import ties_of_cloud
 from pcfix.model import GnssPositions
 from tests.utils.codes import refused
 from tests.utils.tie_points import simulate_tie_points

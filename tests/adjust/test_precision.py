@@ -6,8 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from pcfix.adjust.methods import undetermined
 from pcfix.adjust.parameters import Unknowns
-from pcfix.adjust.precision import members_of, precision_of, undetermined
+from pcfix.adjust.precision import members_of, precision_of
 from pcfix.adjust.problem import solved_cameras, water_of
 from pcfix.adjust.solve import moved_by
 from tests.utils.adjust_twin import Twin

@@ -5,8 +5,9 @@ from functools import cache
 
 import numpy as np
 
+from pcfix.adjust.methods import undetermined
 from pcfix.adjust.parameters import Unknowns
-from pcfix.adjust.precision import members_of, precision_of, undetermined
+from pcfix.adjust.precision import members_of, precision_of
 from pcfix.adjust.problem import water_of
 from pcfix.model import WaterPlane, WaterRaster
 from pcfix.water.surface import surface_above

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from pcfix.adjust.methods import undetermined
 from pcfix.adjust.parameters import Unknowns
-from pcfix.adjust.precision import precision_of, undetermined
+from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import solved_cameras, water_of
 from pcfix.model import WaterPlane
 from tests.utils.adjust_twin import Twin

@@ -140,9 +140,6 @@ def test_shape_and_waterline(files, tmp_path):
         gcps=tmp_path / "marks.csv", lens=files.folder / "lens.csv",
     )  # fmt: skip
     told = json.loads((tmp_path / "out" / "adjustment.json").read_text())
-    (row,) = told["on_surfaces"]
-    assert (row["surface"], row["points"]) == ("water", 12)
-    assert row["rms_m"] < 0.01  # m: what is given
     assert {row["name"] for row in told["control"]["points"]} == {
         row.name for row in found.control if row.role == "control"
     }

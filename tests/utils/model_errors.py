@@ -11,12 +11,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pcfix.adjust.block import block_of as block_to_adjust
+from pcfix.adjust.block import usable_ties
 from pcfix.adjust.methods import adjust_block
 from pcfix.adjust.normal import CAUCHY, SQUARES
 from pcfix.adjust.parameters import Unknowns, default_lens
 from pcfix.adjust.problem import intersect_fixed
 from pcfix.adjust.result import Adjusted
-from pcfix.adjust.ties import usable_ties
 from pcfix.model import Cameras, FloatArray, TiePoints, WaterPlane
 from tests.utils.tie_blocks import block_of
 from tests.utils.tie_points import TieScene, simulate_tie_points
