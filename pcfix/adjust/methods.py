@@ -30,6 +30,16 @@ ELSEWHERE = 0.1
 BED_GSD = 1.5
 """Standard error of the heights of the bed, in ground pixels, that is worth a warning."""
 
+LIMITS = {
+    "level": 0.02, "tilt_x": 0.0005, "tilt_y": 0.0005, "index": 0.005,
+    "distance": 0.002, "centre_x": 0.002, "centre_y": 0.002, "centre_z": 0.002,
+    "shape_xx": 1e-4, "shape_xy": 1e-4, "shape_yy": 1e-4,
+}  # fmt: skip
+"""Standard errors beyond which an unknown counts as undetermined; 1e-4 / m is 2 cm at 14 m."""
+
+STRONG = 0.95
+"""Correlation of two unknowns that are hardly separated."""
+
 _REMEDY = (
     "Check its name, coordinates and marks (swapped names?). A point with the role check has no"
     " weight."
@@ -185,20 +195,6 @@ def _bed_notes(found: Adjusted) -> list[PcfixWarning]:
         " or a calibrated lens."
     )
     return [PcfixWarning("adjust.imprecise_bed", words, sigma_m=sigma_m, gsd=gsd)]
-
-
-# What is known poorly
-
-
-LIMITS = {
-    "level": 0.02, "tilt_x": 0.0005, "tilt_y": 0.0005, "index": 0.005,
-    "distance": 0.002, "centre_x": 0.002, "centre_y": 0.002, "centre_z": 0.002,
-    "shape_xx": 1e-4, "shape_xy": 1e-4, "shape_yy": 1e-4,
-}  # fmt: skip
-"""Standard errors beyond which an unknown counts as undetermined; 1e-4 / m is 2 cm at 14 m."""
-
-STRONG = 0.95
-"""Correlation of two unknowns that are hardly separated."""
 
 
 def undetermined(precision: Precision) -> list[PcfixWarning]:

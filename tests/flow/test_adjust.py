@@ -185,29 +185,14 @@ def test_written(files, written):
         np.testing.assert_allclose(*turns, atol=1e-7)
         assert read.lenses[0].focal == pytest.approx(found.cameras.lenses[0].focal, abs=1e-4)
         np.testing.assert_allclose(read.centres[order], found.cameras.centres, atol=1e-3)
+    told = json.loads((out / "adjustment.json").read_text("utf-8"))
+    assert told["sigma0"] == pytest.approx(found.sigma0)
+    assert all(
+        told["residuals"][key]["rms_before_px"] > 2.0 * IMAGE_PX for key in ("land", "water")
+    )
     page = (out / "report.html").read_text("utf-8")
     assert "<html" in page
     assert "Refractive bundle adjustment" in page
-
-
-def test_summary(files, written):
-    out, found = written
-    told = json.loads((out / "adjustment.json").read_text("utf-8"))
-    assert told["model"] == str(files.folder / "model")
-    assert told["source"] == "tie points"
-    assert told["images"] == len(found.cameras)
-    assert told["sigma0"] == pytest.approx(found.sigma0)
-    for where, rows in (("land", ~found.is_wet), ("water", found.is_wet)):
-        r = found.residual_px[found.used & rows[found.block.owner]]
-        rms = np.sqrt(np.nanmean(r**2))
-        assert told["residuals"][where]["rms_px"] == pytest.approx(rms, rel=1e-3)
-        assert told["residuals"][where]["rms_before_px"] > 2.0 * IMAGE_PX
-    assert told["gnss"]["images"] == len(found.cameras)
-    assert {row["name"] for row in told["control"]["points"]} == {
-        row.name for row in found.control if row.role == "control"
-    }
-    assert told["check"]["points"]
-    assert told["unknowns"]["lens"] == list(found.unknowns.lens)
 
 
 @pytest.mark.usefixtures("undrawn")
