@@ -57,7 +57,7 @@ PARTS = 5
 OUTLIERS = 0.05
 """Share of the tie points that is excluded, those with the worst residuals."""
 SHARE, MOST_SHARE, MOST_SIGMA = 0.4, 2.0, 0.15
-"""Share of the refraction absorbed from which poses count as bent, the largest plausible one, and
+"""Share of the refraction absorbed from which poses count as wrong, the largest plausible one, and
 the largest useful standard error. On simulated blocks with 0.5 px and 3 cm it is within 0.1 of 0
 with true poses, and 0.54 to 1.1 after an ordinary adjustment, smaller with more weight of the GNSS;
 see tests/adjust/test_diagnosis.py."""
@@ -204,7 +204,7 @@ def tie_point_sign(
 
 
 def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, undone: Undone) -> Sign:
-    """Look for the pattern in which this water bends the block in adjusted minus GNSS positions.
+    """Look for the pattern of absorbed refraction in adjusted minus GNSS positions.
 
     The pattern is the centres minus those that an adjustment with water finds without the GNSS
     (`pcfix.adjust.from_cloud.undo_absorption`).

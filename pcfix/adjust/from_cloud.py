@@ -17,10 +17,10 @@ residual are not those that change it). Shift, turn and scale of the block are l
 positions or control points. Taking pi_original(P) as measurements and minimising r would pull the
 solution back to the original one instead.
 
-Points of the apparent cloud stand for the tie points of that adjustment, which were spread in much
-the same way. They have no noise; their weight is how well they stand for the tie points. It is the
+Points of the apparent cloud replace the tie points of that adjustment, which were spread in much
+the same way. They have no noise; their weight is how well they represent the tie points. It is the
 largest with which GNSS positions and control points fit within their standard deviations. They
-count in every image in whose frame they lie, as the software matched features in all of these.
+count in every image in whose frame they are, as the software matched features in all of these.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def adjust_cloud(
     *,
     choose_lens: bool = False,
 ) -> Adjusted:
-    """Adjust a block whose tie points are points of the cloud that its original cameras made.
+    """Adjust a block by points of the cloud that was reconstructed with its original cameras.
 
     The cameras of the block are the start. `apparent_xyz`, shape (m, 3), is where the cloud has the
     points of the block; control points as surveyed. With `choose_lens`, of the lens only the focal
@@ -144,7 +144,7 @@ def _check(block: Block, unknowns: Unknowns) -> None:
 
 
 def _note(chosen: Trial, unknowns: Unknowns) -> PcfixWarning:
-    """Return what was decided, with a warning if the points stand poorly for tie points."""
+    """Return what was decided, with a warning if the points represent tie points poorly."""
     count, free = int(chosen.problem.block.start[-1]), chosen.problem.unknowns.lens
     words = (
         f"No tie points: {count:,} images of points of the cloud were used with a standard"
@@ -229,7 +229,7 @@ def _unsolved(why: str) -> GeometryError:
 
 
 SIGMA_PX = 0.25
-"""Of an image; small, so that the centres only hold the block as a whole."""
+"""Of an image; small, so that the centres only hold the block in place."""
 OWN_SIGMA_M = 1.0
 """Of a projection centre, which holds the block where it is."""
 LEAST_IMAGES_OF_POINT, LEAST_POINTS, LEAST_IMAGES = 3, 10, 5

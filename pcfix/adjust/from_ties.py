@@ -1,8 +1,8 @@
 """Adjustment by tie points: noise, outliers, and which lens parameters are free.
 
-An adjustment without water bends its lens to absorb refraction: square pixels get an aspect, a lens
-without distortion some of it. What it left must be free to go back, and missing terms must be
-found. So the block is adjusted with the parameters that its lenses have, and each other parameter
+An adjustment without water changes its lens to absorb refraction: square pixels get an aspect, a
+lens without distortion some of it. Changed terms must be free to return, and missing ones be found.
+So the block is adjusted with the parameters that its lenses have, and each other parameter
 is tested: by how much would it lower the weighted squares?
 
 That needs no further adjustment. With the normal equations [[A, B], [B', C]] of all unknowns and of
@@ -160,9 +160,9 @@ WEAK_PX = 2.0
 """Standard error of the image at the corner of the frame above which a lens parameter is fixed, if
 the residuals permit; the focal length is always free."""
 
-BENT = 0.05
-"""Probability that weak parameters move as far by chance. An adjustment without water bends them
-too: fixing them there bends the block instead, which no standard error shows."""
+CHANGED = 0.05
+"""Probability that weak parameters move as far by chance. An adjustment without water changes
+them too: fixing them there deforms the block instead, which no standard error shows."""
 
 TRIED = ("b1", "k1", "k2", "k3", "p1", "p2")
 """Terms that a lens may lack. Sensors have no skew b2, nor do COLMAP's lenses."""
@@ -180,7 +180,7 @@ def weak_lens_parameters(problem: Problem, found: Solution, precision: Precision
     rows = np.flatnonzero(np.isin(names, weak))
     went = found.shared[rows] / sigma[rows]
     squares = went @ np.linalg.pinv(precision.correlation[np.ix_(rows, rows)]) @ went
-    return [] if squares > chdtri(max(len(rows), 1), BENT) else weak
+    return [] if squares > chdtri(max(len(rows), 1), CHANGED) else weak
 
 
 def missing_lens_parameters(problem: Problem, now: Solution, sigma0: float) -> list[str]:

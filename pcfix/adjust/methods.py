@@ -53,7 +53,7 @@ def adjust_block(
     cloud: tuple[Cameras, FloatArray] | None = None,
     choose_lens: bool = True,
 ) -> Adjusted:
-    """Adjust a block by measured tie points, or by the apparent cloud that it made.
+    """Adjust a block by measured tie points, or by its apparent cloud.
 
     `cloud` has the original cameras, and the apparent points, shape (m, 3), that the block has in
     place of tie points. `choose_lens`: the observations decide which lens parameters are free.
@@ -110,7 +110,7 @@ def check_marks(
         return
     off = found.xyz - control.xyz
     middle = np.median(off[met], axis=0)
-    apart = np.where(met, np.linalg.norm(off - middle, axis=1), 0.0)
+    distance = np.where(met, np.linalg.norm(off - middle, axis=1), 0.0)
     height = float(np.median(cameras.centres[:, 2]) - np.nanmedian(control.xyz[:, 2]))
     if is_placed and np.abs(middle).max() > ELSEWHERE * height > 0.0:
         x, y, z = (-middle).tolist()
@@ -120,12 +120,12 @@ def check_marks(
             " another CRS or height datum; name it with --gcps-crs or --gnss-crs."
         )
         raise GeometryError("gcps.offset", words, path=name, offset_m=[x, y, z])
-    worst = int(np.argmax(apart))
-    if apart[worst] > ELSEWHERE * height > 0.0:
+    worst = int(np.argmax(distance))
+    if distance[worst] > ELSEWHERE * height > 0.0:
         point = control.names[worst]
         words = (
-            f"{name}: control point {point} does not fit: its marks intersect {apart[worst]:.1f} m"
-            f" from its coordinates, relative to the other points. {_REMEDY}"
+            f"{name}: control point {point} does not fit: its marks intersect"
+            f" {distance[worst]:.1f} m from its coordinates, relative to the other points. {_REMEDY}"
         )
         raise GeometryError("gcps.gross_error", words, path=name, point=point)
 

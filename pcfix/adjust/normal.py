@@ -95,7 +95,7 @@ def linearise_point(
     """Linearise all observations of a point; invert its normal matrix V = sum B'B in place.
 
     Returns how many rows of the workspace count, and how many of them are images (the other one is
-    a condition). Zero if the rays do not fix the point: then it tells nothing about the cameras.
+    a condition). Zero if the rays do not fix the point: then it does not constrain the cameras.
     """
     v, rhs, own, count = work.v, work.rhs, work.own, 0
     v[:], rhs[:] = 0.0, 0.0

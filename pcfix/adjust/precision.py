@@ -22,7 +22,7 @@ of tiles of the frame as candidates besides the unknowns, R = C - B' A^-1 B and 
 covariance of the tiles. That gives the likelihood of s. The mean over all s and ranges is used, so
 that fields too small to be found count too. The unknowns move by A^-1 B e.
 
-Standard errors do not tell that errors of a block are correlated: a focal length that is too long
+Standard errors do not show that errors of a block are correlated: a focal length that is too long
 is compensated by cameras that are too high. So members of an ensemble are drawn from the joint
 covariance. Whatever is computed with each of them in turn scatters by all errors at once.
 """

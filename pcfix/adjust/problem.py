@@ -51,7 +51,7 @@ NETWORK_SIGMA_M = 1e-4
 """Standard deviation of the mean of the projection centres in a free network."""
 
 CELLS = 400
-"""Of a raster of curved water, along its longer side: a bend of 10 cm is kept within 1 um."""
+"""Of a raster of curved water, along its longer side, which represents 10 cm to 1 um."""
 MARGIN = 0.2
 """By which that raster exceeds the block, as a share of its extent."""
 

@@ -8,7 +8,7 @@ changed, so it moves to P', where the same image coordinates intersect now:
 with straight rays, as ordinary software intersects them, land and bed alike. The cloud is then the
 one that the same software would have made with the adjusted cameras, and can be corrected with them
 by any method. Points are classified as submerged afterwards, because an adjustment without water
-may sink or lift whole beaches.
+may lower or raise a beach.
 """
 
 from __future__ import annotations

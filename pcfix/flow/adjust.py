@@ -95,7 +95,7 @@ def adjust_cameras(
     Parameters
     ----------
     model : path or Cameras
-        See `pcfix.read_cameras`; with tie points, or together with the cloud that it made.
+        See `pcfix.read_cameras`; with tie points, or together with its cloud.
     out_dir : path, optional
         A new folder for the adjusted model as ``colmap/``, for blocks with one simple lens as
         ``cameras.csv`` too, ``ensemble.npz`` (see `pcfix.adjust.precision.Members`),

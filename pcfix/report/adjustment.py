@@ -1,6 +1,6 @@
 """The report of an adjustment: its summary as text, and a page of tables.
 
-All words are made of the plain values of `adjustment_dict`, so that a resumed run has them too.
+All text is derived from the plain values of `adjustment_dict`, which a resumed run has, too.
 """
 
 from __future__ import annotations
