@@ -125,7 +125,8 @@ def check_marks(
         point = control.names[worst]
         words = (
             f"{name}: control point {point} does not fit: its marks intersect"
-            f" {distance[worst]:.1f} m from its coordinates, relative to the other points. {_REMEDY}"
+            f" {distance[worst]:.1f} m from its coordinates, relative to the other points."
+            f" {_REMEDY}"
         )
         raise GeometryError("gcps.gross_error", words, path=name, point=point)
 
