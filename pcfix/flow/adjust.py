@@ -47,14 +47,13 @@ from pcfix.model import (
     TiePoints,
     Views,
     WaterDimension,
-    WaterMesh,
     WaterPlane,
     WaterRaster,
     WaterSurface,
 )
-from pcfix.options.correct import WATER_UNKNOWNS, AdjustOptions
+from pcfix.options.correct import AdjustOptions
 from pcfix.options.declare import File, taken
-from pcfix.port.shapes import FlatPort, Port
+from pcfix.port.shapes import DomePort, FlatPort, Port
 from pcfix.refract.choice import views_in_frame
 from pcfix.report.adjustment import adjustment_page
 from pcfix.running import running, threads
@@ -151,7 +150,8 @@ def adjust_into(
         raise SettingError("water.dimension", words, value=str(water))
     if water is not None:
         check_above_water(original, water)
-    _check_free(given, water, inputs.port)
+    unknowns = _unknowns(given, original)
+    _check_free(unknowns, water, inputs.port)
     gnss, reason, notes = _gnss(original, name, given)
     control = given.gcps
     gcps = "gcps" if isinstance(control, GroundControl) else str(control)
@@ -171,9 +171,7 @@ def adjust_into(
     if ties is None or len(ties.xyz) < LEAST_TIES:
         ties = _ties_of_cloud(view, original, name, 0 if ties is None else len(ties.xyz))
         cloud_points = original, ties.xyz
-    cameras, unknowns = original, _unknowns(given, original)
-    if given.lens is not None:
-        cameras = _calibrated(given.lens, original)
+    cameras = original if given.lens is None else _calibrated(given.lens, original)
     index, level_sigma_m = index_of(given.index, given.index_formula)[0], unknowns.water_sigma[0]
     block = block_of(
         cameras, ties, water, index, inside=None if mask is None else mask.inside,
@@ -193,24 +191,21 @@ def adjust_into(
     return found
 
 
-def _check_free(given: AdjustOptions, water: WaterSurface | None, port: Port | None) -> None:
+def _check_free(unknowns: Unknowns, water: WaterSurface | None, port: Port | None) -> None:
     """Refuse unknowns that water or port do not have."""
-    what, known = "the water", [*WATER_UNKNOWNS[:4]]
-    if isinstance(water, WaterMesh | WaterRaster):
-        what, known = "a mesh or raster of water", ["index"]
-    if port is not None:
-        is_flat = isinstance(port, FlatPort)
-        what = "a flat port" if is_flat else "a dome"
-        known = ["index", "distance" if is_flat else "centre"]
-    stated = {"level": given.sigma_level, "tilt": given.sigma_tilt}
-    for name in (*given.free, *(name for name, sigma in stated.items() if sigma)):
+    match port or water:
+        case FlatPort():
+            what, known = "a flat port", ["index", "distance"]
+        case DomePort():
+            what, known = "a dome", ["index", "centre"]
+        case WaterPlane():
+            what, known = "the water", ["level", "tilt", "index", "shape"]
+        case _:
+            what, known = "a mesh or raster of water", ["index"]
+    for name in unknowns.surface:
         if name not in known:
-            raise SettingError(
-                "option.choice",
-                f"--free {name}: {what} has no free {name}. Use {', '.join(known)}.",
-                option="free",
-                value=name,
-            )
+            words = f"--free {name}: {what} has no free {name}. Use {', '.join(known)}."
+            raise SettingError("option.choice", words, option="free", value=name)
 
 
 def _check_surfaces(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from pcfix.errors import SettingError
 from pcfix.options.declare import File, OptionSet, number_or, option, options_of, words
@@ -246,7 +246,6 @@ WaterUnknown = Literal["level", "tilt", "index", "shape", "distance", "centre"]
 LensUnknown = Literal[
     "f", "cx", "cy", "b1", "b2", "p1", "p2", "k1", "k2", "k3", "k4", "k5", "k6", "k7", "k8"
 ]
-WATER_UNKNOWNS: tuple[str, ...] = get_args(WaterUnknown)
 
 
 class SurveyedOptions(OptionSet, panel=Panel.CAMERAS):
