@@ -11,7 +11,6 @@ from pcfix.adjust.from_cloud import adjust_cloud
 from pcfix.adjust.from_ties import adjust_ties
 from pcfix.adjust.parameters import Unknowns
 from pcfix.model import GnssPositions
-from tests.utils.codes import refused
 from tests.utils.tie_points import simulate_tie_points
 from tests.utils.unaware_blocks import unaware
 
@@ -87,16 +86,3 @@ def test_noise():
     # 1.4 and 0.6 of the standard errors of tie points, which are 16 mm
     assert np.sqrt(np.mean((away / sigma_m) ** 2)) < 2.0
     assert np.sqrt(np.mean((apart / sigma_m) ** 2)) < 1.0
-
-
-@pytest.mark.parametrize(
-    ("unknowns", "code"),
-    [
-        (Unknowns(free_network=True), "adjust.cloud_needs_datum"),
-        (Unknowns(poses="fixed"), "adjust.cloud_needs_datum"),
-        (Unknowns(surface={"level": np.inf}), "adjust.cloud_needs_water"),
-    ],
-)
-def test_refused(unknowns, code):
-    with refused(code):
-        adjust_cloud(*cloud_block(block(40), gnss=not unknowns.free_network), unknowns)

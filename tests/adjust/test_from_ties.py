@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.adjust.block import block_of, check_datum
+from pcfix.adjust.block import block_of
 from pcfix.adjust.from_ties import adjust_ties
 from pcfix.adjust.parameters import Unknowns, default_lens
 from pcfix.flow.adjust import adjust_cameras
 from tests.utils.block_kinds import write_kind
-from tests.utils.codes import refused
 from tests.utils.nightly import mostly_nightly
 from tests.utils.tie_blocks import block_of as simple_block
 from tests.utils.tie_points import simulate_tie_points
@@ -113,17 +112,6 @@ def test_marks_are_no_outliers():
     worst = max(found.control, key=lambda row: row.rms_px)
     assert worst.name == control.names[0]
     assert worst.rms_px > 10.0
-
-
-def test_datum():
-    made = scene()
-    nothing = block(made, gnss=False)
-    check_datum(nothing, replace(FOCAL, free_network=True))
-    check_datum(nothing, replace(FOCAL, poses="fixed"))
-    check_datum(block(made, gnss=False, control=made.control), FOCAL)
-    with refused("adjust.no_datum", control=0):
-        checks = replace(made.control, is_check=np.ones(len(made.control.names), bool))
-        check_datum(block(made, gnss=False, control=checks), FOCAL)
 
 
 def test_weak_lens():
