@@ -44,6 +44,8 @@ class Run:
         Number of threads for kernels and searches.
     report : callable
         Called with the number of points that have just been corrected.
+    say : callable, optional
+        Called with a line of text after each step of an adjustment.
     empty : callable
         Creates large arrays; `pcfix.io.files.scratch_arrays` creates them on disk.
     release : callable
@@ -54,6 +56,7 @@ class Run:
 
     threads: int
     report: Callable[[float], None] = _nothing
+    say: Callable[[str], None] | None = None
     empty: Empty = np.empty
     release: Callable[[], None] = _nothing
     clouds: dict[Path, list[Any]] | None = None

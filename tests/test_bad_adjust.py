@@ -55,7 +55,6 @@ CLOUD = ("--cloud", "cloud.las")
     ("code", "words", "given"),
     [
         ("cameras.no_ties", (), {"model": "bare"}),
-        ("cameras.no_ties", (*CLOUD, "--ties", "measured"), {"model": "bare"}),
         ("adjust.no_datum", (), {"gnss": False}),
         ("adjust.no_datum", CLOUD, {"model": "bare", "gnss": False}),
         ("adjust.cloud_needs_datum", (*CLOUD, "--datum", "free"), {"model": "bare", "gnss": False}),
@@ -66,18 +65,10 @@ CLOUD = ("--cloud", "cloud.las")
         ("option.choice", ("--free", "distance"), {}),
         ("option.choice", ("--lens-unknowns", "f,q9"), {}),
         ("adjust.parallel", ("--parallel", "water,floor"), {}),
-        ("adjust.fixed_image", ("--fixed-images", "a.jpg,b.jpg"), {"gnss": False}),
     ],
 )
 def test_words(refuse, code, words, given):
     refuse(code, *words, **given)
-
-
-@pytest.mark.parametrize("words", [("--free", "hight"), ("--sigma-level=-1",)])
-def test_options(files, words):
-    done = run_pcfix("adjust", "model", "out", "--water", "0", *words, folder=files.folder)
-    assert done.returncode == 1
-    assert len(done.stderr.splitlines()) == 1
 
 
 def replaced(folder, file, old, new):
@@ -104,9 +95,6 @@ CONTROL = {
     ),
     "next zone": (
         "gcps.far", lambda d, f: written_control(d, f, next_zone(f.scene.control.xyz)),
-    ),
-    "swapped axes": (
-        "gcps.far", lambda d, f: written_control(d, f, f.scene.control.xyz[:, [1, 0, 2]]),
     ),
     "another height datum": (
         "gcps.offset", lambda d, f: written_control(d, f, higher(f.scene.control.xyz)),

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.block import B1, B2, CX, CY, FOCAL, INDEX, K1, P1, PLANES, PORT, SHAPE
+from pcfix.adjust.parameters import B1, B2, CX, CY, FOCAL, INDEX, K1, P1, PLANES, PORT, SHAPE
 from pcfix.kernels import device
 from pcfix.lens import imaging as formulas
 from pcfix.lens.algebra import (
@@ -84,8 +84,8 @@ class Given(NamedTuple):
 
 POINT, SURFACE, SHARED = 6, 9, 9
 WIDTH = SURFACE + PLANES
-"""Columns of the derivatives of an image: omega and C, Q from `POINT` on, and from `SURFACE` on the
-parameters of `pcfix.adjust.block.WATER_NAMES`. In a row of the equations the shared unknowns follow
+"""Columns of the derivatives of an image: omega and C, Q from `POINT` on, and from `SURFACE` on
+those of `pcfix.adjust.parameters.WATER_NAMES`. In a row of the equations the shared unknowns follow
 instead, from `SHARED` on."""
 
 

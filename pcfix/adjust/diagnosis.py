@@ -25,7 +25,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.adjust.block import plain_block, similarity_gradients, taken, true_start, used_as_dry
+from pcfix.adjust.block import plain_block, some_ties, true_start, used_as_dry
+from pcfix.adjust.parameters import similarity_gradients
 from pcfix.errors import GeometryError
 from pcfix.model import (
     Cameras,
@@ -43,20 +44,20 @@ if TYPE_CHECKING:  # not quick to load
     from pcfix.adjust.from_cloud import Undone
     from pcfix.adjust.problem import Intersected
 
-ORDER = {
-    "tie points": "tie points", "GNSS": "GNSS positions", "bed": "measured depths",
-    "land": "heights of land", "neighbours": "neighbouring points",
-}  # fmt: skip
-"""The signs in the order in which they decide, and what shows each."""
+ORDER = (
+    *("tie points", "GNSS positions", "measured depths"),
+    *("heights of land", "neighbouring points"),
+)
+"""The signs in the order in which they decide."""
 
-LEAST_POINTS = 30
-"""Tie points under water that are needed."""
+LEAST_POINTS, LEAST_PLACES = 30, 3
+"""Tie points under water, and places of a survey, that are needed."""
 PARTS = 5
 """Of the area, along x and along y, for the jackknife."""
 OUTLIERS = 0.05
 """Share of the tie points that is excluded, those with the worst residuals."""
 SHARE, MOST_SHARE, MOST_SIGMA = 0.4, 2.0, 0.15
-"""Share of the refraction absorbed from which poses count as bent, the largest plausible one, and
+"""Share of the refraction absorbed from which poses count as wrong, the largest plausible one, and
 the largest useful standard error. On simulated blocks with 0.5 px and 3 cm it is within 0.1 of 0
 with true poses, and 0.54 to 1.1 after an ordinary adjustment, smaller with more weight of the GNSS;
 see tests/adjust/test_diagnosis.py."""
@@ -86,15 +87,10 @@ class Sign:
     """One statistic."""
 
     name: str  # one of `ORDER`
-    speaks: bool | None  # whether it says that refraction was absorbed; None if it says nothing
-    words: str  # what was found, or why it says nothing
+    speaks: bool | None  # whether it says that refraction was absorbed; None if not significant
+    words: str  # what was found
     figures: dict[str, float] = field(default_factory=dict)
     error_m: float | None = None  # likely error of the heights, if it was absorbed
-
-    @property
-    def shown_by(self) -> str:
-        """The evidence, in the plural."""
-        return ORDER[self.name]
 
 
 @dataclass(frozen=True)
@@ -118,22 +114,19 @@ class Diagnosis:
         """The error that land shows, else that of the sign that decides; None if none is likely."""
         if self.decided_by is None or not self.absorbed:
             return None
-        land = [sign for sign in self.signs if sign.name == "land" and sign.speaks]
+        land = [sign for sign in self.signs if sign.name == "heights of land" and sign.speaks]
         return (land or [self.decided_by])[-1].error_m
 
-    def sentence(self, command: str, because: str = "") -> str:
-        """Return a warning with the command that helps; empty if the poses seem right.
-
-        `because` says why the command has what was not given.
-        """
+    def sentence(self, command: str) -> str:
+        """Return a warning with the command that helps; empty if the poses seem right."""
         if not self.absorbed or self.decided_by is None:
             return ""
         likely = self.likely_error_m
         error = "" if likely is None else f" The heights are probably off by {likely:.2g} m."
-        have = "seem to have" if self.decided_by.name == "neighbours" else "have"
+        have = "seem to have" if self.decided_by.name == ORDER[-1] else "have"
         return (
             f"The poses {have} absorbed the refraction: {self.decided_by.words}.{error} Correcting"
-            f" only the cloud makes them worse. Adjust the poses first{because}: {command}"
+            f" only the cloud makes them worse. Adjust the poses first: {command}"
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -163,18 +156,13 @@ def _absorbed_words(share: float, sigma: float) -> str:
 # Tie points
 
 
-def tie_point_sign(straight: Intersected, refracted: Intersected, depth_m: FloatArray) -> Sign:
-    """Compare residuals of tie points with and without refraction, with the poses as they are.
+def tie_point_sign(
+    straight: Intersected, refracted: Intersected, depth_m: FloatArray
+) -> Sign | None:
+    """Compare residuals of the same tie points with straight and refracted rays.
 
-    Parameters
-    ----------
-    straight, refracted : Intersected
-        The same m points from the same observations.
-    depth_m : array, shape (m,)
-        Of the straight intersection below the water; negative on land.
+    Their depths, shape (m,), are those of the straight intersection; negative on land.
 
-    Notes
-    -----
     With the residuals s without and r with refraction, d = s - r is what straight rays cannot fit.
     With true poses r is noise, which is independent of d; with poses that absorbed the refraction s
     is noise. So b = -(r . d) / (d . d) is 0 or 1, whatever the noise. Its standard error is that of
@@ -187,7 +175,7 @@ def tie_point_sign(straight: Intersected, refracted: Intersected, depth_m: Float
         good &= worst <= np.quantile(worst[good], 1.0 - OUTLIERS)
     wet = good & (depth_m > 0.0)
     if wet.sum() < LEAST_POINTS:
-        return Sign("tie points", None, f"only {wet.sum()} tie points under water")
+        return None
     d = straight.residual_px - refracted.residual_px
     over = straight.sums(-(refracted.residual_px * d).sum(axis=1))[wet]
     under = straight.sums((d * d).sum(axis=1))[wet]
@@ -202,9 +190,8 @@ def tie_point_sign(straight: Intersected, refracted: Intersected, depth_m: Float
     # standard deviations of an image coordinate
     free = redundancy[wet].sum()
     s_px, r_px = (float(np.sqrt(one.squares[wet].sum() / free)) for one in (straight, refracted))
-    figures = {
-        "share": share, "sigma_share": sigma, "wet_straight_px": s_px, "wet_refracted_px": r_px,
-    }  # fmt: skip
+    figures = {"share": share, "sigma_share": sigma}
+    figures |= {"wet_straight_px": s_px, "wet_refracted_px": r_px}
     words = (
         f"tie points under water have residuals of {s_px:.2f} px with straight rays and"
         f" {r_px:.2f} px with refraction, so {_absorbed_words(share, sigma)}"
@@ -217,19 +204,14 @@ def tie_point_sign(straight: Intersected, refracted: Intersected, depth_m: Float
 
 
 def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, undone: Undone) -> Sign:
-    """Look for the pattern in which this water bends the block in adjusted minus GNSS positions.
+    """Look for the pattern of absorbed refraction in adjusted minus GNSS positions.
 
     The pattern is the centres minus those that an adjustment with water finds without the GNSS
     (`pcfix.adjust.from_cloud.undo_absorption`).
 
-    Parameters
-    ----------
-    centres, off_m, sigma_m : array, shape (k, 3)
-        Adjusted centres, adjusted minus GNSS (NaN where there is none), and the stated standard
-        deviations of the GNSS (NaN if not).
+    All arrays have the shape (k, 3): adjusted centres, adjusted minus GNSS (NaN where there is
+    none), and the stated standard deviations of the GNSS (NaN if not).
 
-    Notes
-    -----
     off = b pattern + shift, turn and scale of the block + noise, by least squares. The noise is
     that of the residuals, or that stated of the GNSS if it is larger.
     """
@@ -257,31 +239,25 @@ def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, undon
     is_useful = share <= MOST_SHARE and sigma <= MOST_SIGMA
     speaks = _exceeds(share, sigma, SHARE) if is_useful else None
     figures = {"share": share, "sigma_share": sigma, "rms_m": rms}
-    return Sign("GNSS", speaks, words, figures, undone.error_m)
+    return Sign("GNSS positions", speaks, words, figures, undone.error_m)
 
 
 # Surveys, and the cloud itself
 
 
-def land_sign(higher_m: FloatArray, gsd_m: float, against: str) -> Sign:
-    """Compare land of the cloud with a survey: cloud minus survey in metres, shape (m,).
-
-    `against` names the survey.
-    """
+def land_sign(higher_m: FloatArray, gsd_m: float) -> Sign | None:
+    """Compare land of the cloud with a survey: cloud minus survey in metres, shape (m,)."""
     found = higher_m[np.isfinite(higher_m)]
-    if len(found) < 3:
-        return Sign("land", None, f"only {len(found)} places of {against} on land")
+    if len(found) < LEAST_PLACES:
+        return None
     bias, spread, sigma = _median_of(found)
     limit = max(SIGMAS * sigma, LAND_GSD * gsd_m)
     words = (
         f"land of the cloud is {bias:+.3f} m too high ({len(found):,} places, spread {spread:.3f}"
         f" m, limit {limit:.3f} m)"
     )
-    return Sign(
-        "land", True if abs(bias) > limit else None, words,
-        {"bias_m": bias, "spread_m": spread, "limit_m": limit, "places": float(len(found))},
-        abs(bias),
-    )  # fmt: skip
+    figures = {"bias_m": bias, "spread_m": spread, "limit_m": limit, "places": float(len(found))}
+    return Sign("heights of land", True if abs(bias) > limit else None, words, figures, abs(bias))
 
 
 def _median_of(values: FloatArray) -> tuple[float, float, float]:
@@ -292,11 +268,11 @@ def _median_of(values: FloatArray) -> tuple[float, float, float]:
     return middle, spread, 1.2533 * spread / float(np.sqrt(len(values)))
 
 
-def bed_sign(apparent_m: FloatArray, true_m: FloatArray, refractive_index: float) -> Sign:
+def bed_sign(apparent_m: FloatArray, true_m: FloatArray, refractive_index: float) -> Sign | None:
     """Compare depths of the cloud with measured ones, both below the water, shape (m,), metres."""
     deep = np.isfinite(apparent_m) & (true_m > LEAST_DEPTH_M) & (apparent_m > 0.0)
-    if deep.sum() < 3:
-        return Sign("bed", None, f"only {deep.sum()} measured depths")
+    if deep.sum() < LEAST_PLACES:
+        return None
     share, _, sigma = _median_of(apparent_m[deep] / true_m[deep])
     limit = (1.0 + 1.0 / refractive_index) / 2.0  # between straight and refracted rays
     after = true_m[deep] - refractive_index * apparent_m[deep]
@@ -304,23 +280,17 @@ def bed_sign(apparent_m: FloatArray, true_m: FloatArray, refractive_index: float
         f"the bed of the cloud has {share:.2f} of its measured depth before any correction,"
         f" standard error {sigma:.2f} (limit {limit:.2f})"
     )
-    return Sign(
-        "bed", _exceeds(share, sigma, limit), words,
-        {"share": share, "sigma_share": sigma, "limit": limit},
-        float(np.sqrt(np.mean(after**2))),
-    )  # fmt: skip
+    figures = {"share": share, "sigma_share": sigma, "limit": limit}
+    error_m = float(np.sqrt(np.mean(after**2)))
+    return Sign("measured depths", _exceeds(share, sigma, limit), words, figures, error_m)
 
 
 def neighbours_sign(share: float, sigma: float, *, is_fused: bool) -> Sign:
     """Look at the discontinuities between image footprints that the corrected bed still has.
 
-    Parameters
-    ----------
-    share, sigma : float
-        See `Verdict.straight` of `pcfix.refract`. On four rendered blocks it is 0.02 to 0.25
-        with true poses, and 0.76 to 0.96 with those of an ordinary adjustment.
-    is_fused : bool
-        Whether the cloud is of fused depth maps; others can have discontinuities all the same.
+    Their share is `Verdict.straight` of `pcfix.refract`. On four rendered blocks it is 0.02 to 0.25
+    with true poses, and 0.76 to 0.96 with those of an ordinary adjustment. Clouds that are not of
+    fused depth maps can have discontinuities all the same.
     """
     words = (
         f"{100.0 * share:.0f} % of the discontinuities between image footprints are left in the"
@@ -328,7 +298,7 @@ def neighbours_sign(share: float, sigma: float, *, is_fused: bool) -> Sign:
         " also leave some)"
     )
     speaks = _exceeds(share, sigma, 0.5) if is_fused or share < 0.5 else None
-    return Sign("neighbours", speaks, words, {"share": share, "sigma_share": sigma})
+    return Sign("neighbouring points", speaks, words, {"share": share, "sigma_share": sigma})
 
 
 # All signs
@@ -349,32 +319,20 @@ def diagnosed(
 ) -> Diagnosis:
     """Look for every sign that the evidence allows.
 
-    Parameters
-    ----------
-    cameras : Cameras
-        In the cloud's CRS.
-    n : float
-        Refractive index.
-    gnss : GnssPositions, optional
-        In the frame of the cameras, NaN if unknown.
-    view : pcfix.flow.surfaces.CloudView, optional
-        The cloud, for its heights and in place of tie points.
-    reference : pcfix.compare.match.Reference, optional
-        A survey of land and bed.
-    neighbours : Sign, optional
-        Of `neighbours_sign`.
-    in_passing : bool
-        Whether it must be quick: GNSS positions are used only if nothing else decides.
+    Cameras and GNSS positions (NaN if unknown) are in the cloud's CRS; n is the refractive index.
+    The view (`pcfix.flow.surfaces.CloudView`) gives heights of the cloud, and points in place of
+    tie points; the reference (`pcfix.compare.match.Reference`) is a survey of land and bed. If it
+    must be quick (`in_passing`), GNSS positions are used only if nothing else decides.
     """
-    signs = [] if neighbours is None else [neighbours]
-    if isinstance(water, WaterDimension):  # which has heights at points of the cloud only
-        return Diagnosis(tuple(signs))
-    lenses = cameras.lenses
-    if cameras.rotations is not None and lenses and all(one.unit == "px" for one in lenses):
-        signs += _signs_of_rays(cameras, water, n, ties, gnss, view, in_passing=in_passing)
-    if view is not None:
-        signs += _signs_of_surveys(cameras, water, n, view, control, reference)
-    return Diagnosis(tuple(sorted(signs, key=lambda sign: [*ORDER].index(sign.name))))
+    signs = [neighbours]
+    if not isinstance(water, WaterDimension):  # which has heights at points of the cloud only
+        lenses = cameras.lenses
+        if cameras.rotations is not None and lenses and all(one.unit == "px" for one in lenses):
+            signs += _signs_of_rays(cameras, water, n, ties, gnss, view, in_passing=in_passing)
+        if view is not None:
+            signs += _signs_of_surveys(cameras, water, n, view, control, reference)
+    known = [sign for sign in signs if sign is not None]
+    return Diagnosis(tuple(sorted(known, key=lambda sign: ORDER.index(sign.name))))
 
 
 def _signs_of_rays(
@@ -382,29 +340,26 @@ def _signs_of_rays(
     gnss: GnssPositions | None, view: Any, *, in_passing: bool,
 ) -> list[Sign]:  # fmt: skip
     """Look at tie points and at the GNSS, and predict the error if they say that it is there."""
-    signs, apparent = _sign_of_ties(cameras, water, n, ties)
+    by_ties, apparent = _sign_of_ties(cameras, water, n, ties)
+    signs, speaks = [by_ties] if by_ties else [], None if by_ties is None else by_ties.speaks
     off = np.full((len(cameras), 3), np.nan) if gnss is None else cameras.centres - gnss.xyz
     is_known = int(np.isfinite(off).sum()) >= LEAST_COORDINATES
-    is_absorbed, is_decided = any(s.speaks for s in signs), any(s.speaks is False for s in signs)
-    if not is_absorbed and (not is_known or (in_passing and is_decided)):
+    if not speaks and (not is_known or (in_passing and speaks is False)):
         return signs
+    # the pattern of absorbed refraction, by tie points or points spread over the cloud
     from pcfix.adjust.from_cloud import undo_absorption  # not quick to load
 
-    count, most = len(cameras), QUICK_IMAGES if in_passing else MOST_IMAGES
-    wanted = max(CLOUD_POINTS, POINTS_PER_IMAGE * count)
-    if (
-        apparent is None and view is not None and count <= most
-    ):  # points of the cloud, evenly spread over it
+    wanted = max(CLOUD_POINTS, POINTS_PER_IMAGE * len(cameras))
+    if len(cameras) > (QUICK_IMAGES if in_passing else MOST_IMAGES):
+        return signs
+    if apparent is None and view is not None:
         every = max(1, view.points // wanted)
         apparent = np.vstack([np.zeros((0, 3)), *(one.xyz[::every] for one in view.chunks())])
     try:
-        if count > most or apparent is None:
-            why = f"{count} images (limit {most})" if count > most else "no cloud"
-            raise GeometryError("adjust.no_pattern", why)
-        true = undo_absorption(apparent[:: max(1, len(apparent) // wanted)], cameras, water, n)
-    except GeometryError as error:
-        words = f"the pattern of absorbed refraction is unknown ({error})"
-        return signs + [Sign("GNSS", None, words)] * is_known
+        some = np.zeros((0, 3)) if apparent is None else apparent
+        true = undo_absorption(some[:: max(1, len(some) // wanted)], cameras, water, n)
+    except GeometryError:
+        return signs
     signs = [replace(sign, error_m=true.error_m) for sign in signs]
     if gnss is not None and is_known:
         signs.append(gnss_sign(cameras.centres, off, gnss.sigma_m, true))
@@ -413,36 +368,37 @@ def _signs_of_rays(
 
 def _sign_of_ties(
     cameras: Cameras, water: WaterSurface, n: float, ties: TiePoints | None
-) -> tuple[list[Sign], FloatArray | None]:
+) -> tuple[Sign | None, FloatArray | None]:
     """Intersect some tie points with straight and refracted rays; return the straight ones too."""
     if ties is None:
-        return [], None
+        return None, None
     counts = np.diff(ties.views.start)
     rows = np.flatnonzero((counts >= LEAST_TIE_VIEWS) & np.isfinite(ties.xyz).all(axis=1))
     if not len(rows):
-        return [], None
+        return None, None
     from pcfix.adjust.problem import intersect_fixed  # not quick to load
 
-    block = plain_block(cameras, taken(ties, rows[:: max(1, len(rows) // TIE_POINTS)]), None, n)
+    some = some_ties(ties, rows[:: max(1, len(rows) // TIE_POINTS)])
+    block = plain_block(cameras, some, None, n)
     straight = intersect_fixed(block)
     above = surface_above(water, straight.xyz)
     wet = is_submerged(straight.xyz[:, 2], above)
     begin = true_start(straight.xyz, water, n, wet)
     refracted = intersect_fixed(replace(block, xyz=begin, wet=wet, water=water))
     sign = tie_point_sign(straight, refracted, above.height_m - straight.xyz[:, 2])
-    return [sign], straight.xyz[np.isfinite(straight.squares)]
+    return sign, straight.xyz[np.isfinite(straight.squares)]
 
 
 def _signs_of_surveys(
     cameras: Cameras, water: WaterSurface, n: float, view: Any, control: GroundControl | None,
     reference: Any,
-) -> list[Sign]:  # fmt: skip
+) -> list[Sign | None]:  # fmt: skip
     """Compare the cloud with control points on land, and with a survey of land and bed."""
     # about the size of a pixel at the water
     level = surface_above(water, cameras.centres).height_m
     above = cameras.centres[:, 2] - np.where(np.isfinite(level), level, np.nanmean(level))
     focal = [one.focal if one.unit == "px" else np.inf for one in cameras.lenses or ()]
-    gsd, signs = float(np.mean(above / focal)) if focal else 0.0, list[Sign]()
+    gsd, signs = float(np.mean(above / focal)) if focal else 0.0, list[Sign | None]()
     radius = float(np.clip(10.0 * gsd, 0.2, 2.0))
 
     def cloud_z(xyz: FloatArray) -> FloatArray:
@@ -453,18 +409,14 @@ def _signs_of_surveys(
     if control is not None:
         level = surface_above(water, control.xyz).height_m
         dry = control.xyz[~control.under_water & ~(control.xyz[:, 2] < level)]
-        signs.append(land_sign(cloud_z(dry) - dry[:, 2], gsd, "the control points"))
-        deep = used_as_dry(control, water)
-        if deep:
+        signs.append(land_sign(cloud_z(dry) - dry[:, 2], gsd))
+        if deep := used_as_dry(control, water):
             words = f"control points {', '.join(deep)} are below the water: mark them under_water"
-            signs.append(Sign("land", None, words))
-    if reference is None:
-        return signs
-    surveyed = reference.xyz[:: 1 + len(reference.xyz) // SURVEYED_POINTS]
-    level, found = surface_above(water, surveyed).height_m, cloud_z(surveyed)
-    land, bed = surveyed[:, 2] > level + LAND_M, surveyed[:, 2] < level
-    if land.any():
-        signs.append(land_sign((found - surveyed[:, 2])[land], gsd, "the reference"))
-    if bed.any():
+            signs.append(Sign("heights of land", None, words))
+    if reference is not None:
+        surveyed = reference.xyz[:: 1 + len(reference.xyz) // SURVEYED_POINTS]
+        level, found = surface_above(water, surveyed).height_m, cloud_z(surveyed)
+        land, bed = surveyed[:, 2] > level + LAND_M, surveyed[:, 2] < level
+        signs.append(land_sign((found - surveyed[:, 2])[land], gsd))
         signs.append(bed_sign((level - found)[bed], (level - surveyed[:, 2])[bed], n))
     return signs

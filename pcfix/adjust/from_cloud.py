@@ -17,10 +17,10 @@ residual are not those that change it). Shift, turn and scale of the block are l
 positions or control points. Taking pi_original(P) as measurements and minimising r would pull the
 solution back to the original one instead.
 
-Points of the apparent cloud stand for the tie points of that adjustment, which were spread in much
-the same way. They have no noise; their weight is how well they stand for the tie points. It is the
+Points of the apparent cloud replace the tie points of that adjustment, which were spread in much
+the same way. They have no noise; their weight is how well they represent the tie points. It is the
 largest with which GNSS positions and control points fit within their standard deviations. They
-count in every image in whose frame they lie, as the software matched features in all of these.
+count in every image in whose frame they are, as the software matched features in all of these.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from pcfix.adjust.block import Block, Unknowns, plain_block, some_cameras, ties_of_cloud, true_start
+from pcfix.adjust.block import Block, plain_block, some_cameras, ties_of_cloud, true_start
 from pcfix.adjust.collinearity import SHARED
 from pcfix.adjust.normal import UNDAMPED, linearised, point_steps, residuals
+from pcfix.adjust.parameters import Unknowns
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import (
     Problem,
@@ -44,9 +45,9 @@ from pcfix.adjust.problem import (
     survey_cost,
 )
 from pcfix.adjust.result import Adjusted, adjusted_of
-from pcfix.adjust.solve import Progress, moved_by, reduced_at, show
+from pcfix.adjust.solve import moved_by, reduced_at, show
 from pcfix.errors import GeometryError, PcfixWarning
-from pcfix.model import Cameras, FloatArray, IntArray, WaterSurface
+from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, WaterSurface
 from pcfix.refract.choice import views_in_frame
 from pcfix.water.surface import is_submerged, surface_above
 
@@ -54,7 +55,7 @@ SIGMAS_PX = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 3.0, 5.0, 10.0)
 """Standard deviations of points of the cloud as tie points, tried in this order."""
 
 POOR_PX = 5.0
-"""Of `SIGMAS_PX`, from which the result deserves a warning."""
+"""Of `SIGMAS_PX`, from which bed and focal length may be less accurate than stated."""
 
 FITS = 1.15
 """Mean squared residual of GNSS and control points, in variances, with which they fit."""
@@ -85,23 +86,15 @@ def adjust_cloud(
     original: Cameras,
     apparent_xyz: FloatArray,
     unknowns: Unknowns,
-    progress: Progress | None = None,
     *,
     choose_lens: bool = False,
 ) -> Adjusted:
-    """Adjust a block by the cloud that its original poses made.
+    """Adjust a block by points of the cloud that was reconstructed with its original cameras.
 
-    Parameters
-    ----------
-    block : Block
-        Its tie points are points of the cloud; its cameras are the start.
-    original : Cameras
-        Those that made the cloud, in the same order.
-    apparent_xyz : array, shape (m, 3)
-        Where the cloud has the points of the block; control points as surveyed.
-    choose_lens : bool
-        Whether of the lens only the focal length is free, unless all parameters of the unknowns
-        lower the misfit of GNSS and control points by more than chance does.
+    The cameras of the block are the start. `apparent_xyz`, shape (m, 3), is where the cloud has the
+    points of the block; control points as surveyed. With `choose_lens`, of the lens only the focal
+    length is free, unless all parameters of the unknowns lower the misfit of GNSS and control
+    points by more than chance does.
     """
     _check(block, unknowns)
 
@@ -109,7 +102,7 @@ def adjust_cloud(
         """Return an adjustment; None if it fails."""
         try:
             of_lens = replace(unknowns, lens=lens)
-            return _trial(block, original, apparent_xyz, of_lens, sigma_px, progress)
+            return _trial(block, original, apparent_xyz, of_lens, sigma_px)
         except GeometryError:
             return None
 
@@ -123,15 +116,14 @@ def adjust_cloud(
     if lens != unknowns.lens:
         more = trial(unknowns.lens, chosen.sigma_px)
     if more is not None:
-        extra = (len(unknowns.lens) - len(lens)) * len(chosen.problem.groups)
+        extra = (len(unknowns.lens) - len(lens)) * (len(chosen.problem.given.first_lens) - 1)
         gain = (chosen.misfit - more.misfit) / max(chosen.misfit / chosen.redundancy, 1.0)
         chosen = more if gain > chdtri(extra, SURE) else chosen
     # only GNSS and control points have noise; the precision is about that with tie points of the
     # standard deviation of the cloud
     sigma0 = float(np.sqrt(chosen.misfit / chosen.redundancy))
     known = precision_of(chosen.problem, chosen.found, max(sigma0, 1.0))
-    notes = _notes(chosen, unknowns.lens)
-    found = adjusted_of(chosen.problem, chosen.found, known, notes, "cloud")
+    found = adjusted_of(chosen.problem, chosen.found, known, [_note(chosen, unknowns)], "cloud")
     return replace(found, sigma0=sigma0, redundancy=chosen.redundancy)
 
 
@@ -142,7 +134,7 @@ def _check(block: Block, unknowns: Unknowns) -> None:
         code, words = "needs_datum", "the poses must be free, with GNSS positions or control points"
     elif any(unknowns.water_sigma):
         code, words = "needs_water", "level, tilt and refractive index must be fixed"
-    elif len(block.conditions.on):
+    elif len(block.surfaces[1]):
         code = "has_conditions"
         words = "no point of --gcps can be on the water or on a plane (waterline, on:NAME)"
     else:
@@ -151,30 +143,27 @@ def _check(block: Block, unknowns: Unknowns) -> None:
     raise GeometryError(f"adjust.cloud_{code}", words)
 
 
-def _notes(chosen: Trial, lens: tuple[str, ...]) -> list[PcfixWarning]:
-    """Return what was decided, and a warning if the points stand poorly for tie points."""
+def _note(chosen: Trial, unknowns: Unknowns) -> PcfixWarning:
+    """Return what was decided, with a warning if the points represent tie points poorly."""
     count, free = int(chosen.problem.block.start[-1]), chosen.problem.unknowns.lens
-    fixed = [name for name in lens if name not in free]
     words = (
         f"No tie points: {count:,} images of points of the cloud were used with a standard"
         f" deviation of {chosen.sigma_px:g} px. Lens parameters free: {', '.join(free) or 'none'}."
     )
-    values = {"free": list(free), "fixed": fixed, "sigma_px": chosen.sigma_px}
-    notes = [PcfixWarning("adjust.by_cloud", words, **values)]
     if chosen.sigma_px >= POOR_PX:
-        words = (
-            f"Points of the cloud fit GNSS and control points only with {chosen.sigma_px:g} px, so"
-            " bed and focal length may be less accurate than stated. Give tie points,"
-            " control points or a calibrated lens."
+        words += (
+            " They fit GNSS and control points poorly, so bed and focal length may be less accurate"
+            " than stated. Give tie points, control points or a calibrated lens."
         )
-        notes.append(PcfixWarning("adjust.poor_cloud", words, sigma_px=chosen.sigma_px))
-    return notes
+    fixed = [name for name in unknowns.lens if name not in free]
+    values = {"free": list(free), "fixed": fixed, "sigma_px": chosen.sigma_px}
+    return PcfixWarning("adjust.by_cloud", words, **values)
 
 
 def _trial(
-    block: Block, original: Cameras, apparent_xyz: FloatArray, unknowns: Unknowns, sigma_px: float,
-    progress: Progress | None = None,
-) -> Trial:  # fmt: skip
+    block: Block, original: Cameras, apparent_xyz: FloatArray, unknowns: Unknowns, sigma_px: float
+) -> Trial:
+    """Adjust a block with one weight of the cloud."""
     m, owner = block.tie_points, block.owner
     block = replace(block, sigma_px=np.where(owner < m, sigma_px, block.sigma_px))
     problem, start = prepare(block, unknowns)
@@ -186,7 +175,7 @@ def _trial(
     rows = linearised(at_rest.state._replace(xyz=apparent), dry, UNDAMPED, 0, len(apparent))
     tests = np.zeros((o, 2, SHARED + dry.shared))
     tests[rows.observation[rows.is_image]] = rows.columns[rows.is_image]
-    found = solve_unaware(problem, start, tests[: block.start[m]], progress)
+    found = solve_unaware(problem, start, tests[: block.start[m]])
     marks, weight = problem.used & (owner >= m), problem.given.weight
     r = residuals(found.state, problem.given)[marks]
     in_images = float((r * r * weight[marks][:, None] ** 2).sum())
@@ -199,25 +188,16 @@ def _trial(
 # The equations
 
 
-def solve_unaware(
-    problem: Problem, start: Solution, tests: FloatArray, progress: Progress | None = None
-) -> Solution:
+def solve_unaware(problem: Problem, start: Solution, tests: FloatArray) -> Solution:
     """Find poses, lens and points whose residuals are orthogonal to the original columns.
 
-    Parameters
-    ----------
-    problem, start : Problem, Solution
-        Of `pcfix.adjust.problem.prepare`; points of the cloud were observed where the original
-        cameras image them.
-    tests : array, shape (t, 2, 9 + g)
-        Jacobians of the straight collinearity at the original solution, by pose, point and shared
-        unknowns, for the points of the cloud. The others, control points, are adjusted by least
-        squares.
+    Points of the cloud were observed where the original cameras image them. The tests, shape
+    (t, 2, 9 + g), are the Jacobians of the straight collinearity at the original solution, by pose,
+    point and shared unknowns, for these points. Control points are adjusted by least squares.
     """
     given = problem.given._replace(tests=tests)
-    tested = replace(problem, given=given)
-    now, size = replace(start, rounds=1), np.inf
-    for step_number in range(1, MAX_STEPS + 1):
+    tested, now, size = replace(problem, given=given), start, np.inf
+    for _ in range(MAX_STEPS):
         # the matrix is not symmetric
         matrix, right = reduced_at(tested, now)
         scale = 1.0 / np.sqrt(np.maximum(np.abs(matrix.diagonal()), 1e-300))
@@ -225,13 +205,13 @@ def solve_unaware(
             step = scale * np.linalg.solve(matrix * scale * scale[:, None], scale * right)
         except np.linalg.LinAlgError:
             raise _unsolved("the equations are singular") from None
-        points = point_steps(now.state, given, UNDAMPED, problem.spread(now.state) @ step)
+        points = point_steps(now.state, given, UNDAMPED, step)
         moved = moved_by(problem, now, step, points)
         size = float(np.abs(points).max(initial=0.0)) if np.isfinite(points).all() else np.inf
         if moved is None or not size < LARGE_STEP_M:
             break
-        now = replace(moved, steps=step_number)
-        show(progress, problem, now)
+        now = moved
+        show(problem, now)
         if size < CLOSE_M:
             return replace(now, cost=survey_cost(problem, now))
     raise _unsolved(f"the steps do not converge (last step {size:.2g} m)")
@@ -249,7 +229,7 @@ def _unsolved(why: str) -> GeometryError:
 
 
 SIGMA_PX = 0.25
-"""Of an image; small, so that the centres only hold the block as a whole."""
+"""Of an image; small, so that the centres only hold the block in place."""
 OWN_SIGMA_M = 1.0
 """Of a projection centre, which holds the block where it is."""
 LEAST_IMAGES_OF_POINT, LEAST_POINTS, LEAST_IMAGES = 3, 10, 5
@@ -268,10 +248,7 @@ def undo_absorption(
 ) -> Undone:
     """Return the poses that an adjustment with water would have found; the block stays in place.
 
-    Parameters
-    ----------
-    xyz : array, shape (m, 3)
-        Points of the apparent cloud, or tie points, spread over it; a thousand or two.
+    The points, shape (m, 3), are a thousand or two of the apparent cloud or of its tie points.
     """
     least, in_frame = LEAST_IMAGES_OF_POINT, views_in_frame(xyz, cameras)
     shown = ties_of_cloud(xyz, in_frame, cameras, least).views.camera
@@ -284,11 +261,9 @@ def undo_absorption(
     if not wet.any():
         raise _unsolved("no point under water is in three images")
     true = true_start(ties.xyz, water, refractive_index, wet)
-    block = replace(
-        plain_block(cameras, replace(ties, xyz=true), water, refractive_index, wet),
-        gnss_xyz=cameras.centres,
-        gnss_sigma_m=np.full((len(cameras), 3), OWN_SIGMA_M),
-    )
+    block = plain_block(cameras, replace(ties, xyz=true), water, refractive_index, wet)
+    sigma_m = np.full((len(cameras), 3), OWN_SIGMA_M)
+    block = replace(block, gnss=GnssPositions(cameras.centres, sigma_m, None))
     trial = _trial(block, cameras, ties.xyz, Unknowns(lens=("f",)), SIGMA_PX)
     problem, found = trial.problem, trial.found
     higher = found.state.xyz[:, 2] + problem.origin[2] - intersect_fixed(block).xyz[:, 2]

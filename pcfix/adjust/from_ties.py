@@ -1,8 +1,8 @@
 """Adjustment by tie points: noise, outliers, and which lens parameters are free.
 
-An adjustment without water bends its lens to absorb refraction: square pixels get an aspect, a lens
-without distortion some of it. What it left must be free to go back, and missing terms must be
-found. So the block is adjusted with the parameters that its lenses have, and each other parameter
+An adjustment without water changes its lens to absorb refraction: square pixels get an aspect, a
+lens without distortion some of it. Changed terms must be free to return, and missing ones be found.
+So the block is adjusted with the parameters that its lenses have, and each other parameter
 is tested: by how much would it lower the weighted squares?
 
 That needs no further adjustment. With the normal equations [[A, B], [B', C]] of all unknowns and of
@@ -17,15 +17,15 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
-from pcfix.adjust.block import CODES, LEAST_VIEWS, NAMES, Block, Unknowns, usable_codes
+from pcfix.adjust.block import LEAST_VIEWS, Block
 from pcfix.adjust.normal import CAUCHY, HUBER, SQUARES, residuals
-from pcfix.adjust.precision import Precision, precision_of
+from pcfix.adjust.parameters import CODES, NAMES, Unknowns
+from pcfix.adjust.precision import Precision, common_errors, disagreement_of, precision_of
 from pcfix.adjust.problem import Problem, Solution, prepare
 from pcfix.adjust.result import Adjusted, adjusted_of, sigma0_of
-from pcfix.adjust.shared_errors import common_errors, disagreement_of
-from pcfix.adjust.solve import Progress, reduced_at, solve, solver
+from pcfix.adjust.solve import reduced_at, solve, solver
 from pcfix.errors import GeometryError, PcfixWarning
-from pcfix.model import FloatArray, Lens
+from pcfix.model import FloatArray
 
 ROUGHLY = 1e-4
 """Relative gain of a step that ends the first, robust rounds."""
@@ -38,30 +38,13 @@ LEAST_SHARE = 0.5
 
 MAD_TO_SIGMA = 1.4826
 OUTLIER_ROUNDS = 3
-MANY_OUT = 0.05
-"""Share of outliers that is worth a warning."""
 
 
-def adjust_ties(
-    block: Block,
-    unknowns: Unknowns,
-    progress: Progress | None = None,
-    *,
-    sigma_px: float | None = None,
-    outliers: bool = True,
-    choose_lens: bool = True,
-) -> Adjusted:
-    """Adjust a block of measured tie points.
+def adjust_ties(block: Block, unknowns: Unknowns, *, choose_lens: bool = True) -> Adjusted:
+    """Adjust a block of measured tie points; their noise is estimated from the residuals.
 
-    Parameters
-    ----------
-    sigma_px : float, optional
-        Standard deviation of the tie points; it is estimated by default.
-    outliers : bool
-        Whether to exclude outliers.
-    choose_lens : bool
-        Whether lens parameters that the block does not determine are fixed, and those that lower
-        the residuals freed; else exactly those of the unknowns are free.
+    With `choose_lens`, lens parameters that the block does not determine are fixed, and those that
+    lower the residuals are freed; else exactly those of the unknowns are free.
     """
     problem, now = prepare(block, unknowns)
     counted = np.isfinite(block.sigma_px) & problem.of_ties
@@ -73,15 +56,15 @@ def adjust_ties(
             " the start. Check that poses and tie points belong to one model, and the camera axes."
         )
         raise GeometryError("adjust.behind", words, good=ahead, observations=total)
-    estimate, notes = sigma_px is None, list[PcfixWarning]()
-    clean, now = _cleaned(problem, now, estimate, outliers, progress)
+    clean, now = _cleaned(problem, now)
     if clean.used[counted].mean() < LEAST_SHARE:
         words = (
             "Most tie point observations fit no poses near the given ones. Check that tie points"
             " and poses belong to one model, and the water level; or align the images again."
         )
         raise GeometryError("adjust.not_converged", words)
-    problem, now, precision = _settled(clean, now, estimate, progress)
+    problem, now, precision = _settled(clean, now)
+    notes = list[PcfixWarning]()
     if choose_lens:
         weak = weak_lens_parameters(problem, now, precision)
         more = missing_lens_parameters(problem, now, sigma0_of(problem, now))
@@ -93,56 +76,36 @@ def adjust_ties(
             notes.append(PcfixWarning("adjust.weak_lens", words, fixed=weak))
         if weak or more:
             lens = (*(name for name in unknowns.lens if name not in weak), *more)
-            clean, now = _with_lens(clean, now, lens, outliers, progress)
-            problem, now, precision = _settled(clean, now, estimate, progress)
+            problem, now, precision = _settled(*_with_lens(clean, now, lens))
     factor = disagreement_of(problem, now, precision) * common_errors(problem, precision)
     precision = precision_of(problem, now, precision.sigma0, factor)
-    share = 1.0 - float(problem.used[counted].mean())
-    if share >= MANY_OUT:
-        words = (
-            f"{100.0 * share:.0f} % of the tie point observations are outliers (more than"
-            f" {OUTLIER_SIGMAS:g} standard deviations): mismatches, waves, moving objects, or"
-            " another lens or water surface than assumed. Check that the matching is the cause;"
-            " otherwise the standard errors are too small."
-        )
-        notes.append(PcfixWarning("adjust.many_outliers", words, share=share))
     return adjusted_of(problem, now, precision, notes, "tie points")
 
 
 # The robust rounds
 
 
-def _cleaned(
-    problem: Problem, now: Solution, estimate: bool, outliers: bool, progress: Progress | None
-) -> tuple[Problem, Solution]:
+def _cleaned(problem: Problem, now: Solution) -> tuple[Problem, Solution]:
     """Return the problem with the noise of its tie points estimated and outliers excluded."""
-    if outliers or estimate:
-        now = solve(problem, now, HUBER, progress, close=ROUGHLY)
-    if estimate:
-        problem = with_noise(problem, now)
-    for number in range(OUTLIER_ROUNDS if outliers else 0):
-        loss = CAUCHY if number == 0 else SQUARES
-        now = solve(problem, now, loss, progress, close=ROUGHLY)
+    now = solve(problem, now, HUBER, ROUGHLY)
+    problem = with_noise(problem, now)
+    for number in range(OUTLIER_ROUNDS):
+        now = solve(problem, now, CAUCHY if number == 0 else SQUARES, ROUGHLY)
         before = problem.used
-        problem = without_outliers(problem, now)
-        if estimate:
-            problem = with_noise(problem, now)
+        problem = with_noise(without_outliers(problem, now), now)
         if number and (problem.used == before).all():
             break
     return problem, now
 
 
-def _settled(
-    problem: Problem, now: Solution, estimate: bool, progress: Progress | None
-) -> tuple[Problem, Solution, Precision]:
+def _settled(problem: Problem, now: Solution) -> tuple[Problem, Solution, Precision]:
     """Return the least squares solution without outliers, and its precision.
 
     The noise is now estimated from all residuals, long tails included, so that GNSS and control
     points, whose standard deviations are given, get the right weight relative to the images.
     """
-    if estimate:
-        problem = with_noise(problem, now, robust=False)
-    now = solve(problem, now, progress=progress)
+    problem = with_noise(problem, now, robust=False)
+    now = solve(problem, now)
     return problem, now, precision_of(problem, now, sigma0_of(problem, now), only_poses=True)
 
 
@@ -176,21 +139,15 @@ def without_outliers(problem: Problem, now: Solution) -> Problem:
     return problem.weighted(weight)
 
 
-def _with_lens(
-    problem: Problem, now: Solution, lens: tuple[str, ...], outliers: bool,
-    progress: Progress | None,
-) -> tuple[Problem, Solution]:  # fmt: skip
+def _with_lens(problem: Problem, now: Solution, lens: tuple[str, ...]) -> tuple[Problem, Solution]:
     """Return the problem with other lens parameters, and its outliers chosen again."""
-    weight = problem.given.weight
+    weight, ties = problem.given.weight, problem.of_ties
     wide, start = prepare(problem.block, replace(problem.unknowns, lens=lens))
-    state = start.state._replace(xyz=now.state.xyz)
-    start = replace(start, state=state, rounds=now.rounds, steps=now.steps)
-    now = solve(wide.weighted(weight), start, progress=progress, close=ROUGHLY)
-    if outliers:
-        ties = problem.of_ties & np.isfinite(problem.block.sigma_px)
-        weight = np.where(ties, weight[problem.of_ties].max(initial=0.0), weight)
-        return without_outliers(wide.weighted(weight), now), now
-    return wide.weighted(weight), now
+    start = replace(start, state=start.state._replace(xyz=now.state.xyz))
+    now = solve(wide.weighted(weight), start, close=ROUGHLY)
+    is_counted = ties & np.isfinite(problem.block.sigma_px)
+    weight = np.where(is_counted, weight[ties].max(initial=0.0), weight)
+    return without_outliers(wide.weighted(weight), now), now
 
 
 # Which lens parameters are free
@@ -203,24 +160,12 @@ WEAK_PX = 2.0
 """Standard error of the image at the corner of the frame above which a lens parameter is fixed, if
 the residuals permit; the focal length is always free."""
 
-BENT = 0.05
-"""Probability that weak parameters move as far by chance. An adjustment without water bends them
-too: fixing them there bends the block instead, which no standard error shows."""
+CHANGED = 0.05
+"""Probability that weak parameters move as far by chance. An adjustment without water changes
+them too: fixing them there deforms the block instead, which no standard error shows."""
 
 TRIED = ("b1", "k1", "k2", "k3", "p1", "p2")
 """Terms that a lens may lack. Sensors have no skew b2, nor do COLMAP's lenses."""
-
-
-def default_lens(lenses: tuple[Lens, ...]) -> tuple[str, ...]:
-    """Return the lens parameters that are free by default: those that the lenses have."""
-    names = ["f", "cx", "cy"]
-    for lens in lenses:
-        names += [name for name in ("b1", "b2") if getattr(lens, name)]
-        names += [f"k{i}" for i, value in enumerate(lens.radial[:4], start=1) if value]
-        names += [f"p{i}" for i, value in enumerate(lens.tangential[:2], start=1) if value]
-    return tuple(
-        name for name in dict.fromkeys(names) if any(usable_codes(lens, (name,)) for lens in lenses)
-    )
 
 
 def weak_lens_parameters(problem: Problem, found: Solution, precision: Precision) -> list[str]:
@@ -235,18 +180,13 @@ def weak_lens_parameters(problem: Problem, found: Solution, precision: Precision
     rows = np.flatnonzero(np.isin(names, weak))
     went = found.shared[rows] / sigma[rows]
     squares = went @ np.linalg.pinv(precision.correlation[np.ix_(rows, rows)]) @ went
-    return [] if squares > chdtri(max(len(rows), 1), BENT) else weak
+    return [] if squares > chdtri(max(len(rows), 1), CHANGED) else weak
 
 
 def missing_lens_parameters(problem: Problem, now: Solution, sigma0: float) -> list[str]:
     """Return lens parameters that lower the squares by more than chance does, the best first.
 
-    Parameters
-    ----------
-    problem, now : Problem, Solution
-        Adjusted with the parameters that the lenses have.
-    sigma0 : float
-        A-posteriori standard deviation of unit weight.
+    The solution is adjusted with the parameters that the lenses have.
     """
     names = problem.unknowns.lens
     if any(lens.projection != "perspective" for lens in problem.block.cameras.lenses or ()):

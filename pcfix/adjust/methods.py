@@ -1,42 +1,23 @@
-"""The adjustment of a block by tie points or by the cloud, and the checks of its result.
-
-An antenna's lever arm, another height datum or a wrong water level offset all GNSS positions from
-the projection centres alike. The block follows them, focal length and heights absorb the offset,
-and residuals hardly show it. The water level and control points reveal an offset of the heights.
-"""
+"""The adjustment of a block by tie points or by the cloud, with checks of what goes in and out."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from pcfix.adjust.block import (
-    FIRST_SIGMA_PX,
-    Material,
-    Unknowns,
-    block_of,
-    check_datum,
-    marks_of,
-    plain_block,
-    restricted,
-    some_cameras,
-    ties_of_cloud,
-    well_seen,
-)
+from pcfix.adjust.block import Block, marks_of, plain_block, restricted, some_cameras, well_seen
 from pcfix.adjust.from_cloud import adjust_cloud
-from pcfix.adjust.from_ties import adjust_ties, default_lens
-from pcfix.adjust.precision import undetermined
+from pcfix.adjust.from_ties import adjust_ties
+from pcfix.adjust.parameters import Unknowns, words_of
+from pcfix.adjust.precision import Precision
 from pcfix.adjust.problem import intersect_fixed
 from pcfix.adjust.result import Adjusted
-from pcfix.adjust.solve import Progress, reduced_at, solver
-from pcfix.errors import GeometryError, PcfixWarning, SettingError
-from pcfix.model import Cameras, FloatArray, GroundControl, TiePoints, WaterSurface
-from pcfix.options.correct import AdjustRules
-from pcfix.refract.choice import views_in_frame
+from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.model import Cameras, FloatArray, GroundControl
 from pcfix.water.surface import surface_above
 
-LEAST_TIES = 100
 SMALL_WATER = 10
 """Tie points on one side of the surface that are needed for it to count as observed."""
 
@@ -46,6 +27,19 @@ GROSS_SIGMAS, GROSS_PX = 20.0, 10.0
 ELSEWHERE = 0.1
 """Share of the flying height; no absorbed refraction puts control points that far off."""
 
+BED_GSD = 1.5
+"""Standard error of the heights of the bed, in ground pixels, that is worth a warning."""
+
+LIMITS = {
+    "level": 0.02, "tilt_x": 0.0005, "tilt_y": 0.0005, "index": 0.005,
+    "distance": 0.002, "centre_x": 0.002, "centre_y": 0.002, "centre_z": 0.002,
+    "shape_xx": 1e-4, "shape_xy": 1e-4, "shape_yy": 1e-4,
+}  # fmt: skip
+"""Standard errors beyond which an unknown counts as undetermined; 1e-4 / m is 2 cm at 14 m."""
+
+STRONG = 0.95
+"""Correlation of two unknowns that are hardly separated."""
+
 _REMEDY = (
     "Check its name, coordinates and marks (swapped names?). A point with the role check has no"
     " weight."
@@ -53,46 +47,19 @@ _REMEDY = (
 
 
 def adjust_block(
-    material: Material,
-    rules: AdjustRules,
+    block: Block,
+    unknowns: Unknowns,
     *,
-    ties: TiePoints | None = None,
-    cloud_xyz: FloatArray | None = None,
-    progress: Progress | None = None,
+    cloud: tuple[Cameras, FloatArray] | None = None,
+    choose_lens: bool = True,
 ) -> Adjusted:
-    """Adjust a block by measured tie points, or by the apparent cloud that it made.
+    """Adjust a block by measured tie points, or by its apparent cloud.
 
-    Parameters
-    ----------
-    cloud_xyz : array, shape (m, 3)
-        Points of the cloud, in place of tie points.
+    `cloud` has the original cameras, and the apparent points, shape (m, 3), that the block has in
+    place of tie points. `choose_lens`: the observations decide which lens parameters are free.
     """
-    original, water = material.original, material.water
-    if cloud_xyz is not None:
-        ties = ties_of_cloud(cloud_xyz, views_in_frame(cloud_xyz, original), original)
-    if ties is None or len(ties.xyz) < LEAST_TIES:
-        words = (
-            f"{material.name}: no image shows the cloud. Check the poses with 'pcfix cameras"
-            " --cloud'."
-        )
-        raise GeometryError("cameras.no_overlap", words, path=material.name)
-    # 1. What is free
-    lens: tuple[str, ...] = rules.lens_unknowns or ()
-    chooses_lens = rules.lens_unknowns is None and material.calibrated is None
-    if chooses_lens:
-        lens = default_lens(original.lenses or ())
-    tilt = None if rules.sigma_tilt is None else float(np.tan(np.radians(rules.sigma_tilt)))
-    stated = {"level": rules.sigma_level, "tilt": tilt, "index": rules.sigma_index}
-    surface: dict[str, float] = dict.fromkeys(rules.free, np.inf)
-    surface |= {name: sigma for name, sigma in stated.items() if sigma is not None}
-    is_free = rules.datum == "free"
-    unknowns = Unknowns(rules.poses, rules.fixed_images, lens, surface, free_network=is_free)
-
-    # 2. The block, without images that have too few observations
-    level_sigma_m = surface.get("level", 0.0)
-    block = block_of(material, ties, rules.sigma_image or FIRST_SIGMA_PX, level_sigma_m)
-    check_datum(block, unknowns, material.no_gnss)
-    xyz = block.xyz[: len(ties.xyz)]
+    # 1. Images with too few observations are excluded
+    water, xyz, count = block.water, block.xyz[: block.tie_points], len(block.cameras)
     wet = len(xyz) if water is None else int((surface_above(water, xyz).height_m > xyz[:, 2]).sum())
     if wet < SMALL_WATER:
         words = (
@@ -100,13 +67,7 @@ def adjust_block(
             " adjust. Check the water level, or use an ordinary bundle adjustment."
         )
         raise GeometryError("water.below_points", words, wet=wet, points=len(xyz))
-    rows, count, notes = well_seen(block), len(block.cameras), list[PcfixWarning]()
-    if len(rows) < 2:
-        words = (
-            f"{material.name}: only {len(rows)} of {count} images have enough observations for a"
-            " pose. Give a model with more tie points."
-        )
-        raise GeometryError("ties.few_images", words, path=material.name, images=len(rows))
+    rows, notes = well_seen(block), list[PcfixWarning]()
     if len(rows) < count:
         lost = np.setdiff1d(np.arange(count), rows)
         words = (
@@ -116,61 +77,21 @@ def adjust_block(
         notes.append(PcfixWarning("ties.few_in_image", words, images=len(lost)))
     block = restricted(block, rows)
 
-    # 3. The adjustment, and what its user should know
-    if cloud_xyz is None:
-        found = adjust_ties(
-            block, unknowns, progress, sigma_px=rules.sigma_image, outliers=rules.outliers,
-            choose_lens=chooses_lens,
-        )  # fmt: skip
+    # 2. The adjustment
+    if cloud is None:
+        found = adjust_ties(block, unknowns, choose_lens=choose_lens)
     else:
-        surveyed = [] if material.control is None else [material.control.xyz]
-        apparent = np.vstack([ties.xyz, *surveyed])
-        found = adjust_cloud(
-            block, some_cameras(original, rows), apparent, unknowns, progress,
-            choose_lens=chooses_lens,
-        )  # fmt: skip
-    notes += [*_land_notes(water, found), *found.notes]
-    bed_xy = found.xyz[found.is_wet & found.is_observed, :2]
-    reach_m = float(np.sqrt(np.var(bed_xy, axis=0).sum())) if len(bed_xy) else 0.0
-    notes += undetermined(found.precision, reach_m)
-    if found.precision.members is None:
-        words = (
-            f"The block is too large ({len(block.cameras):,} images) for covariances of its points,"
-            " so the correction cannot use the errors of the poses."
-        )
-        notes.append(PcfixWarning("adjust.too_large", words, images=len(block.cameras)))
-    return replace(found, notes=[*notes, *datum_notes(found), *bed_notes(found)])
+        original, apparent = some_cameras(cloud[0], rows), cloud[1]
+        if block.control is not None:
+            apparent = np.vstack([apparent, block.control.xyz])
+        found = adjust_cloud(block, original, apparent, unknowns, choose_lens=choose_lens)
+
+    # 3. What its user should know
+    notes += [*_land_notes(found), *found.notes, *undetermined(found.precision)]
+    return replace(found, notes=[*notes, *_bed_notes(found)])
 
 
 # Checks of what goes in
-
-
-def check_images(
-    name: str, cameras: Cameras, water: WaterSurface | None, fixed_images: tuple[str, ...]
-) -> None:
-    """Check that the fixed images exist, and that the cameras are above the water."""
-    missing = [label for label in fixed_images if label not in cameras.labels]
-    if missing:
-        words = (
-            f"Fixed image {missing[0]} is not in the model, which has {len(cameras)} images (first"
-            f" {cameras.labels[0]})."
-        )
-        raise SettingError("adjust.fixed_image", words, image=missing[0])
-    if water is None:
-        return
-    level = surface_above(water, cameras.centres).height_m
-    wet = np.flatnonzero(level > cameras.centres[:, 2])
-    if len(wet):
-        i = int(wet[0])
-        raise GeometryError(
-            "cameras.under_water",
-            f"{name}: {len(wet)} of {len(cameras)} cameras are below the water (first"
-            f" {cameras.labels[i]}, {cameras.centres[i, 2]:.2f} m). Check the water level and the"
-            " CRS of both; for underwater images give --port.",
-            path=name,
-            images=len(wet),
-            image=cameras.labels[i],
-        )
 
 
 def check_marks(
@@ -179,14 +100,8 @@ def check_marks(
     """Refuse control points whose marks are somewhere else altogether, before any adjustment.
 
     Each point is intersected from the original cameras by straight rays. All may be offset alike,
-    as the block may be if nothing else places it; one that is offset differently is a mistake.
-
-    Parameters
-    ----------
-    name : str
-        Of the file.
-    is_placed : bool
-        Whether GNSS positions have placed the block already.
+    as the block may be unless GNSS positions have placed it (`is_placed`); one that is offset
+    differently is a mistake. `name` is that of the file.
     """
     marks, _ = marks_of(control)
     found = intersect_fixed(plain_block(cameras, marks))
@@ -195,7 +110,7 @@ def check_marks(
         return
     off = found.xyz - control.xyz
     middle = np.median(off[met], axis=0)
-    apart = np.linalg.norm(off - middle, axis=1)
+    distance = np.where(met, np.linalg.norm(off - middle, axis=1), 0.0)
     height = float(np.median(cameras.centres[:, 2]) - np.nanmedian(control.xyz[:, 2]))
     if is_placed and np.abs(middle).max() > ELSEWHERE * height > 0.0:
         x, y, z = (-middle).tolist()
@@ -205,27 +120,24 @@ def check_marks(
             " another CRS or height datum; name it with --gcps-crs or --gnss-crs."
         )
         raise GeometryError("gcps.offset", words, path=name, offset_m=[x, y, z])
-    worst = int(np.argmax(np.where(met, apart, 0.0)))
-    if apart[worst] > ELSEWHERE * height > 0.0:
-        raise GeometryError(
-            "gcps.gross_error",
-            f"{name}: control point {control.names[worst]} does not fit: its marks intersect"
-            f" {apart[worst]:.1f} m from its coordinates, relative to the other points. {_REMEDY}",
-            path=name,
-            point=control.names[worst],
-            off_m=float(apart[worst]),
+    worst = int(np.argmax(distance))
+    if distance[worst] > ELSEWHERE * height > 0.0:
+        point = control.names[worst]
+        words = (
+            f"{name}: control point {point} does not fit: its marks intersect"
+            f" {distance[worst]:.1f} m from its coordinates, relative to the other points."
+            f" {_REMEDY}"
         )
+        raise GeometryError("gcps.gross_error", words, path=name, point=point)
 
 
 # Checks of what comes out
 
 
-def _land_notes(water: WaterSurface | None, found: Adjusted) -> list[PcfixWarning]:
-    """Return a warning if there is hardly any land; refuse that for a free water surface."""
-    if water is None:
-        return []
+def _land_notes(found: Adjusted) -> list[PcfixWarning]:
+    """Refuse a free water surface if there is hardly any land; warn if it is fixed."""
     above, count = int((found.is_observed & ~found.is_wet).sum()), int(found.is_observed.sum())
-    if above >= SMALL_WATER:
+    if found.block.water is None or above >= SMALL_WATER:
         return []
     few = f"Only {above} of {count:,} points are above the water"
     if any(found.unknowns.water_sigma):
@@ -244,100 +156,30 @@ def check_control(found: Adjusted, name: str) -> None:
     The adjustment distributes a gross error over the coordinates of the point and its marks, so
     both count: the coordinates as they appear in the images.
     """
-    block = found.block
-    known, fits = np.isfinite(block.surveyed_sigma_m), np.isfinite(found.residual_px).all(axis=1)
-    fits &= np.isfinite(block.sigma_px)
-    marks = np.flatnonzero(fits & block.is_surveyed[block.owner])
-    point, camera = block.owner[marks], block.camera[marks]
-    off_m = np.where(known, found.xyz - block.surveyed_xyz, 0.0)[point]
-    off_px = np.linalg.norm(found.residual_px[marks], axis=1)
-    away = np.linalg.norm(found.cameras.centres[camera] - found.xyz[point], axis=1)
-    focal = np.array([lens.focal for lens in found.cameras.lenses or ()])[camera]
-    px = off_px + np.linalg.norm(off_m, axis=1) * focal / away
-    of_place = (np.abs(off_m) / block.surveyed_sigma_m[point]).max(axis=1)
-    sigmas = np.maximum(off_px / block.sigma_px[marks], of_place)
-    gross = (px > GROSS_PX) & (sigmas > GROSS_SIGMAS)
-    if not gross.any():
+    control = found.block.control
+    if control is None:
         return
-    worst = int(np.argmax(np.where(gross, px, 0.0)))
-    name_of_worst = block.control_names[point[worst] - block.tie_points]
-    words = (
-        f"{name}: control point {name_of_worst} does not fit: its error is {px[worst]:.0f} px or"
-        f" {sigmas[worst]:.0f} standard deviations. {_REMEDY}"
-    )
-    values = {"point": name_of_worst, "off_px": float(px[worst])}
-    raise GeometryError("gcps.gross_error", words, path=name, **values)
-
-
-# Datum and heights of the bed
-
-
-UNKNOWN_M = 10.0
-"""Prior standard deviation of an offset; one that keeps it is not determined."""
-
-SIGMAS, OF_GNSS = 3.0, 2.0
-"""An offset is reported if it exceeds so many of its standard errors, and so many standard
-deviations of a position: smaller ones come from fixed lens parameters, and move the bed by less."""
-
-FEW = 6
-"""GNSS positions and control points; fewer hardly determine the weight of a cloud."""
-
-BED_GSD = 1.5
-"""Standard error of the heights of the bed, in ground pixels, that is worth a warning."""
-
-
-def height_offset(found: Adjusted) -> tuple[float, float] | None:
-    """Return how far the GNSS positions lie too high for a block, and the standard error, metres.
-
-    It is one more unknown of all positions, estimated by one step from the solution. None if
-    nothing is free.
-    """
-    problem, now, weight = found.problem, found.solution, found.block.gnss_weights[:, 2]
-    with_poses = np.zeros((len(weight), 6))
-    with_poses[:, 5] = weight
-    spread = problem.spread(now.state)
-    border = spread.T @ np.append(with_poses, np.zeros(problem.given.shared))
-    matrix, right = reduced_at(problem, now)
-    solve_for = solver(matrix)
-    if solve_for is None or not border.any():
-        return None
-    # the poses and shared unknowns are eliminated
-    by_border, by_right = border @ solve_for(np.column_stack([border, right]))
-    variance = 1.0 / (weight.sum() + 1.0 / UNKNOWN_M**2 - by_border)
-    pull = -weight @ np.nan_to_num(found.gnss_residual_m[:, 2]) - by_right
-    return float(variance * pull), max(found.sigma0, 1.0) * float(np.sqrt(variance))
-
-
-def datum_notes(found: Adjusted) -> list[PcfixWarning]:
-    """Return a warning if GNSS positions are few for a cloud, or too high or low for the block."""
-    known = np.isfinite(found.gnss_residual_m)
-    if not known.any() or found.unknowns.poses != "free" or found.unknowns.free_network:
-        return []
-    if found.source == "cloud":
-        control = sum(row.role == "control" for row in found.control)
-        count = int(known.all(axis=1).sum())
-        if count + control >= FEW:
-            return []
+    focal = float(np.median([lens.focal for lens in found.cameras.lenses or ()]))
+    errors = []
+    for row in found.control:
+        i = control.names.index(row.name)
+        off_m = np.array([row.dx_m, row.dy_m, row.dz_m])
+        away_m = float(np.linalg.norm(found.cameras.centres - control.xyz[i], axis=1).min())
+        px = row.rms_px + float(np.linalg.norm(off_m)) * focal / away_m
+        of_marks = row.rms_px / float(np.median(control.sigma_px))
+        sigmas = max(of_marks, float((np.abs(off_m) / control.sigma_m[i]).max()))
+        if row.role == "control" and px > GROSS_PX and sigmas > GROSS_SIGMAS:
+            errors.append((px, sigmas, row.name))
+    if errors:
+        px, sigmas, point = max(errors)
         words = (
-            f"Only {count} GNSS positions and {control} control points determine the weight of the"
-            " cloud. Give positions of more images, spread over the block, or control points."
+            f"{name}: control point {point} does not fit: its error is {px:.0f} px or"
+            f" {sigmas:.0f} standard deviations. {_REMEDY}"
         )
-        return [PcfixWarning("gnss.few", words, gnss=count, control=control)]
-    stated_m = float(np.median(found.block.gnss_sigma_m[known]))
-    offset_m, sigma_m = height_offset(found) or (0.0, 0.0)
-    if abs(offset_m) <= max(SIGMAS * sigma_m, OF_GNSS * stated_m):
-        return []
-    side, level = ("above", "low") if offset_m > 0.0 else ("below", "high")
-    water = "" if found.water is None else f", or a water level that is too {level}"
-    words = (
-        f"The GNSS positions are {abs(offset_m):.2f} m {side} the projection centres (standard"
-        f" error {sigma_m:.2f} m): an antenna lever arm, another height datum{water}. The block"
-        " followed them. Correct them, or omit them if there are control points."
-    )
-    return [PcfixWarning("gnss.offset_found", words, offset_m=offset_m, sigma_m=sigma_m)]
+        raise GeometryError("gcps.gross_error", words, path=name, point=point, off_px=px)
 
 
-def bed_notes(found: Adjusted) -> list[PcfixWarning]:
+def _bed_notes(found: Adjusted) -> list[PcfixWarning]:
     """Return a warning if the heights of the bed are imprecise."""
     sigma, bed = found.precision.point_sigma_m, found.is_wet & found.is_observed
     if sigma is None or not bed.any():
@@ -354,3 +196,28 @@ def bed_notes(found: Adjusted) -> list[PcfixWarning]:
         " or a calibrated lens."
     )
     return [PcfixWarning("adjust.imprecise_bed", words, sigma_m=sigma_m, gsd=gsd)]
+
+
+def undetermined(precision: Precision) -> list[PcfixWarning]:
+    """Return a warning for each unknown whose standard error is too large to be useful.
+
+    It names the unknown from which this one is hardly separated, if there is one.
+    """
+    notes, shared = [], precision.shared
+    for i, row in enumerate(shared):
+        (what, unit), limit = words_of(row.name), LIMITS.get(row.name, np.inf)
+        if row.sigma <= limit:
+            continue
+        words = (
+            f"the {what} is undetermined: standard error {row.sigma:.2g}{unit} (limit"
+            f" {limit:.2g}{unit})."
+        )
+        values: dict[str, Any] = {"unknown": row.name, "sigma": row.sigma}
+        r = np.where(np.arange(len(shared)) == i, 0.0, precision.correlation[i])
+        other = int(np.abs(r).argmax())
+        if abs(r[other]) > STRONG:
+            pair, values["correlated_with"] = words_of(shared[other].name)[0], shared[other].name
+            words += f" It is strongly correlated with the {pair} (r = {r[other]:.3f})."
+        words += " Fix it to a measured value, or give control points at several heights."
+        notes.append(PcfixWarning("adjust.undetermined", words, **values))
+    return notes

@@ -1,7 +1,7 @@
 r"""The normal equations of a block, reduced to poses and shared unknowns.
 
 With the residual r = measured minus computed image, weighted, and the Jacobians J (pose), G (shared
-unknowns: lens, water, similarity) and B (point) of one observation, a point contributes
+unknowns: lens and water) and B (point) of one observation, a point contributes
 
     U = J'J,  U_g = J'G,  U_gg = G'G,  V = sum B'B,  W = J'B,  W_g = sum G'B
 
@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.block import PLANES
 from pcfix.adjust.collinearity import (
     POINT,
     SHARED,
@@ -36,6 +35,7 @@ from pcfix.adjust.collinearity import (
     lens_gradients,
     workspace,
 )
+from pcfix.adjust.parameters import PLANES
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot, inverted, row_of, times, transposed_times, vector
 from pcfix.model import BoolArray, FloatArray, IntArray
@@ -95,7 +95,7 @@ def linearise_point(
     """Linearise all observations of a point; invert its normal matrix V = sum B'B in place.
 
     Returns how many rows of the workspace count, and how many of them are images (the other one is
-    a condition). Zero if the rays do not fix the point: then it tells nothing about the cameras.
+    a condition). Zero if the rays do not fix the point: then it does not constrain the cameras.
     """
     v, rhs, own, count = work.v, work.rhs, work.own, 0
     v[:], rhs[:] = 0.0, 0.0

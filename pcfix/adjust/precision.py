@@ -2,11 +2,27 @@
 
 The inverse of the reduced normal matrix S is the covariance of poses and shared unknowns for
 observations of unit weight, because the points were eliminated and not ignored (Triggs et al. 2000,
-section 6). It is scaled by the a-posteriori variance of unit weight, and by factors for errors that
-observations share (`pcfix.adjust.shared_errors`). The datum is that of the prior knowledge; in a
-free network that of the start values.
+section 6). It is scaled by the a-posteriori variance of unit weight. The datum is that of the prior
+knowledge; in a free network that of the start values.
 
-Standard errors do not tell that errors of a block are correlated: a focal length that is too long
+These standard errors hold for independent errors. Errors of matching and of the lens model are
+shared: by neighbouring points, by one image, by one place in the frame. A group of observations
+contributes a part h of the right side; all parts together are zero. Without the other parts it
+would move the unknowns by S^-1 h, and the sum of the squares over the groups is a variance that
+allows for errors shared within a group (sandwich estimator: White 1980, Liang & Zeger 1986; to
+first order a delete-a-group jackknife). Random groups of points give that variance without shared
+errors, and random residuals that of observations of equal quality. The excess, if an F-test
+confirms it, is added to the variances.
+
+Places in the frame are too few for that, and lens, angles and centres absorb most of what they
+share. There a smooth field of image shifts is estimated, as of terms that the lens model lacks: a
+random field with standard deviation s in pixels, smooth over some part of the frame. With shifts e
+of tiles of the frame as candidates besides the unknowns, R = C - B' A^-1 B and their right sides c
+(see `pcfix.adjust.from_ties`), c has the covariance sigma0^2 R + s^2 R K R, where K is the
+covariance of the tiles. That gives the likelihood of s. The mean over all s and ranges is used, so
+that fields too small to be found count too. The unknowns move by A^-1 B e.
+
+Standard errors do not show that errors of a block are correlated: a focal length that is too long
 is compensated by cameras that are too high. So members of an ensemble are drawn from the joint
 covariance. Whatever is computed with each of them in turn scatters by all errors at once.
 """
@@ -14,17 +30,27 @@ covariance. Whatever is computed with each of them in turn scatters by all error
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.special import fdtri
 
-from pcfix.adjust.block import CODES, INDEX, PORT, SHAPE, lens_parameter, moved_lens, words_of
-from pcfix.adjust.normal import UNDAMPED, sparse_rows_of
+from pcfix.adjust.normal import UNDAMPED, sparse_matrix, sparse_rows_of
+from pcfix.adjust.parameters import (
+    CODES,
+    CX,
+    CY,
+    FOCAL,
+    INDEX,
+    PORT,
+    SHAPE,
+    lens_parameter,
+    moved_lens,
+)
 from pcfix.adjust.problem import Problem, Solution, polynomial
 from pcfix.adjust.solve import moved_by, reduced_at, singular, solver
-from pcfix.errors import PcfixWarning
-from pcfix.model import Cameras, FloatArray, WaterPlane, WaterRaster, WaterSurface
+from pcfix.model import Cameras, FloatArray, IntArray, WaterPlane, WaterRaster, WaterSurface
 
 DENSE_UP_TO = 12_000
 """Unknowns up to which the whole inverse is computed (1.2 GB)."""
@@ -82,23 +108,13 @@ def precision_of(
 ) -> Precision:  # fmt: skip
     """Return covariances and correlations at a solution.
 
-    Parameters
-    ----------
-    problem : Problem
-        Outliers have no weight.
-    solution : Solution
-    sigma0 : float
-        A-posteriori standard deviation of unit weight; 1 for the given standard deviations.
-    factor : array, shape (6 + g,), optional
-        Further factors of standard errors: of angles and centres of all poses, and of the shared
-        unknowns; see `pcfix.adjust.shared_errors`.
-    only_poses : bool
-        Whether standard errors of the points and an ensemble are not wanted.
+    `sigma0` is the a-posteriori standard deviation of unit weight; 1 for the given standard
+    deviations. `factor`, shape (6 + g,), has further factors of standard errors: of angles and
+    centres of all poses, and of the shared unknowns (`disagreement_of`, `common_errors`).
+    `only_poses` is without standard errors of the points and without an ensemble.
     """
-    matrix, state = reduced_at(problem, solution)[0], solution.state
-    k, g, free = len(problem.moves), len(problem.names), np.flatnonzero(problem.moves)
-    times = np.ones(6 + g) if factor is None else factor
-    variance, u = sigma0 * sigma0, len(matrix.diagonal())
+    matrix, k, g = reduced_at(problem, solution)[0], len(solution.lenses), len(problem.names)
+    times, u = np.ones(6 + g) if factor is None else factor, matrix.shape[0]
     solve_for = solver(matrix)
     if solve_for is None:
         raise singular(problem, solution)
@@ -115,30 +131,26 @@ def precision_of(
             inverse[:, rows] = columns
         if part is not None:
             of_part = columns[rows].reshape(len(part), 6, len(part), 6)
-            poses[free[part // 6]] = np.einsum("kikj->kij", of_part)
+            poses[part // 6] = np.einsum("kikj->kij", of_part)
     of_shared = columns[last]
-    diagonal = np.append(np.einsum("kii->ki", poses)[free], of_shared.diagonal())
+    diagonal = np.append(np.einsum("kii->ki", poses), of_shared.diagonal())[problem.fixed :]
     if not ((diagonal > 0.0) & (diagonal * matrix.diagonal() * SINGULAR < 1.0)).all():
         raise singular(problem, solution)
     of_shared = of_shared * times[6:] * times[6:, None]
     poses = poses * times[:6] * times[:6, None]
-    if problem.unknowns.poses == "similarity":
-        by = problem.pose_gradients(state)
-        poses = by @ of_shared[-7:, -7:] @ by.transpose(0, 2, 1)
     points: FloatArray | None = None
     members: Members | None = None
     if inverse is not None:
-        each = np.append(np.tile(times[:6], len(free)), times[6:])
+        each = np.append(np.tile(times[:6], k), times[6:])[problem.fixed :]
         inverse *= each
         inverse *= each[:, None]
-        spread = problem.spread(state)
-        points = sigma0 * _point_sigma(problem, solution, spread @ inverse @ spread.T)
+        points = sigma0 * _point_sigma(problem, solution, inverse)
         members = members_of(problem, solution, sigma0 * drawn(inverse))
     sigma = np.sqrt(np.diag(of_shared))
     correlation = of_shared / sigma / sigma[:, None]
     rows_of = zip(problem.names, solution.shared.tolist(), (sigma * sigma0).tolist(), strict=True)
     return Precision(
-        sigma0, variance * poses, tuple(SharedUnknown(*row) for row in rows_of), correlation,
+        sigma0, sigma0**2 * poses, tuple(SharedUnknown(*row) for row in rows_of), correlation,
         points, members,
     )  # fmt: skip
 
@@ -146,8 +158,8 @@ def precision_of(
 def _point_sigma(problem: Problem, found: Solution, inverse: FloatArray) -> FloatArray:
     """Return standard errors of the points for observations of unit weight, shape (m, 3).
 
-    Their variances are those of V^-1 + V^-1 W' S^-1 W V^-1. The inverse S^-1 has the shape
-    (6 k + g, 6 k + g), zero where poses are fixed.
+    Their variances are those of V^-1 + V^-1 W' S^-1 W V^-1. The inverse S^-1 of the free unknowns
+    has the shape (u, u).
     """
     sigma, first = np.full_like(found.state.xyz, np.nan), 0
     step = 1 + len(sigma) // MOST_POINTS
@@ -156,7 +168,7 @@ def _point_sigma(problem: Problem, found: Solution, inverse: FloatArray) -> Floa
         own = part.inverse.diagonal().reshape(-1, 3)
         for some in range(0, last - first, step * POINTS_AT_ONCE):
             rows = np.arange(some, min(some + step * POINTS_AT_ONCE, last - first), step)
-            coupling = part.coupling[(3 * rows[:, None] + np.arange(3)).ravel()]
+            coupling = part.coupling[(3 * rows[:, None] + np.arange(3)).ravel(), problem.fixed :]
             by_others = coupling.multiply(coupling @ inverse).sum(axis=1)
             # points that their rays do not fix have no variance
             square = np.where(own[rows] > 0.0, own[rows] + by_others.reshape(-1, 3), np.nan)
@@ -165,52 +177,167 @@ def _point_sigma(problem: Problem, found: Solution, inverse: FloatArray) -> Floa
     return sigma
 
 
-# What is known poorly
+# Errors that observations share
 
 
-LIMITS = {
-    "level": 0.02, "tilt_x": 0.0005, "tilt_y": 0.0005, "index": 0.005, "scale": 0.001,
-    "distance": 0.002, "centre_x": 0.002, "centre_y": 0.002, "centre_z": 0.002,
-}  # fmt: skip
-"""Standard errors beyond which an unknown counts as undetermined."""
-
-LEAST_BEND_M = 0.02
-"""The same for the height by which curved water departs from a plane, as for its level."""
-
-STRONG = 0.95
-"""Correlation of two unknowns that are hardly separated."""
+SURE = 0.99
+"""Probability with which equal groups would not differ by as much."""
 
 
-def undetermined(precision: Precision, reach_m: float = 0.0) -> list[PcfixWarning]:
-    """Return a warning for each unknown whose standard error is too large to be useful.
+MOST_TILES, POINTS_PER_TILE, FRAME_TILES = 400, 25, 48
+LEAST_GROUPS = 10
+"""Fewer groups do not give a variance."""
 
-    It names the unknown from which this one is hardly separated, if there is one.
+COMMON_SHARE = 0.5
+"""Error in common to all images at the corner of the frame, as a share of the image noise: matching
+shifts features with their slope, and outliers of the original adjustment are missing on one side.
+Focal length and principal point absorb it, so that poses and bed are right, and residuals do not
+show it. Rendered blocks, whose lens is known, had up to 1.5 times this."""
 
-    Parameters
-    ----------
-    reach_m : float
-        RMS distance of the points under water from their middle.
+
+def disagreement_of(problem: Problem, found: Solution, formal: Precision) -> FloatArray:
+    """Return by which factors standard errors must grow for shared errors, shape (6 + g,).
+
+    They are those of the angles and centres of all poses, and of the shared unknowns; `formal` is
+    the precision by the normal matrix.
     """
-    notes, shared = [], precision.shared
-    for i, row in enumerate(shared):
-        (what, unit), limit = words_of(row.name), LIMITS.get(row.name, np.inf)
-        if row.name.startswith("shape") and reach_m:
-            limit = LEAST_BEND_M / reach_m**2
-        if row.sigma <= limit:
-            continue
-        words = (
-            f"the {what} is undetermined: standard error {row.sigma:.2g}{unit} (limit"
-            f" {limit:.2g}{unit})."
-        )
-        values: dict[str, Any] = {"unknown": row.name, "sigma": row.sigma}
-        r = np.where(np.arange(len(shared)) == i, 0.0, precision.correlation[i])
-        other = int(np.abs(r).argmax())
-        if abs(r[other]) > STRONG:
-            pair, values["correlated_with"] = words_of(shared[other].name)[0], shared[other].name
-            words += f" It is strongly correlated with the {pair} (r = {r[other]:.3f})."
-        words += " Fix it to a measured value, or give control points at several heights."
-        notes.append(PcfixWarning("adjust.undetermined", words, **values))
-    return notes
+    given, block, added = problem.given, problem.block, np.zeros(6 + len(problem.names))
+    # random groups of points, neighbouring points, points of an image, and places in the frame
+    tiles = min(MOST_TILES, len(block.xyz) // POINTS_PER_TILE)
+    randomly = np.random.default_rng(0).integers(0, max(tiles, 1), len(block.xyz))[block.owner]
+    near = _tiles(found.state.xyz[:, :2], tiles)[block.owner]
+    size = np.array([(lens.width, lens.height) for lens in block.cameras.lenses or ()])
+    place = _tiles(given.image_xy / size[given.camera], FRAME_TILES)
+    place += given.group[given.camera] * (place.max(initial=0) + 1)
+    frame = np.unique(place, return_inverse=True)[1]
+    matrix, right = reduced_at(problem, found)
+    solve_for, free = solver(matrix), slice(problem.fixed, None)
+    least = len(np.unique(randomly))
+    if least < LEAST_GROUPS or solve_for is None:
+        return 1.0 + added
+    # the first group has drawn residuals: the variances that random groups have by chance
+    random = np.random.default_rng(1).normal(0.0, formal.sigma0, given.image_xy.shape)
+    groups = [randomly, randomly, near, given.camera]
+    *pulls, field, rest = _pulls_of(problem, found, groups, frame, random)
+    by_chance, *shares = (_share_of(formal, solve_for(p[:, free].T)) for p in pulls)
+    for group, share in zip(groups[1:], shares, strict=True):
+        count = len(np.unique(group))
+        is_more = share > fdtri(count - 1, least - 1, SURE) * by_chance
+        more = np.where(is_more & (count >= LEAST_GROUPS), share - by_chance, 0.0)
+        added = added + more
+        if group is randomly:
+            by_chance = by_chance + more
+    if frame.max() + 1 >= LEAST_GROUPS:
+        field = field[:, free]
+        rest -= field @ solve_for(np.column_stack([field.T, right]))
+        likely = _likely_field(problem, frame, formal.sigma0, rest) @ field
+        added = added + _share_of(formal, solve_for(likely.T))
+    return np.sqrt(1.0 + added)
+
+
+def common_errors(problem: Problem, formal: Precision) -> FloatArray:
+    """Return factors of the standard errors for an error that all images share, (6 + g,)."""
+    factor = np.ones(6 + len(formal.shared))
+    noise_px = formal.sigma0 / float(np.median(problem.given.weight[problem.used]))
+    rows = np.flatnonzero(np.isin(problem.given.code, (FOCAL, CX, CY)))
+    sigma = np.array([formal.shared[i].sigma for i in rows])
+    factor[6 + rows] = np.hypot(1.0, COMMON_SHARE * noise_px / problem.lens_effects[rows] / sigma)
+    return factor
+
+
+def _tiles(xy: FloatArray, count: int) -> IntArray:
+    """Return the tile of each place, of about `count` square ones that cover nearly all places."""
+    low, high = np.nanpercentile(xy, [1.0, 99.0], axis=0)
+    side = max(float(np.sqrt(np.prod(high - low) / max(count, 1))), 1e-9)
+    last = np.maximum(np.ceil((high - low) / side) - 1.0, 0.0)
+    place = np.clip(np.floor((np.nan_to_num(xy) - low) / side), 0.0, last).astype(np.int64)
+    return np.asarray(place[:, 0] * int(last[1] + 1.0) + place[:, 1])
+
+
+def _share_of(formal: Precision, moved: FloatArray) -> FloatArray:
+    """Return variances over the formal ones, (6 + g,), for poses their mean.
+
+    `moved`, shape (u, n), are the movements of the free unknowns by each of n groups.
+    """
+    of_poses, of_shared = np.split((moved**2).sum(axis=1), [len(moved) - len(formal.shared)])
+    share = of_shared / [row.sigma**2 for row in formal.shared]
+    if not len(of_poses):
+        return np.append(np.zeros(6), share)
+    poses = np.einsum("kii->ki", formal.pose_covariance)
+    return np.append((of_poses.reshape(-1, 6) / poses).mean(axis=0), share)
+
+
+def _pulls_of(
+    problem: Problem, found: Solution, groups: list[IntArray], frame: IntArray, drawn: FloatArray
+) -> list[FloatArray]:
+    """Return the right side of the reduced equations by groups, each of shape (groups, 6 k + g).
+
+    The first is that with the weighted residuals `drawn`, shape (o, 2), instead of those found.
+    Then, for shifts along u and v of the t tiles of the frame: B', shape (2 t, 6 k + g), and C
+    with their right sides, shape (2 t, 2 t + 1).
+    """
+    size, count = 6 * len(found.lenses) + problem.given.shared, 2 * (int(frame.max(initial=0)) + 1)
+    pulls = [np.zeros((int(group.max(initial=0)) + 1, size)) for group in groups]
+    field, rest = np.zeros((count, size)), np.zeros((count, count + 1))
+    for part in sparse_rows_of(found.state, problem.given, UNDAMPED):
+        at, is_image = part.rows.observation, part.rows.is_image
+        r = np.where(is_image[:, None], drawn[at], part.rows.r)
+        for group, total in zip(groups, pulls, strict=True):
+            grouped = sparse_matrix(r, np.repeat(group[at], 2)[:, None], len(total))
+            total += part.product(grouped).toarray()
+            r = part.rows.r
+        weight = np.repeat(np.where(is_image, problem.given.weight[at], 0.0), 2)
+        column = (2 * frame[at][:, None] + np.arange(2)).reshape(-1, 1)
+        shifts = sparse_matrix(weight, column, count)
+        field += part.product(shifts).toarray()
+        by_points = shifts.T @ part.points
+        rest[:, :-1] += (shifts.T @ shifts - by_points @ part.inverse @ by_points.T).toarray()
+        rest[:, -1] += shifts.T @ part.left_over()
+    return [*pulls, field, rest]
+
+
+# A smooth field over the frame
+
+
+RANGES = (0.2, 0.4, 0.8)
+"""Ranges of smoothness, over half the diagonal: from waves of the sensor to whole frames."""
+
+LARGEST_PX, STEPS = 2.0, np.linspace(0.0, 1.0, 200)
+"""Range of s; a lens with larger errors is another lens."""
+
+NO_FIELD = 1e-9
+"""Share of the largest eigenvalue below which a field leaves nothing in the residuals."""
+
+
+def _likely_field(problem: Problem, tile: IntArray, sigma0: float, rest: FloatArray) -> FloatArray:
+    """Return the transposed root of the covariance of the likely field, shape (2 t, 2 t).
+
+    `tile` numbers the parts of the frame, none without observations; each sensor has its own.
+    `rest` are R and the right sides c of their shifts, shape (2 t, 2 t + 1).
+    """
+    given, lenses, one = problem.given, problem.block.cameras.lenses or (), np.eye(len(rest))
+    half_px = 0.5 * np.array([np.hypot(lens.width, lens.height) for lens in lenses])[given.camera]
+    count = np.bincount(tile)
+    middle = [np.bincount(tile, given.image_xy[:, i] / half_px) / count for i in range(2)]
+    sensor = np.bincount(tile, given.group[given.camera]) / count
+    apart = np.sum([(axis - axis[:, None]) ** 2 for axis in middle], axis=0)
+    is_same_sensor = sensor == sensor[:, None]
+    # in the eigenvectors of K R K' the pulls are independent, so that the likelihood is a product
+    likely, halves = np.zeros((len(RANGES), len(STEPS))), []
+    square = (LARGEST_PX * STEPS**3) ** 2  # dense where s is small
+    for i, length in enumerate(RANGES):
+        common = np.where(is_same_sensor, np.exp(-0.5 * apart / length**2), 0.0)
+        half = np.linalg.cholesky(np.kron(common, np.eye(2)) + 1e-9 * one)
+        halves.append(half)
+        value, vector = np.linalg.eigh(half.T @ rest[:, :-1] @ half)
+        shows = value > NO_FIELD * value[-1]
+        pull2 = (vector[:, shows].T @ half.T @ rest[:, -1]) ** 2 / value[shows]
+        variance = sigma0**2 + square[:, None] * value[shows]
+        likely[i] = -0.5 * (np.log(variance) + pull2 / variance).sum(axis=1)
+    weight = np.exp(likely - likely.max()) * STEPS**2  # a uniform prior of s
+    s2_of = (weight * square).sum(axis=1) / weight.sum()
+    of_all = np.sum([s2 * half @ half.T for s2, half in zip(s2_of, halves, strict=True)], axis=0)
+    return np.asarray(np.linalg.cholesky(of_all + 1e-12 * one).T)
 
 
 # The ensemble
@@ -222,8 +349,8 @@ MEMBERS, AXES = 32, 16
 TINY = 1e-10
 """Added to the diagonal of correlations, which rounding may leave indefinite."""
 
-SAME_M, SAME_FOCAL = 1e-3, 1e-6
-"""Differences of distances between centres, and relative ones of focal lengths, in one block."""
+SAME_FOCAL = 1e-6
+"""Relative difference of the focal lengths of one block."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,8 +362,7 @@ class Members:
     """
 
     labels: tuple[str, ...]  # length k
-    centres: FloatArray  # (k, 3), of the adjusted block, to recognise it
-    focal: FloatArray  # (k,), the same
+    focal: FloatArray  # (k,), of the adjusted block, to recognise it
     turn: FloatArray  # (m, k, 3), rotation vectors in the frame of each camera, radians
     shift_m: FloatArray  # (m, k, 3), of the centres, along the same axes
     lens_names: tuple[str, ...]  # length p
@@ -255,18 +381,11 @@ class Members:
         if cameras.rotations is None or cameras.lenses is None:
             return None
         focal = np.array([lens.focal for lens in cameras.lenses])
-        here, there = (
-            np.linalg.norm(c - c.mean(axis=0), axis=1)
-            for c in (self.centres[rows], cameras.centres)
-        )
-        # maps differ in scale
-        there = there * (here.mean() / max(float(there.mean()), SAME_M))
-        is_same = np.abs(focal / self.focal[rows] - 1.0).max() < SAME_FOCAL
-        if not is_same or np.abs(there - here).max() >= SAME_M:
+        if np.abs(focal / self.focal[rows] - 1.0).max() >= SAME_FOCAL:
             return None
         return Members(
-            cameras.labels, self.centres[rows], self.focal[rows], self.turn[:, rows],
-            self.shift_m[:, rows], self.lens_names, self.lens[:, rows], self.water,
+            cameras.labels, self.focal[rows], self.turn[:, rows], self.shift_m[:, rows],
+            self.lens_names, self.lens[:, rows], self.water,
         )  # fmt: skip
 
     def cameras(self, member: int, nominal: Cameras) -> Cameras:
@@ -330,7 +449,7 @@ def members_of(problem: Problem, found: Solution, steps: FloatArray) -> Members:
     codes = [CODES[name] for name in names]
     before = [[lens_parameter(lens, code) for code in codes] for lens in found.lenses]
     turn, shift, lens, water = [], [], [], []
-    for step in steps:
+    for step in np.hstack([np.zeros((len(steps), problem.fixed)), steps]):
         moved = moved_by(problem, found, step, np.zeros_like(state.xyz))
         if moved is None:
             continue
@@ -347,7 +466,6 @@ def members_of(problem: Problem, found: Solution, steps: FloatArray) -> Members:
     k, m = len(state.centres), len(turn)
     return Members(
         problem.block.cameras.labels,
-        state.centres + problem.origin,
         np.array([lens.focal for lens in found.lenses]),
         np.reshape(turn, (m, k, 3)),
         np.reshape(shift, (m, k, 3)),

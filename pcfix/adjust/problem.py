@@ -11,25 +11,22 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.block import (
+from pcfix.adjust.block import WATER, Block
+from pcfix.adjust.collinearity import POINT, SHARED, Given, State
+from pcfix.adjust.normal import UNDAMPED, cost_of, linearised, point_steps, residuals
+from pcfix.adjust.parameters import (
     INDEX,
-    MOTIONS,
     NAMES,
     PLANES,
     PORT,
     SHAPE,
-    WATER,
     WATER_NAMES,
-    Block,
     Unknowns,
     effect_at_corner,
-    inverse_variances,
     sensor_groups,
     similarity_gradients,
     usable_codes,
 )
-from pcfix.adjust.collinearity import POINT, SHARED, Given, State
-from pcfix.adjust.normal import UNDAMPED, Rule, cost_of, linearised, point_steps, residuals
 from pcfix.errors import GeometryError
 from pcfix.lens.imaging import lens_table
 from pcfix.model import (
@@ -54,7 +51,7 @@ NETWORK_SIGMA_M = 1e-4
 """Standard deviation of the mean of the projection centres in a free network."""
 
 CELLS = 400
-"""Of a raster of curved water, along its longer side: a bend of 10 cm is kept within 1 um."""
+"""Of a raster of curved water, along its longer side, which represents 10 cm to 1 um."""
 MARGIN = 0.2
 """By which that raster exceeds the block, as a share of its extent."""
 
@@ -67,38 +64,13 @@ class Problem:
     unknowns: Unknowns
     origin: FloatArray  # (3,), of the coordinates in `given` and in states
     given: Given  # what the kernels need
-    groups: list[list[int]]  # rows of the cameras of each sensor
-    codes: list[tuple[int, ...]]  # free lens parameters of each sensor
-    moves: BoolArray  # (k,), poses that move one by one
-    # of the g shared unknowns, and of the seven motions if all poses move together
-    names: list[str]
-
-    def spread(self, state: State) -> csc_array:
-        """Return how poses and shared unknowns move with the free unknowns, shape (6 k + g, u).
-
-        Those are the poses that move, and what has names.
-        """
-        from scipy import sparse
-
-        k, g = len(self.moves), self.given.shared
-        free = np.append(np.repeat(self.moves, 6), np.ones(g, np.bool_))
-        one_by_one = sparse.eye_array(6 * k + g, format="csc")[:, np.flatnonzero(free)]
-        if self.unknowns.poses != "similarity":
-            return one_by_one
-        together = np.vstack([self.pose_gradients(state).reshape(-1, 7), np.zeros((g, 7))])
-        return sparse.hstack([one_by_one, sparse.csc_array(together)], format="csc")
+    lens_unknowns: list[tuple[int, int]]  # of each the first image of its sensor, and the code
+    names: list[str]  # of the g shared unknowns
 
     @property
-    def pivot(self) -> FloatArray:
-        """The point about which a similarity turns and scales the poses, shape (3,)."""
-        return np.asarray(self.block.cameras.centres.mean(axis=0) - self.origin)
-
-    def pose_gradients(self, state: State) -> FloatArray:
-        """Return how poses, turn and centre, move with a similarity of all, shape (k, 6, 7)."""
-        by = np.zeros((len(self.moves), 6, 7))
-        by[:, :3, 3:6] = -state.rotations
-        by[:, 3:] = similarity_gradients(state.centres - self.pivot)
-        return by
+    def fixed(self) -> int:
+        """Number of fixed pose parameters, the first of all 6 k + g: all or none."""
+        return 6 * len(self.block.cameras) if self.unknowns.poses == "fixed" else 0
 
     @property
     def used(self) -> BoolArray:
@@ -114,10 +86,7 @@ class Problem:
     def lens_effects(self) -> FloatArray:
         """Image movement at the corner of the frame per unit of each lens unknown."""
         lenses = self.block.cameras.lenses or ()
-        pairs = zip(self.groups, self.codes, strict=True)
-        return np.array([
-            effect_at_corner(lenses[images[0]], code) for images, codes in pairs for code in codes
-        ])  # fmt: skip
+        return np.array([effect_at_corner(lenses[i], code) for i, code in self.lens_unknowns])
 
     def weighted(self, weight: FloatArray) -> Problem:
         """Return the problem with other weights of its observations."""
@@ -132,8 +101,6 @@ class Solution:
     lenses: tuple[Lens, ...]  # of the k cameras
     shared: FloatArray  # (g,), corrections of the shared unknowns
     cost: float = np.inf  # sum of weighted squares, including prior knowledge
-    rounds: int = 0  # with different weights
-    steps: int = 0  # of all rounds
 
 
 def prepare(
@@ -142,8 +109,11 @@ def prepare(
     """Return a problem and its start; the origin is the rounded mean of the cameras by default."""
     cameras, water, lenses = block.cameras, block.water, block.cameras.lenses or ()
     origin = np.round(cameras.centres.mean(axis=0)) if origin is None else origin
-    group, groups = sensor_groups(lenses)
-    codes = [usable_codes(lenses[images[0]], unknowns.lens) for images in groups]
+    group = sensor_groups(lenses)
+    first_images = np.unique(group, return_index=True)[1].tolist()
+    codes = [usable_codes(lenses[i], unknowns.lens) for i in first_images]
+    pairs = zip(first_images, codes, strict=True)
+    lens_unknowns = [(i, code) for i, of_sensor in pairs for code in of_sensor]
     numbers = surface_numbers(block, origin)
     planes, plane_names, axis, alike = _planes(block, origin, numbers)
     # columns of the shared unknowns: lenses, then surface and planes
@@ -155,17 +125,14 @@ def prepare(
     for number, other in alike.items():
         column[number] = column[other]
     names = [
-        NAMES[code] if len(groups) == 1 else f"{NAMES[code]} of sensor {i}"
-        for i, of_sensor in enumerate(codes, start=1)
-        for code in of_sensor
+        NAMES[code] if len(codes) == 1 else f"{NAMES[code]} of sensor {group[i] + 1}"
+        for i, code in lens_unknowns
     ]
     names += [name for name, one in zip((*WATER_NAMES, *plane_names), is_free, strict=True) if one]
-    shared = len(names)
-    names += MOTIONS if unknowns.poses == "similarity" else ()
     row, table = lens_table(lenses)
     centres = cameras.centres - origin
-    weight = inverse_variances(block.surveyed_xyz, block.surveyed_sigma_m)
-    conditions = block.conditions
+    surveyed_xyz, surveyed_weight = block.survey
+    _, on, on_sigma_m = block.surfaces
     given = Given(
         start=np.ascontiguousarray(block.start, np.int64),
         camera=np.ascontiguousarray(block.camera, np.int64),
@@ -179,21 +146,17 @@ def prepare(
         origin=origin,
         curved=bool(unknowns.surface.get("shape")),
         first_lens=first_lens,
-        code=np.array([code for of_sensor in codes for code in of_sensor], np.int64),
+        code=np.array([code for _, code in lens_unknowns], np.int64),
         column=column,
-        shared=shared,
-        surveyed_xyz=np.where(weight > 0.0, block.surveyed_xyz - origin, 0.0),
-        surveyed_weight=weight,
-        on=np.asarray(conditions.on, np.int64),
-        on_weight=np.where(conditions.on >= 0, 1.0 / conditions.sigma_m, 0.0),
+        shared=len(names),
+        surveyed_xyz=np.where(surveyed_weight > 0.0, surveyed_xyz - origin, 0.0),
+        surveyed_weight=surveyed_weight,
+        on=on,
+        on_weight=np.where(on >= 0, 1.0 / on_sigma_m, 0.0),
         axis=axis,
-        tests=np.zeros((0, 2, SHARED + shared)),
+        tests=np.zeros((0, 2, SHARED + len(names))),
     )
-    poses = [
-        unknowns.poses == "free" and label not in unknowns.fixed_images for label in cameras.labels
-    ]
-    moves = np.array(poses, np.bool_)
-    problem = Problem(block, unknowns, origin, given, groups, codes, moves, names)
+    problem = Problem(block, unknowns, origin, given, lens_unknowns, names)
     state = State(
         centres, np.ascontiguousarray(cameras.rotations, np.float64), table, block.xyz - origin,
         np.concatenate([numbers, planes]), port_row(block.port),
@@ -226,28 +189,25 @@ def _planes(
     Returns their numbers (height and two slopes), names, main axes, and which numbers are the same
     unknown as another one, counted from the first of `WATER_NAMES`.
     """
-    given = block.conditions
-    xyz, counts = block.xyz - origin, np.diff(block.start) > 0
-    bundles = [tuple(given.parallel)] if given.parallel else []
-    bundles += [(name,) for name in given.names if name not in given.parallel]
-    numbers = np.zeros((len(given.names), 3))
-    axis, alike = np.full(1 + len(given.names), 2), dict[int, int]()
+    planes, on_surface, _ = block.surfaces
+    xyz, seen = block.xyz - origin, np.diff(block.start) > 0
+    bundles = [block.parallel] if block.parallel else []
+    bundles += [(name,) for name in planes if name not in block.parallel]
+    numbers = np.zeros((len(planes), 3))
+    axis, alike = np.full(1 + len(planes), 2, np.int64), dict[int, int]()
     for bundle in bundles:
-        rows = [given.names.index(name) for name in bundle if name != WATER]
-        on = [xyz[(given.on == row + 1) & counts] for row in rows]
+        rows = [planes.index(name) for name in bundle if name != WATER]
+        on = [xyz[(on_surface == row + 1) & seen] for row in rows]
         normal = np.array([-water[1], -water[2], 1.0])
         if WATER not in bundle:
             # any three points lie on a plane: one more is needed to say anything
             count, least = sum(map(len, on)), len(bundle) + 3
             if count < least:
-                raise GeometryError(
-                    "gcps.few_on_plane",
+                words = (
                     f"Plane {', '.join(bundle)}: {count} points are on it, at least {least} are"
-                    " needed. Mark more points.",
-                    plane=", ".join(bundle),
-                    points=count,
-                    least=least,
+                    " needed. Mark more points."
                 )
+                raise GeometryError("gcps.few_on_plane", words, plane=", ".join(bundle))
             apart = np.vstack([points - points.mean(axis=0) for points in on])
             normal = np.linalg.svd(apart, full_matrices=False)[2][-1]
         up = int(np.abs(normal).argmax())
@@ -259,8 +219,8 @@ def _planes(
             numbers[row], axis[1 + row] = [middle[up] - slopes @ middle[[x, y]], *slopes], up
             if PLANES + 3 * row != first:
                 alike |= {PLANES + 3 * row + i: first + i for i in (1, 2)}
-    names = [f"{word} of {name}" for name in given.names for word in WATER_NAMES[:3]]
-    return numbers.ravel().tolist(), names, axis.astype(np.int64), alike
+    names = [f"{word} of {name}" for name in planes for word in WATER_NAMES[:3]]
+    return numbers.ravel().tolist(), names, axis, alike
 
 
 # What was found
@@ -325,12 +285,8 @@ def polynomial(water: FloatArray, x: FloatArray | float, y: FloatArray | float) 
 def prior_rows(problem: Problem, found: Solution) -> tuple[csc_array, FloatArray]:
     """Return prior knowledge of poses, lens and water as weighted observations of them.
 
-    Returns
-    -------
-    rows : sparse array, shape (n, 6 k + g)
-        Derivatives by poses and shared unknowns, over the standard deviation.
-    left : array, shape (n,)
-        Observed minus current value, over the standard deviation.
+    These are the derivatives by poses and shared unknowns, a sparse array of shape (n, 6 k + g),
+    and observed minus current values, shape (n,), both over the standard deviations.
     """
     from scipy import sparse
 
@@ -344,10 +300,10 @@ def prior_rows(problem: Problem, found: Solution) -> tuple[csc_array, FloatArray
     free, sigma = free[free >= 0][np.isfinite(sigma)], sigma[np.isfinite(sigma)]
     column = np.concatenate([6 * camera + 3 + axis, 6 * k + free])
     weight = np.concatenate([root[camera, axis], 1.0 / sigma])
-    centres = (block.gnss_xyz - problem.origin - found.state.centres)[camera, axis]
+    centres = (block.gnss.xyz - problem.origin - found.state.centres)[camera, axis]
     left = weight * np.concatenate([centres, -found.shared[free]])
     rows = sparse.csc_array((weight, (np.arange(len(column)), column)), (len(column), size))
-    if not problem.unknowns.free_network or problem.unknowns.poses == "similarity":
+    if not problem.unknowns.free_network:
         return rows, left
     # mean, direction and scale of the centres of a free network
     start = block.cameras.centres - problem.origin
@@ -374,31 +330,30 @@ def _undetermined_motions(problem: Problem) -> list[int]:
     return [0, 1, *level, *tilt, 5, 6]
 
 
-def cost_at(problem: Problem, found: Solution, rule: Rule) -> float:
+def cost_at(problem: Problem, found: Solution, loss: int) -> float:
     """Return the cost of a solution: images, surveyed points and all prior knowledge."""
     used, weight = problem.used, problem.given.weight
     r = residuals(found.state, problem.given)[used]
-    return cost_of((r**2).sum(axis=1) * weight[used] ** 2, rule.loss) + survey_cost(problem, found)
+    return cost_of((r**2).sum(axis=1) * weight[used] ** 2, loss) + survey_cost(problem, found)
 
 
 def survey_cost(problem: Problem, found: Solution) -> float:
     """Return the weighted squares of all observations that are no images."""
     given, left = problem.given, prior_rows(problem, found)[1]
     off = given.surveyed_weight * (given.surveyed_xyz - found.state.xyz) ** 2
-    on_surfaces = off_surfaces(problem, found.state)[1]
-    return float(off.sum() + left @ left + on_surfaces @ on_surfaces)
+    off_surfaces = _off_surfaces(problem, found.state)
+    return float(off.sum() + left @ left + off_surfaces @ off_surfaces)
 
 
-def off_surfaces(problem: Problem, state: State) -> tuple[IntArray, FloatArray]:
-    """Return points that lie on surfaces, and surface minus point in standard deviations.
+def _off_surfaces(problem: Problem, state: State) -> FloatArray:
+    """Return surface minus point, in standard deviations, of points that lie on surfaces.
 
-    Both have the shape (n,); points that their rays and surface do not fix are missing.
+    Points that their rays and surface do not fix are missing.
     """
     if not len(problem.given.on):
-        return np.zeros(0, np.int64), np.zeros(0)
+        return np.zeros(0)
     rows = linearised(state, problem.given, UNDAMPED, problem.block.tie_points, len(state.xyz))
-    is_condition = ~rows.is_image & rows.columns[:, 0, POINT:SHARED].any(axis=1)
-    return problem.block.owner[rows.observation[is_condition]], rows.r[is_condition, 0]
+    return rows.r[~rows.is_image & rows.columns[:, 0, POINT:SHARED].any(axis=1), 0]
 
 
 # Intersection with fixed poses

@@ -8,19 +8,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import (
-    INDEX,
-    LEAST_VIEWS,
-    NAMES,
-    PORT,
-    SHAPE,
-    WATER,
-    WATER_NAMES,
-    Block,
-    Unknowns,
-    lens_parameter,
-)
+from pcfix.adjust.block import LEAST_VIEWS, Block
 from pcfix.adjust.normal import residuals
+from pcfix.adjust.parameters import INDEX, NAMES, PORT, SHAPE, WATER_NAMES, Unknowns, lens_parameter
 from pcfix.adjust.precision import Precision
 from pcfix.adjust.problem import (
     Intersected,
@@ -28,7 +18,6 @@ from pcfix.adjust.problem import (
     Solution,
     intersect_fixed,
     intersected,
-    off_surfaces,
     port_of,
     solved_cameras,
     surface_numbers,
@@ -99,9 +88,8 @@ def redundancy_of(problem: Problem) -> int:
     priors += sum(0.0 < value < np.inf for value in problem.unknowns.water_sigma)
     priors += len(np.intersect1d(np.flatnonzero(given.on >= 0), block.owner[used]))
     datum = 7 if problem.unknowns.free_network else 0
-    return int(
-        2 * used.sum() + priors + datum - 3 * points - 6 * problem.moves.sum() - len(problem.names)
-    )
+    unknowns = 6 * len(block.cameras) - problem.fixed + len(problem.names)
+    return int(2 * used.sum() + priors + datum - 3 * points - unknowns)
 
 
 def adjusted_of(
@@ -111,15 +99,14 @@ def adjusted_of(
     """Return a solution as a result, with check points intersected."""
     block, owner, state = problem.block, problem.block.owner, now.state
     # check points have no weight yet
-    is_check = np.isin(owner, block.tie_points + np.flatnonzero(block.is_check))
-    is_check &= np.diff(block.start)[owner] >= LEAST_VIEWS
+    is_check = (block.is_check & (np.diff(block.start) >= LEAST_VIEWS))[owner]
     with_checks, _ = intersected(problem.weighted(np.where(is_check, 1.0, 0.0)), state)
     xyz, r = with_checks.xyz + problem.origin, residuals(with_checks, problem.given)
     water = water_of(problem, state)
     none = -np.inf if block.port is None else np.inf  # behind a port everything is under water
     level = np.full(len(xyz), none) if water is None else surface_above(water, xyz).height_m
     cameras = solved_cameras(problem, now)
-    off = cameras.centres - block.gnss_xyz
+    off = cameras.centres - block.gnss.xyz
     return Adjusted(
         block=block,
         unknowns=problem.unknowns,
@@ -144,14 +131,16 @@ def adjusted_of(
 
 
 def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlRow]:
-    rows = []
-    names = zip(block.control_names, block.is_check, strict=True)
-    for p, (name, check) in enumerate(names, block.tie_points):
+    rows, control = list[ControlRow](), block.control
+    if control is None:
+        return rows
+    names = zip(control.names, control.is_check, control.xyz, strict=True)
+    for p, (name, check, surveyed) in enumerate(names, block.tie_points):
         marks = r[block.start[p] : block.start[p + 1]]
         marks = marks[np.isfinite(marks).all(axis=1)]
-        if (check and len(marks) < LEAST_VIEWS) or np.isnan(block.surveyed_xyz[p]).any():
+        if (check and len(marks) < LEAST_VIEWS) or np.isnan(surveyed).any():
             continue
-        dx, dy, dz = (xyz[p] - block.surveyed_xyz[p]).tolist()
+        dx, dy, dz = (xyz[p] - surveyed).tolist()
         rms_px, role = float(rms(marks.ravel())), "check" if check else "control"
         rows.append(ControlRow(name, role, dx, dy, dz, rms_px, len(marks)))
     return rows
@@ -167,13 +156,8 @@ def before_of(adjusted: Adjusted) -> Intersected:
     survey; observations that the adjustment excluded stay excluded.
     """
     block = adjusted.block
-    found = intersect_fixed(
-        replace(
-            block,
-            sigma_px=np.where(adjusted.used, block.sigma_px, np.inf),
-            surveyed_sigma_m=np.full_like(block.surveyed_sigma_m, np.inf),
-        )
-    )
+    sigma_px = np.where(adjusted.used, block.sigma_px, np.inf)
+    found = intersect_fixed(replace(block, sigma_px=sigma_px, control=None))
     met = (np.isfinite(found.squares) & adjusted.is_observed)[:, None]
     residual_px = np.where(met[block.owner], found.residual_px, np.nan)
     return Intersected(np.where(met, found.xyz, np.nan), residual_px, found.start)
@@ -198,35 +182,26 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
     `before` are the residuals before the adjustment, of `before_of`.
     """
     a, block, u = adjusted, adjusted.block, adjusted.unknowns
-    k, observed = len(block.cameras), a.is_observed
-    roles = [row.role for row in a.control]
-    is_check = np.append(np.zeros(len(a.xyz) - len(block.is_check), np.bool_), block.is_check)
-    fixed = k if u.poses == "fixed" else len(set(u.fixed_images) & set(block.cameras.labels))
-    lenses = block.cameras.lenses or ()
+    observed, lenses = a.is_observed, block.cameras.lenses or ()
     found = {
         "source": a.source,
         "image_unit": lenses[0].unit,
-        "images": k,
-        "images_fixed": fixed,
-        "poses_are": u.poses,
-        "port": block.port is not None,
+        "images": len(lenses),
         "unknowns": {
+            "poses": u.poses,
             "lens": u.lens,
             "surface": dict(u.surface),
             "free_network": u.free_network,
-            "parallel": block.conditions.parallel,
+            "parallel": block.parallel,
         },
         "points": {
             "all": observed.sum(),
             "land": (observed & ~a.is_wet).sum(),
             "water": (observed & a.is_wet).sum(),
-            "left_out": (~observed & ~is_check).sum(),
-            "control": roles.count("control"),
-            "check": roles.count("check"),
         },
         "observations": {
             "used": a.used.sum(),
-            "left_out": (~a.used & ~is_check[block.owner]).sum(),
+            "left_out": (~a.used & ~block.is_check[block.owner]).sum(),
         },
         "sigma0": a.sigma0,
         "redundancy": a.redundancy,
@@ -235,16 +210,13 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
             "water": _residuals(a, before, a.is_wet),
         },
         "lens": _lens(a),
-        "water": _water(a),
-        "port_found": _port(a),
-        "on_surfaces": _on_surfaces(a.problem, a.solution),
+        "water": _surface(a, "water"),
+        "port": _surface(a, "port"),
         "poses": _poses(a),
         "precision": _precision(a.precision),
         "gnss": _gnss(a),
         "control": _surveyed(a, "control"),
         "check": _surveyed(a, "check"),
-        "rounds": a.solution.rounds,
-        "steps": a.solution.steps,
         "notes": [one.as_dict() for one in {str(one): one for one in a.notes}.values()],
     }
     return dict(plain(found))
@@ -273,92 +245,55 @@ def _residuals(a: Adjusted, before: Intersected, points: BoolArray) -> Plain:
 def _lens(a: Adjusted) -> list[Plain]:
     """Return the free parameters of each lens: the first of the shared unknowns."""
     original, adjusted = a.block.cameras.lenses or (), a.cameras.lenses or ()
-    sensors = enumerate(zip(a.problem.groups, a.problem.codes, strict=True), start=1)
-    free = [(i, images[0], code) for i, (images, codes) in sensors for code in codes]
+    rows = zip(a.problem.lens_unknowns, a.precision.shared, strict=False)
     return [
         {
-            "sensor": original[image].sensor or f"sensor {i}",
+            "sensor": original[i].sensor or f"sensor {a.problem.given.group[i] + 1}",
             "name": NAMES[code],
-            "before": lens_parameter(original[image], code),
-            "after": lens_parameter(adjusted[image], code),
+            "before": lens_parameter(original[i], code),
+            "after": lens_parameter(adjusted[i], code),
             "sigma": unknown.sigma,
         }
-        for (i, image, code), unknown in zip(free, a.precision.shared, strict=False)
+        for (i, code), unknown in rows
     ]
 
 
-def _water(a: Adjusted) -> Plain | None:
-    original, adjusted = a.block.water, a.water
-    if original is None or adjusted is None:
+def _surface(a: Adjusted, kind: str) -> Plain | None:
+    """Return parameters of the water or of the port, block frame; None if there is none."""
+    sigma = dict(zip(WATER_NAMES, a.unknowns.water_sigma, strict=True))
+    free = [name for name, value in sigma.items() if value]
+    if kind == "water":
+        surface: object = a.water
+        names = [*WATER_NAMES[: INDEX + 1]] if isinstance(a.block.water, WaterPlane) else ["index"]
+        names += [name for name in free if name in WATER_NAMES[SHAPE:PORT]]
+    else:
+        surface, names = a.port, [name for name in free if name in ("index", *WATER_NAMES[PORT:])]
+    if surface is None:
         return None
-    is_plane = isinstance(original, WaterPlane)
-    names = ["level", "tilt_x", "tilt_y", "index"] if is_plane else ["index"]
-    names += WATER_NAMES[SHAPE:PORT] if a.unknowns.surface.get("shape") else []
-    found: Plain = {"surface": str(adjusted), **_numbers(a, names)}
-    for key in ("before", "after") if is_plane else ():
-        found["level"][key] += float(a.problem.origin[2])
-    return found
-
-
-def _port(a: Adjusted) -> Plain | None:
-    if a.port is None:
-        return None
-    free = zip(WATER_NAMES, a.unknowns.water_sigma, strict=True)
-    of_port = ("index", *WATER_NAMES[PORT:])
-    names = [name for name, sigma in free if sigma and name in of_port]
-    return {"port": str(a.port), **_numbers(a, names)}
-
-
-def _numbers(a: Adjusted, names: list[str]) -> dict[str, Plain]:
-    """Return parameters of the refracting surface, block frame."""
-    start = surface_numbers(a.block, a.problem.origin)
-    return {
-        name: {
-            "before": start[i],
-            "after": a.solution.state.water[i],
+    start, found = surface_numbers(a.block, a.problem.origin), dict[str, Any](surface=str(surface))
+    for name in names:
+        i = WATER_NAMES.index(name)
+        base = float(a.problem.origin[2]) if name == "level" else 0.0
+        found[name] = {
+            "before": base + start[i],
+            "after": base + a.solution.state.water[i],
             "sigma": a.precision.sigma_of(name),
-            "free": bool(a.unknowns.water_sigma[i]),
+            "free": name in free,
         }
-        for i, name in enumerate(WATER_NAMES)
-        if name in names
-    }
-
-
-def _on_surfaces(problem: Problem, now: Solution) -> list[Plain]:
-    """Return the stated and found distances of marked points from each surface, metres."""
-    given, (points, left) = problem.block.conditions, off_surfaces(problem, now.state)
-    sigma_m = given.sigma_m[points]
-    rows = [(name, given.on[points] == i) for i, name in enumerate((WATER, *given.names))]
-    return [
-        {
-            "surface": name,
-            "points": is_on.sum(),
-            "sigma_m": rms(sigma_m[is_on]),
-            "rms_m": rms((left * sigma_m)[is_on]),
-        }
-        for name, is_on in rows
-        if is_on.any()
-    ]
+    return found
 
 
 def _poses(a: Adjusted) -> Plain:
     far = np.linalg.norm(a.cameras.centres - a.block.cameras.centres, axis=1)
     before, after = np.asarray(a.block.cameras.rotations), np.asarray(a.cameras.rotations)
     turned = Rotation.from_matrix(after @ before.transpose(0, 2, 1)).magnitude()
-    return {
-        "moved_rms_m": rms(far),
-        "moved_largest_m": far.max(),
-        "moved_largest_image": a.cameras.labels[int(far.argmax())],
-        "turned_rms_deg": rms(np.degrees(np.asarray(turned))),
-    }
+    return {"moved_rms_m": rms(far), "turned_rms_deg": rms(np.degrees(np.asarray(turned)))}
 
 
 def _precision(p: Precision) -> Plain:
-    moves = p.pose_covariance.any(axis=(1, 2))
     return {
-        "images": moves.sum(),
-        "centre_mean_m": mean(p.centre_sigma_m[moves]),
-        "angle_mean_deg": mean(p.angle_sigma_deg[moves]),
+        "centre_mean_m": mean(p.centre_sigma_m),
+        "angle_mean_deg": mean(p.angle_sigma_deg),
         "shared": [row._asdict() for row in p.shared],
         "correlation": p.correlation,
     }
@@ -369,14 +304,11 @@ def _gnss(a: Adjusted) -> Plain | None:
     if not known.any():
         return None
     off = a.gnss_residual_m[known]
-    far = np.linalg.norm(np.nan_to_num(off), axis=1)
     return {
         "images": known.sum(),
         "mean_m": mean(off),
         "rms_m": rms(off),
-        "rms_before_m": rms((a.block.cameras.centres - a.block.gnss_xyz)[known]),
-        "largest_m": far.max(),
-        "largest_image": a.cameras.labels[int(np.flatnonzero(known)[far.argmax()])],
+        "rms_before_m": rms((a.block.cameras.centres - a.block.gnss.xyz)[known]),
     }
 
 

@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import INDEX, moved_lens, words_of
 from pcfix.adjust.collinearity import State
 from pcfix.adjust.normal import SQUARES, UNDAMPED, Rule, normal_equations, point_steps, residuals
+from pcfix.adjust.parameters import INDEX, moved_lens, words_of
 from pcfix.adjust.problem import Problem, Solution, cost_at, port_of, port_row, prior_rows
 from pcfix.errors import GeometryError, PcfixError
 from pcfix.lens.imaging import lens_table
-from pcfix.model import FloatArray
+from pcfix.model import FloatArray, Lens
+from pcfix.running import current
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8
 MOST_STEPS = 60
@@ -32,66 +33,42 @@ EXACT = 1e-10
 ROUNDING = 1e-12
 """Share of the cost by which it may rise at the minimum."""
 
-WEAK = 1e-11
-"""Eigenvalue of the matrix with unit diagonal below which a combination is undetermined."""
-
-
-Progress = Callable[[str], None]
-"""Called with a line after each step."""
-
 
 # Steps
 
 
-def solve(
-    problem: Problem,
-    start: Solution,
-    loss: int = SQUARES,
-    progress: Progress | None = None,
-    close: float = CLOSE,
-) -> Solution:
-    """Minimise the weighted squared residuals.
+def solve(problem: Problem, start: Solution, loss: int = SQUARES, close: float = CLOSE) -> Solution:
+    """Minimise the weighted squared residuals, or a robust loss of `pcfix.adjust.normal`.
 
-    Parameters
-    ----------
-    loss : int
-        `SQUARES`, `HUBER` or `CAUCHY` of `pcfix.adjust.normal`.
-    close : float
-        Two steps in a row that lower the cost by less than this share end the round.
+    Two steps in a row that lower the cost by less than the share `close` end the round.
     """
-    rule = Rule(loss)
-    now = replace(start, cost=cost_at(problem, start, rule), rounds=start.rounds + 1)
-    if not np.isfinite(now.cost):
-        raise GeometryError(
-            "adjust.no_start", "The adjustment has no finite start. Check the poses and the water."
-        )
-    damping, up, calm = FIRST_DAMPING, 2.0, 0
+    now = replace(start, cost=cost_at(problem, start, loss))
+    damping, up, calm, steps = FIRST_DAMPING, 2.0, 0, 0
     # with exact observations the cost ends at zero, of which there is no share
     least_cost = EXACT * max(int(problem.used.sum()), 1)
-    last = start.steps + MOST_STEPS
-    while now.steps < last and calm < 2 and damping <= MOST_DAMPING:
-        trial = _trial(problem, now, rule._replace(damping=damping))
+    while steps < MOST_STEPS and calm < 2 and damping <= MOST_DAMPING:
+        trial = _trial(problem, now, Rule(loss, damping))
         gain = np.nan if trial is None else (now.cost - trial.cost) / max(now.cost, least_cost)
         if trial is not None and gain >= 0.0:
-            now = replace(trial, steps=now.steps + 1)
+            now, steps = trial, steps + 1
             damping, up = max(damping / 10.0, LEAST_DAMPING), 2.0
             calm = calm + 1 if gain < close else 0
-            show(progress, problem, now)
+            show(problem, now)
         elif gain > -ROUNDING:
             break
         else:
             damping, up = damping * up, 2.0 * up  # a shorter step
-    if trial is None and now.steps == start.steps:
+    if trial is None and steps == 0:
         raise singular(problem, now)
     return now
 
 
-def show(progress: Progress | None, problem: Problem, now: Solution) -> None:
-    """Describe the last step to whoever follows the progress."""
-    if progress is not None:
+def show(problem: Problem, now: Solution) -> None:
+    """Show the residuals after a step, if the command shows its progress."""
+    if (say := current().say) is not None:
         r = residuals(now.state, problem.given)[problem.used]
         rms_px = np.sqrt(np.nansum(r * r) / max(r.size, 1))
-        progress(f"round {now.rounds}, step {now.steps}, {len(r):,} observations, {rms_px:.3f} px")
+        say(f"{len(r):,} observations, residuals {rms_px:.3f} px")
 
 
 def _trial(problem: Problem, now: Solution, rule: Rule) -> Solution | None:
@@ -103,28 +80,21 @@ def _trial(problem: Problem, now: Solution, rule: Rule) -> Solution | None:
     step = solve_for(right)
     if not np.isfinite(step).all():
         return None
-    points = point_steps(now.state, problem.given, rule, problem.spread(now.state) @ step)
-    moved = moved_by(problem, now, step, points)
-    return None if moved is None else replace(moved, cost=cost_at(problem, moved, rule))
+    step = np.append(np.zeros(problem.fixed), step)
+    moved = moved_by(problem, now, step, point_steps(now.state, problem.given, rule, step))
+    return None if moved is None else replace(moved, cost=cost_at(problem, moved, rule.loss))
 
 
 def moved_by(
     problem: Problem, now: Solution, step: FloatArray, points: FloatArray
 ) -> Solution | None:
-    """Return a solution with steps of the free unknowns and of the points added.
+    """Return a solution with steps of poses and shared unknowns, (6 k + g,), and points added.
 
     None if a parameter leaves its range.
     """
-    state, given, count = now.state, problem.given, 6 * int(problem.moves.sum())
-    poses, shared = np.zeros((len(problem.moves), 6)), step[count:]
-    poses[problem.moves] = step[:count].reshape(-1, 6)
-    centres = state.centres + poses[:, 3:]
+    state, given, count = now.state, problem.given, 6 * len(now.lenses)
+    poses, shared = step[:count].reshape(-1, 6), step[count:]
     rotations = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ state.rotations
-    if problem.unknowns.poses == "similarity":
-        t, phi, s = np.split(shared[given.shared :], [3, 6])
-        turn = Rotation.from_rotvec(phi).as_matrix()
-        centres = problem.pivot + t + (1.0 + s[0]) * (centres - problem.pivot) @ turn.T
-        rotations = rotations @ turn.T
     water, free = state.water.copy(), given.column >= 0
     water[free] += shared[given.column[free]]
     if not 1.0 <= water[INDEX] < 3.0:
@@ -133,23 +103,21 @@ def moved_by(
         port = port_of(problem.block, water)
     except PcfixError:  # a distance below zero, or a dome that does not contain the camera
         return None
-    lenses = list(now.lenses)
-    parts = np.split(shared, given.first_lens[1:])
-    for rows, codes, by in zip(problem.groups, problem.codes, parts, strict=False):
-        # images with one lens keep one
-        new = {lens: moved_lens(lens, codes, by) for lens in {lenses[i] for i in rows}}
-        for i in rows:
-            lenses[i] = new[lenses[i]]
+    pairs, moved = [*zip(now.lenses, given.group.tolist(), strict=True)], dict[Any, Lens]()
+    for lens, sensor in set(pairs):  # images with one lens keep one
+        own = slice(*given.first_lens[sensor : sensor + 2])
+        moved[lens, sensor] = moved_lens(lens, given.code[own].tolist(), shared[own])
+    lenses = tuple(moved[pair] for pair in pairs)
     if not all(lens.focal > 0.0 for lens in lenses):
         return None
-    table = lens_table(tuple(lenses))[1]
+    table = lens_table(lenses)[1]
     return replace(
         now,
         state=State(
-            centres, np.ascontiguousarray(rotations), np.ascontiguousarray(table),
-            state.xyz + points, water, port_row(port),
+            state.centres + poses[:, 3:], np.ascontiguousarray(rotations),
+            np.ascontiguousarray(table), state.xyz + points, water, port_row(port),
         ),
-        lenses=tuple(lenses),
+        lenses=lenses,
         shared=now.shared + shared,
     )  # fmt: skip
 
@@ -161,6 +129,7 @@ def reduced_at(problem: Problem, found: Solution, rule: Rule = UNDAMPED) -> tupl
     """Return the equations of the free unknowns at a solution, with prior knowledge.
 
     The matrix, shape (u, u), is dense or scipy's sparse one; the right side has the shape (u,).
+    These are the last u of all 6 k + g unknowns.
     """
     from scipy.sparse import diags_array
 
@@ -169,8 +138,8 @@ def reduced_at(problem: Problem, found: Solution, rule: Rule = UNDAMPED) -> tupl
     extra = rows.T @ rows
     # the damping is a factor on the diagonal before the points were eliminated
     extra = extra + diags_array(rule.damping * (diagonal + extra.diagonal()))
-    spread = problem.spread(found.state)
-    return spread.T @ (total + extra) @ spread, spread.T @ (right + rows.T @ left)
+    free = slice(problem.fixed, None)
+    return (total + extra)[free, free], (right + rows.T @ left)[free]
 
 
 def solver(matrix: Any) -> Callable[[FloatArray], FloatArray] | None:
@@ -205,46 +174,27 @@ def solver(matrix: Any) -> Callable[[FloatArray], FloatArray] | None:
 # What is undetermined
 
 
-BED = {"level", "index", "tilt_x", "tilt_y", "shape_xx", "shape_xy", "shape_yy"}
-
-
 def singular(problem: Problem, solution: Solution) -> GeometryError:
     """Return an error that names the unknowns that the observations leave undetermined.
 
-    These have no observation at all, or a component in an eigenvector of an eigenvalue of zero of
-    the reduced matrix with unit diagonal: 1e-4 makes a variance a thousand times larger.
+    These are the ones on which no observation depends, or if there are none, all of them.
     """
-    from scipy.sparse import csc_array, diags_array
-    from scipy.sparse.linalg import eigsh
-
-    matrix, poses = reduced_at(problem, solution)[0], np.flatnonzero(problem.moves)
-    diagonal = matrix.diagonal()
-    weak, why = ~(diagonal > 0.0), "no observation depends on them"
+    matrix = reduced_at(problem, solution)[0]
+    weak, why = ~(matrix.diagonal() > 0.0), "no observation depends on them"
     if not weak.any():
-        scale = diags_array(1.0 / np.sqrt(diagonal))
-        start = np.random.default_rng(0).normal(size=len(diagonal))
-        few = min(8, len(diagonal) - 1)
-        scaled = csc_array(scale @ matrix @ scale)
-        values, vectors = eigsh(scaled, k=few, sigma=-1e-9, which="LM", v0=start)
-        vectors = vectors[:, values < max(WEAK, 10.0 * float(values.min()))]
-        weak = np.linalg.norm(vectors, axis=1) > 1e-4
-        why = "the observations do not separate them"
-    of_poses, of_names = np.split(weak, [6 * len(poses)])
-    images = poses[of_poses.reshape(-1, 6).any(axis=1)]
+        weak, why = np.ones(len(weak), np.bool_), "the observations do not separate them"
+    of_poses, of_names = np.split(weak, [len(weak) - len(problem.names)])
+    images = np.flatnonzero(of_poses.reshape(-1, 6).any(axis=1))
     labels = [problem.block.cameras.labels[i] for i in images]
     names = [name for name, is_weak in zip(problem.names, of_names, strict=True) if is_weak]
     words = [f"the {words_of(name)[0]}" for name in names]
     if labels:
         some = f"of {', '.join(labels[:3])}" if len(labels) <= 3 else f"of {len(labels)} images"
         words.append(f"the poses {some}")
-    remedy = "fix some of them"
-    if set(names) & BED and not problem.block.wet.any():
-        remedy = "fix them, as no point is under water"
-    elif labels:
-        remedy = "give GNSS positions, three control points or a free network, or fix images"
+    datum = ", or give GNSS positions or three control points" if labels else ""
     return GeometryError(
         "adjust.singular",
-        f"The adjustment cannot determine {', '.join(words)}: {why}. To solve it, {remedy}.",
+        f"The adjustment cannot determine {', '.join(words)}: {why}. Fix some of them{datum}.",
         unknowns=names,
         images=labels,
     )

@@ -8,12 +8,12 @@ changed, so it moves to P', where the same image coordinates intersect now:
 with straight rays, as ordinary software intersects them, land and bed alike. The cloud is then the
 one that the same software would have made with the adjusted cameras, and can be corrected with them
 by any method. Points are classified as submerged afterwards, because an adjustment without water
-may sink or lift whole beaches.
+may lower or raise a beach.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +27,7 @@ from pcfix.model import BoolArray, Cameras, Correction, FloatArray, IntArray, Ou
 from pcfix.refract.batch import Optics, optics_of
 from pcfix.refract.choice import views_in_frame
 from pcfix.refract.tiling import spatial_order
-from pcfix.sums import MOST, Sums
+from pcfix.sums import Sums
 
 MAX_STEPS = 12
 CLOSE_M = 1e-6
@@ -44,8 +44,6 @@ MOST_APART = 0.1
 """Share of the flying height between two centres of one image; refraction moves a block, with its
 datum and scale, by a few hundredths."""
 
-REASON = "fewer than two original cameras image them"
-
 
 # Points
 
@@ -55,21 +53,9 @@ def transfer(
 ) -> tuple[FloatArray, BoolArray]:
     """Intersect the images of points again, with adjusted cameras.
 
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Apparent points, metres, world frame.
-    views : Views
-        Cameras that intersect each point; weights do not count.
-    original, adjusted : Cameras
-        The same images, in the same order, with angles and lenses.
-
-    Returns
-    -------
-    shift_m : array, shape (n, 3)
-        Zero for points that stay.
-    moved : array of bool, shape (n,)
-        Points that two cameras or more image, before and after.
+    The cameras are the same images in the same order, with angles and lenses. Points and shifts
+    have the shape (n, 3), metres, world frame. Returns the shifts, zero for points that stay, and
+    which points two cameras or more image, before and after.
     """
     shift, moved = np.zeros((len(xyz), 3)), np.zeros(len(xyz), np.bool_)
     start, camera = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
@@ -189,22 +175,17 @@ class TransferCounts(Sums):
     points: int
     not_moved: int
     land: int
-    sum_m: FloatArray  # shape (4,): of the shift along the axes, and of its square
-    most_m: float = field(metadata=MOST)
+    sum_z_m: float
+    sum_squares_m2: float  # of the length of the shift
 
     @classmethod
     def of(cls, step: Transferred, correction: Correction) -> TransferCounts:
         """Return those of a chunk, with the correction that `Transferred.whole` returned."""
         followed = step.moved & ~correction.uncorrected
         shift = (step.xyz - step.original_xyz)[followed]
-        length2 = (shift**2).sum(axis=1)
-        return cls(
-            points=len(shift),
-            not_moved=int((~step.moved).sum()),
-            land=int((correction.outcome[followed] == Outcome.LAND).sum()),
-            sum_m=np.array([*shift.sum(axis=0), length2.sum()]),
-            most_m=float(np.sqrt(length2.max(initial=0.0))),
-        )
+        land = int((correction.outcome[followed] == Outcome.LAND).sum())
+        not_moved, squares = int((~step.moved).sum()), float((shift**2).sum())
+        return cls(len(shift), not_moved, land, float(shift[:, 2].sum()), squares)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,21 +197,12 @@ class CloudTransfer:
     row: IntArray  # (o,), row here of each original camera as read, -1 if it was not adjusted
 
     def step(self, xyz: FloatArray, listed: Views | None) -> Transferred:
-        """Transfer points.
-
-        Parameters
-        ----------
-        xyz : array, shape (n, 3)
-            Metres, world frame.
-        listed : Views or None
-            Of the original cameras, as read.
-        """
+        """Transfer points, shape (n, 3), metres; `listed` are views of the original cameras."""
         original, adjusted = self.original, self.adjusted
         shift, moved = np.zeros((len(xyz), 3)), np.zeros(len(xyz), np.bool_)
         views = None if listed is None else renumbered(listed, self.row)[0]
         if views is not None:
-            # whatever kind of list it is for the correction, these images show the point
-            shift, moved = transfer(xyz, replace(views, kind="tracks"), original, adjusted)
+            shift, moved = transfer(xyz, views, original, adjusted)
         left = np.flatnonzero(~moved)
         left = left[spatial_order(np.ascontiguousarray(xyz[left]))]
         for first in range(0, len(left), POINTS_AT_ONCE):
@@ -258,24 +230,23 @@ class CloudTransfer:
         """Refuse a cloud that the original cameras do not see."""
         if counts.points == 0 and counts.not_moved:
             words = (
-                f"{name}: no point could be transferred to the adjusted cameras, because {REASON}."
-                " Check that --adjusted-from is the model of the cloud, in its CRS."
+                f"{name}: no point could be transferred to the adjusted cameras, because fewer than"
+                " two original cameras image them. Check that --adjusted-from is the model of the"
+                " cloud, in its CRS."
             )
             raise GeometryError("adjusted_from.no_overlap", words, path=name)
 
     def as_dict(self, counts: TransferCounts) -> dict[str, Any]:
         """Return the statistics as plain values, metres."""
-        mean = counts.sum_m / max(counts.points, 1)
-        shift = {
-            "mean_x": mean[0], "mean_y": mean[1], "mean_z": mean[2], "rms": np.sqrt(mean[3]),
-            "max": counts.most_m,
-        }  # fmt: skip
+        count = max(counts.points, 1)
         return {
             "points": counts.points,
             "land": counts.land,
             "not_transferred": counts.not_moved,
-            "not_transferred_reason": REASON,
-            "shift_m": {name: round(float(value), 4) for name, value in shift.items()},
+            "shift_m": {
+                "mean_z": round(counts.sum_z_m / count, 4),
+                "rms": round(float(np.sqrt(counts.sum_squares_m2 / count)), 4),
+            },
         }
 
     def provenance(self) -> dict[str, Any]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,20 +14,22 @@ import numpy as np
 from pcfix.adjust.block import (
     LEAST_VIEWS,
     WATER,
-    Material,
+    block_of,
+    check_datum,
     gnss_with_sigma,
+    some_ties,
+    ties_of_cloud,
     usable_ties,
     with_places,
 )
-from pcfix.adjust.block import taken as taken_ties
-from pcfix.adjust.methods import LEAST_TIES, adjust_block, check_control, check_images, check_marks
+from pcfix.adjust.methods import adjust_block, check_control, check_marks
+from pcfix.adjust.parameters import Unknowns, default_lens
 from pcfix.adjust.result import Adjusted, adjustment_dict, before_of
-from pcfix.adjust.solve import Progress
-from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError, bad_file
+from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.diagnosis import flags_of, water_word
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
 from pcfix.flow.runner import check_folder
-from pcfix.flow.surfaces import sample_of, view_of
+from pcfix.flow.surfaces import CloudView, sample_of, view_of
 from pcfix.io.atomic import temporary_output
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.io.cameras.table import read_sensor, write_table
@@ -41,20 +43,20 @@ from pcfix.model import (
     Cameras,
     GnssPositions,
     GroundControl,
-    Lens,
     TiePoints,
     Views,
     WaterDimension,
-    WaterMesh,
     WaterPlane,
     WaterRaster,
     WaterSurface,
 )
-from pcfix.options.correct import WATER_UNKNOWNS, AdjustOptions
+from pcfix.options.correct import AdjustOptions
 from pcfix.options.declare import File, taken
-from pcfix.port.shapes import FlatPort, Port
+from pcfix.port.shapes import DomePort, FlatPort, Port
+from pcfix.refract.choice import views_in_frame
 from pcfix.report.adjustment import adjustment_page
-from pcfix.running import threads
+from pcfix.running import running, threads
+from pcfix.water.checks import check_above_water
 from pcfix.water.index import index_of
 
 if TYPE_CHECKING:
@@ -68,8 +70,8 @@ MODELS = ("colmap", "cameras.csv")
 WATER_FILE = "water.tif"
 """The water of an adjustment, where it is not a plane and was adjusted."""
 
-CLOUD_POINTS = 6000
-"""Points of the cloud that stand for tie points."""
+LEAST_TIES, CLOUD_POINTS = 100, 6000
+"""Measured tie points that are needed, and points of the cloud that stand for them."""
 
 _EXPORTS = (
     "Tie points are in COLMAP's model with points3D, OpenSfM's reconstruction with tracks.csv, a"
@@ -83,7 +85,7 @@ def adjust_cameras(
     out_dir: File | None = None,
     *,
     options: AdjustOptions | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[str], None] | None = None,
     **keywords: Any,
 ) -> Adjusted:
     """Adjust the poses and lens of a block with refraction; ``pcfix adjust``.
@@ -91,7 +93,7 @@ def adjust_cameras(
     Parameters
     ----------
     model : path or Cameras
-        See `pcfix.read_cameras`; with tie points, or together with the cloud that it made.
+        See `pcfix.read_cameras`; with tie points, or together with its cloud.
     out_dir : path, optional
         A new folder for the adjusted model as ``colmap/``, for blocks with one simple lens as
         ``cameras.csv`` too, ``ensemble.npz`` (see `pcfix.adjust.precision.Members`),
@@ -113,16 +115,15 @@ def adjust_cameras(
     given = taken(AdjustOptions, options, keywords, "adjust_cameras")
     inputs = replace(given.part(Inputs), cameras=model)
     target = None if out_dir is None else Path(out_dir)
-    with threads(given.jobs):
-        return adjust_into(target, inputs, given, given.cloud, progress)
+    with threads(given.jobs), running(say=progress):
+        return adjust_into(target, inputs, given, given.cloud)
 
 
 def adjust_into(
-    folder: Path | None, inputs: Inputs, given: AdjustOptions, cloud: Clouds | None,
-    progress: Progress | None = None,
-) -> Adjusted:  # fmt: skip
+    folder: Path | None, inputs: Inputs, given: AdjustOptions, cloud: Clouds | None
+) -> Adjusted:
     """Adjust the cameras of some inputs; of the options all others count. See `adjust_cameras`."""
-    # 1. The block, its water, and what was surveyed
+    # 1. The cameras, their water, and what was surveyed
     if folder is not None:
         known = [*paths_in(inputs), *paths_in(given)]
         check_folder(folder, known, mark=SUMMARY, overwrite=given.overwrite)
@@ -146,8 +147,10 @@ def adjust_into(
             " a level, plane, raster, mesh or shoreline."
         )
         raise SettingError("water.dimension", words, value=str(water))
-    check_images(name, original, water, given.fixed_images)
-    _check_free(given, water, inputs.port)
+    if water is not None:
+        check_above_water(original, water)
+    unknowns = _unknowns(given, original)
+    _check_free(unknowns, water, inputs.port)
     gnss, reason, notes = _gnss(original, name, given)
     control = given.gcps
     gcps = "gcps" if isinstance(control, GroundControl) else str(control)
@@ -157,31 +160,26 @@ def adjust_into(
         check_marks(control, original, gcps, is_placed=gnss is not None)
     _check_surfaces(given.parallel, control, water, gcps)
     mask = mask_of(inputs.water_mask, crs or original.crs)
-    material = Material(
-        name, original, water, index_of(given.index, given.index_formula)[0], gnss, control,
-        inputs.port, None if given.lens is None else _calibration(given.lens, original),
-        None if mask is None else mask.inside, reason, given.parallel,
-    )  # fmt: skip
 
-    # 2. Tie points as they were measured, or points of the cloud
-    ties = None if given.ties == "cloud" else inputs.tie_points(crs, placed=False)
+    # 2. The block, by tie points as they were measured or by points of the cloud
+    ties, cloud_points = None, None
+    if given.ties != "cloud":
+        ties = inputs.tie_points(crs, placed=False)
     if ties is not None:
         ties = usable_ties(with_places(ties, original), original)
-    count = 0 if ties is None else len(ties.xyz)
-    if ties is not None and count >= LEAST_TIES:
-        found = adjust_block(material, given, ties=ties, progress=progress)
-    elif view is None or given.ties == "measured":
-        cloud_too = "" if given.ties == "measured" else ", and there is no --cloud"
-        words = (
-            f"{name}: has {count} usable tie points ({LEAST_TIES} are needed){cloud_too}."
-            f" {_EXPORTS}"
-        )
-        raise InputError("cameras.no_ties", words, path=name, ties=count, least=LEAST_TIES)
-    else:
-        count = min(CLOUD_POINTS, view.points)  # random points of the cloud
-        rows = np.sort(np.random.default_rng(0).choice(view.points, count, replace=False))
-        xyz = sample_of(view, rows).xyz
-        found = adjust_block(material, given, cloud_xyz=xyz, progress=progress)
+    if ties is None or len(ties.xyz) < LEAST_TIES:
+        ties = _ties_of_cloud(view, original, name, 0 if ties is None else len(ties.xyz))
+        cloud_points = original, ties.xyz
+    cameras = original if given.lens is None else _calibrated(given.lens, original)
+    index, level_sigma_m = index_of(given.index, given.index_formula)[0], unknowns.water_sigma[0]
+    block = block_of(
+        cameras, ties, water, index, inside=None if mask is None else mask.inside,
+        control=control, level_sigma_m=level_sigma_m,
+    )  # fmt: skip
+    block = replace(block, port=inputs.port, parallel=given.parallel, gnss=gnss or block.gnss)
+    check_datum(block, unknowns, reason)
+    chooses_lens = given.lens_unknowns is None and given.lens is None
+    found = adjust_block(block, unknowns, cloud=cloud_points, choose_lens=chooses_lens)
 
     # 3. The result
     if control is not None:
@@ -192,24 +190,21 @@ def adjust_into(
     return found
 
 
-def _check_free(given: AdjustOptions, water: WaterSurface | None, port: Port | None) -> None:
+def _check_free(unknowns: Unknowns, water: WaterSurface | None, port: Port | None) -> None:
     """Refuse unknowns that water or port do not have."""
-    what, known = "the water", [*WATER_UNKNOWNS[:4]]
-    if isinstance(water, WaterMesh | WaterRaster):
-        what, known = "a mesh or raster of water", ["index"]
-    if port is not None:
-        is_flat = isinstance(port, FlatPort)
-        what = "a flat port" if is_flat else "a dome"
-        known = ["index", "distance" if is_flat else "centre"]
-    stated = {"level": given.sigma_level, "tilt": given.sigma_tilt}
-    for name in (*given.free, *(name for name, sigma in stated.items() if sigma)):
+    match port or water:
+        case FlatPort():
+            what, known = "a flat port", ["index", "distance"]
+        case DomePort():
+            what, known = "a dome", ["index", "centre"]
+        case WaterPlane():
+            what, known = "the water", ["level", "tilt", "index", "shape"]
+        case _:
+            what, known = "a mesh or raster of water", ["index"]
+    for name in unknowns.surface:
         if name not in known:
-            raise SettingError(
-                "option.choice",
-                f"--free {name}: {what} has no free {name}. Use {', '.join(known)}.",
-                option="free",
-                value=name,
-            )
+            words = f"--free {name}: {what} has no free {name}. Use {', '.join(known)}."
+            raise SettingError("option.choice", words, option="free", value=name)
 
 
 def _check_surfaces(
@@ -252,8 +247,8 @@ def _gnss(
     return gnss, reason, notes
 
 
-def _calibration(path: File, cameras: Cameras) -> Lens:
-    """Return a calibration of images of this size."""
+def _calibrated(path: File, cameras: Cameras) -> Cameras:
+    """Return cameras with the lens of a calibration, which is of images of their size."""
     one = read_sensor(Path(path))
     for lens in set(cameras.lenses or ()):
         if (lens.width, lens.height, lens.unit) != (one.width, one.height, one.unit):
@@ -263,7 +258,37 @@ def _calibration(path: File, cameras: Cameras) -> Lens:
                 " one of these images."
             )
             raise InputError("sensor.size", words, path=path)
-    return one
+    return replace(cameras, lenses=(one,) * len(cameras))
+
+
+def _unknowns(given: AdjustOptions, cameras: Cameras) -> Unknowns:
+    """Return what is estimated; of a lens that is not calibrated all parameters that it has."""
+    tilt = None if given.sigma_tilt is None else float(np.tan(np.radians(given.sigma_tilt)))
+    stated = {"level": given.sigma_level, "tilt": tilt, "index": given.sigma_index}
+    surface: dict[str, float] = dict.fromkeys(given.free, np.inf)
+    surface |= {name: sigma for name, sigma in stated.items() if sigma is not None}
+    lens: tuple[str, ...] | None = given.lens_unknowns
+    if lens is None:
+        lens = () if given.lens is not None else default_lens(cameras.lenses or ())
+    return Unknowns(given.poses, lens, surface, free_network=given.datum == "free")
+
+
+def _ties_of_cloud(view: CloudView | None, cameras: Cameras, name: str, measured: int) -> TiePoints:
+    """Return random points of the cloud in all images that show them, as tie points."""
+    if view is None:
+        words = (
+            f"{name}: has {measured} usable tie points ({LEAST_TIES} are needed), and there is no"
+            f" --cloud. {_EXPORTS}"
+        )
+        raise InputError("cameras.no_ties", words, path=name, ties=measured, least=LEAST_TIES)
+    count = min(CLOUD_POINTS, view.points)
+    rows = np.sort(np.random.default_rng(0).choice(view.points, count, replace=False))
+    xyz = sample_of(view, rows).xyz
+    ties = ties_of_cloud(xyz, views_in_frame(xyz, cameras), cameras)
+    if len(ties.xyz) < LEAST_TIES:
+        words = f"{name}: no image shows the cloud. Check the poses with 'pcfix cameras --cloud'."
+        raise GeometryError("cameras.no_overlap", words, path=name)
+    return ties
 
 
 # Writing
@@ -292,24 +317,18 @@ def _write_models(folder: Path, found: Adjusted) -> None:
         counts = np.bincount(block.owner[used], minlength=m)[:m]
         start = np.concatenate([[0], np.cumsum(counts)])
         ties = TiePoints(found.xyz[:m], Views(start, block.camera[used]), block.image_xy[used])
-        ties = taken_ties(ties, np.flatnonzero(counts >= LEAST_VIEWS))
-    writers = {
-        "colmap": partial(write_colmap, folder / "colmap", cameras, ties),
-        "cameras.csv": partial(write_table, folder, cameras),
-    }
-    failed = []
-    for name, write in writers.items():
-        try:
-            write()
-        except InputError as error:
-            failed.append(str(error).replace(f"{folder}/", ""))
-            if name != "cameras.csv":  # which is for blocks with one simple lens
-                words = f"{name} was not written: {failed[-1]}"
-                found.notes.append(PcfixWarning("output.format", words, name=name))
-    if len(failed) == len(writers):
-        raise InputError(
-            "output.format", "No camera format can hold these lenses: " + " ".join(failed)
-        )
+        ties = some_ties(ties, np.flatnonzero(counts >= LEAST_VIEWS))
+    failed = ""
+    try:
+        write_colmap(folder / MODELS[0], cameras, ties)
+    except InputError as error:
+        failed = f"{MODELS[0]} was not written: {str(error).replace(f'{folder}/', '')}"
+        found.notes.append(PcfixWarning("output.format", failed, name=MODELS[0]))
+    try:
+        write_table(folder, cameras)
+    except InputError:  # the table is for blocks with one simple lens
+        if failed:
+            raise
 
 
 def correct_words(found: Adjusted, model: File, out_dir: File, options: AdjustOptions) -> str:

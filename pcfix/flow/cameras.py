@@ -70,7 +70,7 @@ def check_cameras(
         cameras, problem = read, str(error)
     if given.gnss is not None:
         cameras = read_gnss(given.gnss, cameras)
-    diagnosis, remedy = None, ("", "")
+    diagnosis, remedy = None, ""
     if view is not None and surface is not None:
         reference = None if given.reference is None else read_reference(given.reference)
         if reference is not None:
@@ -122,7 +122,7 @@ class CamerasReport:
     figures: Plain  # as JSON holds them
     cameras: Cameras  # in the cloud's CRS, if there is a cloud
     diagnosis: Diagnosis | None  # whether the poses have absorbed the refraction
-    remedy: tuple[str, str]  # the command that corrects the poses, and a remark
+    remedy: str  # the command that corrects the poses
 
 
 def sensors_of(cameras: Cameras, above_m: FloatArray | None) -> list[Plain]:
@@ -243,15 +243,13 @@ def cameras_text(report: CamerasReport) -> str:
         verdict = f"not known; give control points (--gcps), or {EXPORT}"
         if found.decided_by is not None:
             have = "have" if found.absorbed else "have not"
-            shown_by = found.decided_by.shown_by
-            verdict = f"the poses {have} absorbed the refraction, as {shown_by} show"
+            verdict = f"the poses {have} absorbed the refraction, as {found.decided_by.name} show"
         if found.likely_error_m is not None:
             verdict += f"; the likely error of heights is {found.likely_error_m:.2g} m"
         rows.append(("Refraction", verdict))
         rows += [(s.name[:1].upper() + s.name[1:], says[s.speaks] + s.words) for s in found.signs]
         if found.absorbed:
-            command, because = report.remedy
-            rows += [("Next step", f"adjust the poses{because}:"), ("", command)]
+            rows += [("Next step", "adjust the poses:"), ("", report.remedy)]
     return aligned(f"{r['path']}: {cameras.source or 'cameras'}", rows)
 
 

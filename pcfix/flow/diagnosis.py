@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 LEAST_POSITIONS = 3
 """GNSS positions that determine position, orientation and scale of a block."""
 
-NO_DATUM = " (with GNSS.csv, the positions of the images, or with control points, --gcps)"
-
 QUICK_BYTES = 25_000_000
 """Size of a model that is read within a second or two, even if nobody asked."""
 
@@ -84,11 +82,11 @@ def diagnose_in_passing(
         )  # fmt: skip
     except (PcfixError, OSError) as error:  # this check stops no correction
         return found | {"words": f"not checked for absorbed refraction: {error}"}, None
-    command, because = adjust_words(
+    command = adjust_words(
         inputs, plan.view.name, has_datum=has_datum(cameras, name),
         index=None if n == DEFAULT_REFRACTIVE_INDEX else n,
     )  # fmt: skip
-    sentence, decided, warning = diagnosis.sentence(command, because), diagnosis.decided_by, None
+    sentence, decided, warning = diagnosis.sentence(command), diagnosis.decided_by, None
     if sentence:
         likely = diagnosis.likely_error_m
         values = {} if likely is None else {"likely_error_m": likely}
@@ -100,7 +98,7 @@ def diagnose_in_passing(
     )
     if decided is not None:
         have = "have" if diagnosis.absorbed else "have not"
-        words = f"{have} absorbed the refraction, as {decided.shown_by} show"
+        words = f"{have} absorbed the refraction, as {decided.name} show"
         words += "; see the warning" if sentence else ""
     signs = diagnosis.as_dict()["signs"]
     return {"absorbed": diagnosis.absorbed, "words": words, "signs": signs}, warning
@@ -137,20 +135,19 @@ def has_datum(cameras: Cameras, name: str) -> bool:
 
 def adjust_words(
     inputs: Inputs, cloud: str, *, has_datum: bool, **more: File | float | None
-) -> tuple[str, str]:
-    """Return the command that corrects the poses, and a remark on it.
+) -> str:
+    """Return the command that corrects the poses.
 
     Without a datum it asks for GNSS positions; `more` are options of an adjustment only.
     """
     model = "MODEL" if isinstance(inputs.cameras, Cameras) else str(inputs.cameras)
     words = ["pcfix", "adjust", model, "OUT", "--water", water_word(inputs.water), "--cloud", cloud]
     words += flags_of(inputs)
-    remark = "" if has_datum or more.get("gcps") or more.get("gnss") else NO_DATUM
-    if remark:
+    if not (has_datum or more.get("gcps") or more.get("gnss")):
         more["gnss"] = "GNSS.csv"
     for name, value in more.items():
         words += [] if value is None else [f"--{name}", str(value)]
-    return shlex.join(words), remark
+    return shlex.join(words)
 
 
 def water_word(given: Any) -> str:

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.adjust.block import Block, Unknowns, plain_block, restricted, well_seen
+from pcfix.adjust.block import Block, plain_block, restricted, well_seen
+from pcfix.adjust.parameters import Unknowns
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import prepare
 from pcfix.errors import PcfixWarning, SettingError
@@ -22,7 +23,7 @@ from pcfix.flow.correct import correct_points
 from pcfix.flow.pose_errors import pose_errors
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import Points
-from pcfix.model import Correction, FloatArray, TiePoints, Views, WaterPlane
+from pcfix.model import Correction, FloatArray, GnssPositions, TiePoints, Views, WaterPlane
 from pcfix.options.correct import BudgetOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import options_of, taken
 from pcfix.options.scenes import PlanOptions
@@ -153,8 +154,9 @@ def _bed(given: PlanOptions, depth_m: float) -> tuple[Block, FloatArray]:
     return replace(
         block,
         sigma_px=np.full(len(block.camera), max(given.sigma_image, 0.01)),
-        gnss_xyz=block.cameras.centres,
-        gnss_sigma_m=np.full((len(block.cameras), 3), given.gnss_sigma),
+        gnss=GnssPositions(
+            block.cameras.centres, np.full((len(block.cameras), 3), given.gnss_sigma), None
+        ),
     ), apparent
 
 

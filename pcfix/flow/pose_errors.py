@@ -1,7 +1,7 @@
 """Errors of a corrected bed by the errors of an adjustment: a sample is corrected with each member.
 
 The images do not change: the cameras of each member intersect the images of the points again,
-whether the original or the adjusted cameras made the cloud.
+whether the cloud is of the original or of the adjusted cameras.
 """
 
 from __future__ import annotations

@@ -306,7 +306,7 @@ def find_members(cameras: File) -> tuple[Path, Members] | None:
         labels, lens_names = (tuple(values.pop(n).tolist()) for n in ("labels", "lens_names"))
         m, k, p = len(values["turn"]), len(labels), len(lens_names)
         shapes = {
-            **{"centres": (k, 3), "focal": (k,), "turn": (m, k, 3), "shift_m": (m, k, 3)},
+            **{"focal": (k,), "turn": (m, k, 3), "shift_m": (m, k, 3)},
             **{"lens": (m, k, p), "water": (m, 7)},
         }
         for name, shape in shapes.items():

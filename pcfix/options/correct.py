@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from pcfix.errors import SettingError
 from pcfix.options.declare import File, OptionSet, number_or, option, options_of, words
@@ -226,7 +226,6 @@ WaterUnknown = Literal["level", "tilt", "index", "shape", "distance", "centre"]
 LensUnknown = Literal[
     "f", "cx", "cy", "b1", "b2", "p1", "p2", "k1", "k2", "k3", "k4", "k5", "k6", "k7", "k8"
 ]
-WATER_UNKNOWNS: tuple[str, ...] = get_args(WaterUnknown)
 
 
 class SurveyedOptions(OptionSet, panel=Panel.CAMERAS):
@@ -305,21 +304,15 @@ class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
     lens_unknowns: tuple[LensUnknown, ...] | None = option(None, parse=_lens_names, metavar="NAMES")
     """Unknowns of the lens: none, or any of f,cx,cy,k1...,p1,p2,b1,b2. [default: those that the
     block determines]"""
-    poses: Literal["free", "fixed", "similarity"] = option("free")
-    """Adjust each pose, none, or all together by one similarity transformation."""
-    fixed_images: tuple[str, ...] = option((), parse=words, metavar="A,B")
-    """Images whose poses are held fixed."""
+    poses: Literal["free", "fixed"] = option("free")
+    """Adjust the poses, or hold them fixed."""
     datum: Literal["observed", "free"] = option("observed")
     """Datum of the block: from observations, or free: mean position, direction and scale of the
     original poses."""
-    ties: Literal["auto", "measured", "cloud"] = option("auto")
-    """Use measured tie points, or points of the cloud; auto: measured if there are any."""
+    ties: Literal["auto", "cloud"] = option("auto")
+    """Use points of the cloud as tie points; auto: only if there are no measured ones."""
     gnss_sigma: float | None = option(None, above=0)
     """Standard deviation of GNSS positions that state none. [m] [default: from their residuals]"""
-    sigma_image: float | None = option(None, above=0)
-    """Standard deviation of tie points in the images. [px] [default: from their residuals]"""
-    outliers: bool = option(True)
-    """Search for outliers and exclude them."""
 
 
 class AdjustOptions(

@@ -1,6 +1,6 @@
 """The report of an adjustment: its summary as text, and a page of tables.
 
-All words are made of the plain values of `adjustment_dict`, so that a resumed run has them too.
+All text is derived from the plain values of `adjustment_dict`, which a resumed run has, too.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pcfix.adjust.block import words_of
+from pcfix.adjust.parameters import words_of
 from pcfix.adjust.result import Plain
 from pcfix.report.page import Report, Table, render
 from pcfix.report.text import Rows, RowTable, filled, share, wrapped
@@ -19,25 +19,18 @@ WHERE = (("land", "on land"), ("water", "under water"))
 MOST_LISTED = 12
 """Surveyed points in the text; the page has all of them."""
 _FACTS: RowTable = (
-    ("Lens", "fixed", "lens_is_fixed"),
-    ("Water", "{water[surface]}", "has_shape"),
-    ("Water", "none", "no_water"),
-    ("Port", "--port {port_found[port]}", "port"),
-    ("{label}", "{after:.6g}{unit}, fixed", "*held"),
-    ("On {surface}", "{points:,} marked points, distance RMS {rms_m:z.4f} m (given {sigma_m:g} m)",
-     "*on_surfaces"),
+    ("Water", "{water[surface]}", "water"),
+    ("Port", "--port {port[surface]}", "port"),
     ("Poses", "{poses_words}", "images"),
-    ("", "centres moved by {poses[moved_rms_m]:.3f} m (RMS), at most {poses[moved_largest_m]:.3f} m"
-     " ({poses[moved_largest_image]}), rotated by {poses[turned_rms_deg]:.4f} deg (RMS)", "moved"),
+    ("", "centres moved by {poses[moved_rms_m]:.3f} m, rotated by {poses[turned_rms_deg]:.4f} deg"
+     " (RMS)", "moved"),
     ("", "centres known to {precision[centre_mean_m]:z.4f} m (X, Y, Z), angles to"
      " {precision[angle_mean_deg]:z.4f} deg (mean standard errors)", "is_precise"),
     ("Bed", "heights known to {bed_m:.3f} m (standard error{bed_if})", "bed_m"),
     ("Observations", "{o[used]:,} {kind} used, {o[left_out]:,} excluded ({o_share})", "o"),
-    ("Fit", "sigma0 {sigma0:.3f}, redundancy {redundancy:,}, {rounds} rounds, {steps} steps",
-     "images"),
+    ("Fit", "sigma0 {sigma0:.3f}, redundancy {redundancy:,}", "images"),
     ("GNSS", "{gnss[images]:,} images. Centres minus GNSS (east, north, up): mean"
-     " {gnss[mean_m]:+z.3f} m, RMS {gnss[rms_m]:z.3f} m, largest {gnss[largest_m]:z.3f} m"
-     " ({gnss[largest_image]})", "gnss"),
+     " {gnss[mean_m]:+z.3f} m, RMS {gnss[rms_m]:z.3f} m", "gnss"),
     ("{role} points", "{count}. Adjusted minus surveyed (X, Y, Z): mean {mean_m:+z.3f} m, RMS"
      " {rms_m:z.3f} m, {rms_px:z.2f} {image_unit}", "*surveyed"),
 )  # fmt: skip
@@ -76,7 +69,7 @@ def adjustment_page(d: Plain) -> str:
     how = "with refraction at the housing port" if d["port"] else how
     lead = f"{_head(d)}, {how}. Residuals: {_residuals(d)} (RMS of a coordinate)."
     head = Table("In short", [], [list(row) for row in _facts(d)])
-    tables = [_change_table(d), _residual_table(d), _survey_table(d), _correlation_table(d)]
+    tables = [_change_table(d), _residual_table(d), _survey_table(d)]
     tables = [table for table in tables if table.rows]
     return render(Report(TITLE, lead, head, all_notes(d), tables))
 
@@ -101,31 +94,14 @@ def _residuals(d: Plain) -> str:
 
 def _facts(d: Plain) -> Rows:
     """Return labels and values of what the table of changes does not have."""
-    o, water, poses = d["observations"], d["water"], d["poses_are"]
+    o, is_free = d["observations"], d["unknowns"]["poses"] == "free"
     kinds = {"tie points": "measured tie points", "cloud": "points of the cloud in original images"}
-    # a level surface has no tilt to show
-    held = [
-        row | {"label": label.capitalize(), "unit": unit}
-        for name, row in _surface(d)
-        for label, unit in [words_of(name)]
-        if not row["free"] and not (name.startswith("tilt") and row["after"] == 0.0)
-    ]
-    fixed_images = f", {d['images_fixed']:,} of them fixed" if d["images_fixed"] else ""
     network = ", a free network" if d["unknowns"]["free_network"] else ""
-    words = {
-        "free": f"free{fixed_images}{network}", "fixed": "fixed",
-        "similarity": "shifted, rotated and scaled together",
-    }  # fmt: skip
-    bed_if = ", if the fixed poses are right" if d["images_fixed"] else ""
-    bed_if = ", if the block is not bent" if poses == "similarity" else bed_if
     return filled(_FACTS, d | {
-        "poses_words": words[poses], "o": o, "kind": kinds[d["source"]],
+        "poses_words": f"free{network}" if is_free else "fixed", "o": o, "kind": kinds[d["source"]],
         "o_share": share(o["left_out"], o["used"] + o["left_out"]),
-        "has_shape": water is not None and not water["surface"].startswith("level"),
-        "lens_is_fixed": not d["lens"], "held": held, "no_water": water is None,
-        "moved": poses != "fixed" and d["poses"]["moved_rms_m"],
-        "is_precise": poses != "fixed" and d["precision"]["images"],
-        "bed_if": bed_if,
+        "moved": is_free and d["poses"]["moved_rms_m"], "is_precise": is_free,
+        "bed_if": "" if is_free else ", if the fixed poses are right",
         "bed_m": (d["residuals"]["water"]["sigma_xyz_m"] or [None])[-1],
         "surveyed": [
             {"role": role.capitalize(), "count": len(d[role]["points"]), **d[role]}
@@ -136,7 +112,7 @@ def _facts(d: Plain) -> Rows:
 
 def _surface(d: Plain) -> Iterator[tuple[str, Plain]]:
     """Yield the parameters of water or port by name."""
-    for name, row in (d["water"] or d["port_found"] or {}).items():
+    for name, row in (d["water"] or d["port"] or {}).items():
         if isinstance(row, dict):
             yield name, row
 
@@ -162,8 +138,6 @@ def _change_table(d: Plain) -> Table:
     for name, row in _surface(d):
         if row["free"]:
             add(name, row)
-    for row in d["precision"]["shared"][-7:] if d["poses_are"] == "similarity" else ():
-        add(row["name"], row | {"before": 0.0, "after": row["added"]})
     for key, where in WHERE:
         r = d["residuals"][key]
         if r["points"]:
@@ -178,16 +152,6 @@ def _change_table(d: Plain) -> Table:
 def _length(values: list[float | None]) -> float:
     """Return the length of a vector, of its known components."""
     return float(np.sqrt(sum(value**2 for value in values if value is not None)))
-
-
-def _correlation_table(d: Plain) -> Table:
-    p = d["precision"]
-    names = [row["name"].replace("_", " ") for row in p["shared"]]
-    rows = [
-        [name, *(fixed(value, 3, "+") for value in row)]
-        for name, row in zip(names, p["correlation"], strict=True)
-    ]
-    return Table("Correlations of the shared unknowns", ["", *names], rows if len(rows) > 1 else [])
 
 
 def _survey_table(d: Plain) -> Table:

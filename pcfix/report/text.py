@@ -53,9 +53,9 @@ _LABELLING: RowTable = (
 _CORRECTED: RowTable = (
     *_PART,
     ("Transferred", "{transfer[points]:,} points ({transfer[land]:,} on land) to the adjusted"
-     " poses: {transfer[shift_m][rms]:.3f} m rms, at most {transfer[shift_m][max]:.3f} m, mean Z"
+     " poses: {transfer[shift_m][rms]:.3f} m rms, mean Z"
      " {transfer[shift_m][mean_z]:+.3f} m", "transfer"),
-    ("", "{transfer[not_transferred]:,} not transferred: {transfer[not_transferred_reason]}"
+    ("", "{transfer[not_transferred]:,} not transferred: fewer than two original cameras image them"
      " (not moved, withheld)", "transfer[not_transferred]"),
     ("Submerged", "{submerged:,} points ({submerged:of points}), {corrected_words}", ""),
     ("", "{count:,} not corrected: {name} (not moved, withheld)", "*uncorrected"),

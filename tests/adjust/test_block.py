@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from pcfix.adjust.block import Material, block_of, restricted, usable_ties, well_seen
+from pcfix.adjust.block import block_of, restricted, usable_ties, well_seen
 from pcfix.model import TiePoints, Views
 from tests.utils.codes import refused
 from tests.utils.tie_points import simulate_tie_points
@@ -18,12 +18,10 @@ def scene():
 
 def gathered(**changes):
     made = scene()
-    given = {
-        "name": "model", "original": made.cameras, "water": made.water,
-        "refractive_index": made.refractive_index, "gnss": made.cameras.gnss,
-        "control": made.control,
-    }  # fmt: skip
-    return block_of(Material(**(given | changes)), made.ties, 0.7)
+    given = {"water": made.water, "refractive_index": made.refractive_index,
+             "control": made.control}  # fmt: skip
+    block = block_of(made.cameras, made.ties, **(given | changes))
+    return replace(block, gnss=made.cameras.gnss)
 
 
 def test_usable_ties():
@@ -59,7 +57,7 @@ def test_poor_image():
               zip(block.owner, block.camera, map(tuple, block.image_xy), strict=True)
               if c != 3}  # fmt: skip
     assert back == all_of
-    np.testing.assert_array_equal(less.gnss_xyz, made.cameras.gnss.xyz[rows])
+    np.testing.assert_array_equal(less.gnss.xyz, made.cameras.gnss.xyz[rows])
 
 
 def test_control_under_water():
@@ -69,4 +67,4 @@ def test_control_under_water():
     names = [control.names[i] for i in np.flatnonzero(control.under_water)]
     with refused("gcps.under_water", points=names):
         gathered(control=silent)
-    assert gathered(control=silent, water=None).control_names == control.names
+    assert gathered(control=silent, water=None).control.names == control.names

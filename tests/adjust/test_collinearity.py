@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import CODES, PLANES, PORT, SHAPE, Unknowns, moved_lens, plain_block
+from pcfix.adjust.block import plain_block
 from pcfix.adjust.collinearity import (
     SURFACE,
     WIDTH,
@@ -15,6 +15,7 @@ from pcfix.adjust.collinearity import (
     lens_gradients,
     workspace,
 )
+from pcfix.adjust.parameters import CODES, PLANES, PORT, SHAPE, Unknowns, moved_lens
 from pcfix.adjust.problem import port_of, port_row, prepare
 from pcfix.lens.imaging import coefficients
 from pcfix.model import Cameras, Lens, TiePoints, Views, WaterPlane

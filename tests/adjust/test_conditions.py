@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcfix.adjust.block import NO_CONDITIONS, PLANES, Conditions, Unknowns
+from pcfix.adjust.parameters import PLANES, Unknowns
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import prepare
 from pcfix.adjust.result import redundancy_of
@@ -30,17 +30,14 @@ def scene(points, **settings):
 
 
 def put(made, surfaces):
-    """Return a scene with points moved onto surfaces, and the conditions that say so.
+    """Return a scene with points moved onto surfaces, and the surface of each point.
 
     `surfaces` maps a name to rows of the points and a function from their coordinates to new ones.
     """
-    truth, on = made.truth.copy(), np.full(len(made.truth), -1)
-    planes = [name for name in surfaces if name != "water"]
+    truth, on = made.truth.copy(), np.full(len(made.truth), "", object)
     for name, (rows, place) in surfaces.items():
-        truth[rows] = place(truth[rows])
-        on[rows] = 0 if name == "water" else 1 + planes.index(name)
-    made = under_bent_water(replace(made, truth=truth), np.zeros(3))
-    return made, Conditions(tuple(planes), on, np.full(len(on), SIGMA_M))
+        truth[rows], on[rows] = place(truth[rows]), name
+    return under_bent_water(replace(made, truth=truth), np.zeros(3)), on
 
 
 def at_level(made, b=0.0, c=0.0, depth=0.0):
@@ -50,15 +47,24 @@ def at_level(made, b=0.0, c=0.0, depth=0.0):
     return lambda q: np.column_stack([q[:, :2], level + (q[:, :2] - [x, y]) @ [b, c]])
 
 
-def block_with(made, conditions, **how):
+def block_with(made, on, **how):
+    """Return a block in which all points are control points, most of them without coordinates."""
     block = block_of(made, **how)
-    more = len(block.xyz) - len(conditions.on)
-    on = np.concatenate([conditions.on, np.full(more, -1)])
-    sigma = np.concatenate([conditions.sigma_m, np.ones(more)])
-    return replace(
-        block, wet=on != 0, conditions=replace(conditions, on=on, sigma_m=sigma),
-        control_names=tuple(f"P{i}" for i in range(len(on))), is_check=np.zeros(len(on), bool),
+    m, control = len(on), block.control
+    if control is None:
+        control = replace(made.control, names=(), xyz=np.zeros((0, 3)), sigma_m=np.zeros((0, 3)))
+    on = (*on, *[""] * len(control.names))
+    control = replace(
+        control, names=tuple(f"P{i}" for i in range(len(on))), is_check=np.zeros(len(on), bool),
+        xyz=np.vstack([np.full((m, 3), np.nan), control.xyz]), on=on,
+        sigma_m=np.vstack([np.full((m, 3), np.inf), control.sigma_m]),
+        on_sigma_m=np.full(len(on), SIGMA_M),
     )  # fmt: skip
+    return replace(block, wet=np.array(on) != "water", control=control)
+
+
+def without_surfaces(block):
+    return replace(block, control=replace(block.control, on=()))
 
 
 def adjusted(block, unknowns):
@@ -68,11 +74,11 @@ def adjusted(block, unknowns):
 
 def test_come_home():
     made = scene(90)
-    made, conditions = put(made, {
+    made, on = put(made, {
         "water": (np.arange(8), at_level(made)),
         "floor": (np.arange(8, 20), at_level(made, 0.02, -0.01, 2.0)),
     })  # fmt: skip
-    block = block_with(made, conditions, exact=True, water=WaterPlane(made.water.a + 0.2))
+    block = block_with(made, on, exact=True, water=WaterPlane(made.water.a + 0.2))
     problem, found, _ = adjusted(block, LEVEL)
     assert problem.names == ["level", "level of floor", "tilt_x of floor", "tilt_y of floor"]
     truth = made.truth - problem.origin
@@ -87,8 +93,8 @@ def test_wall():
     middle = np.round(made.true_cameras.centres.mean(axis=0))
     rows = np.flatnonzero(~made.is_wet)[:9]
     east = lambda q: np.column_stack([middle[0] + 0.1 * (q[:, 2] - made.water.a), q[:, 1:]])  # noqa: E731
-    made, conditions = put(made, {"wall": (rows, east)})
-    problem, found, _ = adjusted(block_with(made, conditions, exact=True), Unknowns(lens=()))
+    made, on = put(made, {"wall": (rows, east)})
+    problem, found, _ = adjusted(block_with(made, on, exact=True), Unknowns(lens=()))
     assert problem.given.axis.tolist() == [2, 0]
     np.testing.assert_allclose(found.state.water[PLANES + 1 :], [0.0, 0.1], atol=1e-7)
     np.testing.assert_allclose(found.state.xyz + problem.origin, made.truth, atol=HOME_M)
@@ -97,30 +103,30 @@ def test_wall():
 def test_waterline():
     made = scene(200)
     rows = np.arange(10)
-    made, conditions = put(made, {"water": (rows, at_level(made))})
-    block = block_with(made, conditions, water=WaterPlane(made.water.a + 0.2), control=True)
+    made, on = put(made, {"water": (rows, at_level(made))})
+    block = block_with(made, on, water=WaterPlane(made.water.a + 0.2), control=True)
     _, found, precision = adjusted(block, LEVEL)
     sigma = precision.sigma_of("level")
     assert abs(found.shared[0] + 0.2) < 3.5 * sigma
-    without = adjusted(replace(block, conditions=NO_CONDITIONS), LEVEL)[2].sigma_of("level")
-    assert sigma < 0.9 * without
-    assert redundancy_of(prepare(block, LEVEL)[0]) == 10 + redundancy_of(
-        prepare(replace(block, conditions=NO_CONDITIONS), LEVEL)[0]
-    )
+    assert sigma < 0.9 * adjusted(without_surfaces(block), LEVEL)[2].sigma_of("level")
+    redundancies = [
+        redundancy_of(prepare(one, LEVEL)[0]) for one in (block, without_surfaces(block))
+    ]
+    assert redundancies[0] == 10 + redundancies[1]
 
 
 @pytest.mark.parametrize("parallel", [("floor", "deck"), ("water", "floor", "deck")])
 def test_parallel(parallel):
     made = scene(120, tilt_percent=1.0)
     b, c = made.water.b, made.water.c
-    made, conditions = put(made, {
+    made, on = put(made, {
         "floor": (np.arange(8), at_level(made, b, c, 2.0)),
         "deck": (np.arange(8, 12), at_level(made, b, c, -0.5)),
     })  # fmt: skip
     unknowns = Unknowns(lens=(), surface={"tilt": FREE})
-    apart = adjusted(block_with(made, conditions, control=True), unknowns)[2]
-    conditions = replace(conditions, parallel=parallel)
-    problem, found, precision = adjusted(block_with(made, conditions, control=True), unknowns)
+    apart = adjusted(block_with(made, on, control=True), unknowns)[2]
+    block = replace(block_with(made, on, control=True), parallel=parallel)
+    problem, found, precision = adjusted(block, unknowns)
     floor, deck = found.state.water[PLANES:].reshape(2, 3)
     assert (floor[1:] == deck[1:]).all()
     if "water" in parallel:
@@ -140,17 +146,14 @@ def test_same_as_scipy():
         attitude_noise_deg=0.05, forward_overlap=0.6, side_overlap=0.5, obliques_deg=25,
         oblique_directions=2, oblique_share=0.3, tilt_percent=1.0,
     )  # fmt: skip
-    made, conditions = put(made, {
+    made, on = put(made, {
         "water": (np.arange(4), at_level(made, made.water.b, made.water.c)),
         "floor": (np.arange(4, 10), at_level(made, 0.01, 0.0, 1.0)),
     })  # fmt: skip
-    nowhere = {"gnss_xyz": np.full((len(made.cameras), 3), np.nan),
-               "gnss_sigma_m": np.full((len(made.cameras), 3), np.inf)}  # fmt: skip
+    block = block_with(made, on, cameras=made.true_cameras, gnss=False)
     for parallel in ((), ("water", "floor")):
-        given = replace(conditions, parallel=parallel)
-        block = replace(block_with(made, given, cameras=made.true_cameras), **nowhere)
         # the twin has no word for points that are never wet: a waterline that it meets from above
-        block = replace(block, wet=np.ones(len(block.wet), bool))
+        block = replace(block, wet=np.ones(len(block.wet), bool), parallel=parallel)
         unknowns = Unknowns(poses="fixed", lens=(), surface={"level": FREE, "tilt": FREE})
         problem, found, precision = adjusted(block, unknowns)
         twin = Twin(block, tuple(problem.names), free_poses=False)

@@ -6,11 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pcfix.adjust.block import Material, Unknowns, block_of, ties_of_cloud
+from pcfix.adjust.block import block_of, ties_of_cloud
 from pcfix.adjust.from_cloud import adjust_cloud
 from pcfix.adjust.from_ties import adjust_ties
+from pcfix.adjust.parameters import Unknowns
 from pcfix.model import GnssPositions
-from tests.utils.codes import refused
 from tests.utils.tie_points import simulate_tie_points
 from tests.utils.unaware_blocks import unaware
 
@@ -32,12 +32,10 @@ def cloud_block(made, *, gnss=True, control=None, exact=True):
     """Return the apparent points as the only thing that is known of the images."""
     scene, old = made.scene, made.cameras
     ties = ties_of_cloud(made.ties.xyz, made.ties.views, old)
-    datum = None
+    whole = block_of(old, ties, scene.water, scene.refractive_index, control=control)
     if gnss:
         place = scene.true_cameras.centres if exact else scene.cameras.gnss.xyz
-        datum = GnssPositions(place, scene.cameras.gnss.sigma_m, None)
-    material = Material("model", old, scene.water, scene.refractive_index, datum, control)
-    whole = block_of(material, ties, 1.0)
+        whole = replace(whole, gnss=GnssPositions(place, scene.cameras.gnss.sigma_m, None))
     apparent = ties.xyz if control is None else np.vstack([ties.xyz, control.xyz])
     return whole, old, apparent
 
@@ -80,27 +78,11 @@ def test_noise():
     made = block(400, exact=False)
     scene = made.scene
     mended = adjust_cloud(*cloud_block(made, exact=False), Unknowns())
-    gnss = scene.cameras.gnss
-    material = Material("model", scene.cameras, scene.water, scene.refractive_index, gnss)
-    whole = block_of(material, scene.ties, scene.noise.image_px)
-    aware = adjust_ties(whole, Unknowns(lens=("f",)))
+    whole = block_of(scene.cameras, scene.ties, scene.water, scene.refractive_index)
+    aware = adjust_ties(replace(whole, gnss=scene.cameras.gnss), Unknowns(lens=("f",)))
     sigma_m = aware.precision.centre_sigma_m
     away = np.abs(mended.cameras.centres - scene.true_cameras.centres)
     apart = np.abs(mended.cameras.centres - aware.cameras.centres)
     # 1.4 and 0.6 of the standard errors of tie points, which are 16 mm
     assert np.sqrt(np.mean((away / sigma_m) ** 2)) < 2.0
     assert np.sqrt(np.mean((apart / sigma_m) ** 2)) < 1.0
-
-
-@pytest.mark.parametrize(
-    ("unknowns", "code"),
-    [
-        (Unknowns(free_network=True), "adjust.cloud_needs_datum"),
-        (Unknowns(poses="similarity"), "adjust.cloud_needs_datum"),
-        (Unknowns(surface={"level": np.inf}), "adjust.cloud_needs_water"),
-    ],
-)
-def test_refused(unknowns, code):
-    one = cloud_block(block(40), gnss=unknowns.poses == "similarity" or bool(unknowns.surface))
-    with refused(code):
-        adjust_cloud(*one, unknowns)

@@ -5,8 +5,9 @@ from functools import cache
 
 import numpy as np
 
-from pcfix.adjust.block import Unknowns
-from pcfix.adjust.precision import members_of, precision_of, undetermined
+from pcfix.adjust.methods import undetermined
+from pcfix.adjust.parameters import Unknowns
+from pcfix.adjust.precision import members_of, precision_of
 from pcfix.adjust.problem import water_of
 from pcfix.model import WaterPlane, WaterRaster
 from pcfix.water.surface import surface_above
@@ -57,9 +58,8 @@ def test_comes_home():
 def test_undetermined_shape():
     made = scene(60)
     precision = adjusted(block_of(made, control=True, sigma_px=8.0))[2]
-    reach_m = np.sqrt(np.var(made.truth[made.is_wet, :2], axis=0).sum())
     shape = {"shape_xx", "shape_xy", "shape_yy"}
-    assert shape <= {one.values["unknown"] for one in undetermined(precision, reach_m)}
+    assert shape <= {one.values["unknown"] for one in undetermined(precision)}
 
 
 def test_same_as_scipy():
@@ -68,11 +68,10 @@ def test_same_as_scipy():
         attitude_noise_deg=0.05, forward_overlap=0.6, side_overlap=0.5, obliques_deg=25,
         oblique_directions=2, oblique_share=0.3,
     )  # fmt: skip
-    block = block_of(under_bent_water(made, 4.0 * BEND), control=True)
-    unknowns = replace(SHAPED, poses="fixed")
-    block = replace(block, cameras=made.true_cameras, gnss_xyz=np.full_like(block.gnss_xyz, np.nan),
-                    gnss_sigma_m=np.full_like(block.gnss_sigma_m, np.inf))  # fmt: skip
-    problem, found, precision = adjusted(block, unknowns)
+    block = block_of(
+        under_bent_water(made, 4.0 * BEND), control=True, cameras=made.true_cameras, gnss=False
+    )
+    problem, found, precision = adjusted(block, replace(SHAPED, poses="fixed"))
     twin = Twin(block, tuple(problem.names), free_poses=False)
     x = twin.solve()
     _, _, added, xyz = twin.parts(x)
@@ -88,7 +87,7 @@ def test_same_as_scipy():
 def test_members():
     made = scene(60)
     problem, found, precision = adjusted(block_of(made, control=True))
-    step = np.zeros((1, 6 * int(problem.moves.sum()) + len(problem.names)))
+    step = np.zeros((1, 6 * len(found.lenses) + len(problem.names)))
     step[0, -6:] = [0.02, 1e-3, -2e-3, 1e-5, 2e-5, -3e-5]
     member = members_of(problem, found, step)
     raster, cameras = water_of(problem, found.state), made.true_cameras

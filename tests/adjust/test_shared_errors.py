@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import Unknowns
-from pcfix.adjust.precision import precision_of
+from pcfix.adjust.parameters import Unknowns
+from pcfix.adjust.precision import disagreement_of, precision_of
 from pcfix.adjust.result import sigma0_of
-from pcfix.adjust.shared_errors import disagreement_of
 from tests.utils.tie_blocks import adjusted, block_of
 from tests.utils.tie_points import simulate_tie_points
 

@@ -23,8 +23,8 @@ from tests.benchmarks.accuracy import true_surface
 
 LEVEL, GSD, MARGIN = 0.37, 0.05, 0.1
 WAYS = {
-    "tie points, GNSS": {"ties": "measured"},
-    "tie points, GNSS, GCPs": {"ties": "measured", "gcps": True},
+    "tie points, GNSS": {"ties": "auto"},
+    "tie points, GNSS, GCPs": {"ties": "auto", "gcps": True},
     "cloud alone, GNSS": {"ties": "cloud"},
     "cloud alone, GNSS, GCPs": {"ties": "cloud", "gcps": True},
 }

@@ -32,7 +32,7 @@ import laspy
 import numpy as np
 
 import pcfix
-from pcfix.adjust.block import Unknowns
+from pcfix.adjust.parameters import Unknowns
 from pcfix.adjust.problem import solved_cameras
 from pcfix.errors import PcfixError, PcfixWarning
 from tests.utils import block_kinds, model_errors

@@ -136,12 +136,11 @@ OF_PORT = {
     ),
 }
 OF_ADJUST = {
-    "gnss": "--ties measured",
+    "gnss": "",
     "gcps": f"--gcps {FREE}/gcps.csv --free level --sigma-level 0.1",
-    "held": "--lens-unknowns f --fixed-images A001.JPG,A002.JPG --no-outliers --gnss-sigma 0.05",
-    "similarity": f"--poses similarity --gcps {FREE}/gcps.csv",
+    "held": "--lens-unknowns f --gnss-sigma 0.05",
     "fixed": "--poses fixed --sigma-index 0.01 --sigma-tilt 0.1",
-    "free-datum": "--datum free --lens {inputs}/lens.csv --sigma-image 0.5",
+    "free-datum": "--datum free --lens {inputs}/lens.csv",
     "not-told-apart": "--free level,tilt,index",
 }
 OF_OBLIQUES = {"default": "", "views": "--views {inputs}/c.vis", "snell": "--method snell"}
@@ -286,7 +285,7 @@ def table() -> dict[str, str]:
         commands[f"sgm.{fusion}"] = OBLIQUES.replace("correct {inputs}/c.las out.las", matched)
     add("port", PORT, OF_PORT)
     add("adjust", ADJUST, OF_ADJUST)
-    commands["adjust.ties"] = f"adjust {FREE}/sparse {KNOWN} --ties measured"
+    commands["adjust.ties"] = f"adjust {FREE}/sparse {KNOWN}"
     cloud = f"adjust {FREE}/sparse {KNOWN} {CLOUD} --ties cloud"
     add("adjust", cloud, {"cloud": "", "cloud-gcps": f"--gcps {FREE}/gcps.csv"})
     add("clean", "clean {scene.snell/out.laz} out.laz --summary summary.json", OF_CLEAN)

@@ -102,15 +102,6 @@ def test_cloud(files):
     assert land < 0.02
 
 
-def test_similarity(files):
-    found = adjust(files, poses="similarity", lens=files.folder / "lens.csv")
-    before, after = files.made.cameras, found.cameras
-    turn = after.rotations[0].T @ before.rotations[0]
-    np.testing.assert_allclose(after.rotations @ turn, before.rotations, atol=1e-9)
-    lengths = [np.linalg.norm(c.centres - c.centres.mean(axis=0), axis=1) for c in (before, after)]
-    assert np.ptp(lengths[1] / lengths[0]) < 1e-8  # 10 m known to 1e-8 m and better
-
-
 def test_level_and_index(files):
     found = adjust(
         files, water=files.water + 0.25, index=1.33, free=("level", "index"),
@@ -146,12 +137,9 @@ def test_shape_and_waterline(files, tmp_path):
     write_waterline(files, tmp_path / "marks.csv")
     found = adjust(
         files, out=tmp_path / "out", water=files.water + 0.25, free=("level", "tilt", "shape"),
-        gcps=tmp_path / "marks.csv", lens=files.folder / "lens.csv", sigma_image=IMAGE_PX,
+        gcps=tmp_path / "marks.csv", lens=files.folder / "lens.csv",
     )  # fmt: skip
     told = json.loads((tmp_path / "out" / "adjustment.json").read_text())
-    (row,) = told["on_surfaces"]
-    assert (row["surface"], row["points"]) == ("water", 12)
-    assert row["rms_m"] < 0.01  # m: what is given
     assert {row["name"] for row in told["control"]["points"]} == {
         row.name for row in found.control if row.role == "control"
     }
@@ -197,29 +185,14 @@ def test_written(files, written):
         np.testing.assert_allclose(*turns, atol=1e-7)
         assert read.lenses[0].focal == pytest.approx(found.cameras.lenses[0].focal, abs=1e-4)
         np.testing.assert_allclose(read.centres[order], found.cameras.centres, atol=1e-3)
+    told = json.loads((out / "adjustment.json").read_text("utf-8"))
+    assert told["sigma0"] == pytest.approx(found.sigma0)
+    assert all(
+        told["residuals"][key]["rms_before_px"] > 2.0 * IMAGE_PX for key in ("land", "water")
+    )
     page = (out / "report.html").read_text("utf-8")
     assert "<html" in page
     assert "Refractive bundle adjustment" in page
-
-
-def test_summary(files, written):
-    out, found = written
-    told = json.loads((out / "adjustment.json").read_text("utf-8"))
-    assert told["model"] == str(files.folder / "model")
-    assert told["source"] == "tie points"
-    assert told["images"] == len(found.cameras)
-    assert told["sigma0"] == pytest.approx(found.sigma0)
-    for where, rows in (("land", ~found.is_wet), ("water", found.is_wet)):
-        r = found.residual_px[found.used & rows[found.block.owner]]
-        rms = np.sqrt(np.nanmean(r**2))
-        assert told["residuals"][where]["rms_px"] == pytest.approx(rms, rel=1e-3)
-        assert told["residuals"][where]["rms_before_px"] > 2.0 * IMAGE_PX
-    assert told["gnss"]["images"] == len(found.cameras)
-    assert {row["name"] for row in told["control"]["points"]} == {
-        row.name for row in found.control if row.role == "control"
-    }
-    assert told["check"]["points"]
-    assert told["unknowns"]["lens"] == list(found.unknowns.lens)
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -241,7 +214,7 @@ def test_doors_agree(files, written, tmp_path):
 
 @pytest.mark.usefixtures("undrawn")
 def test_output_folder(files, tmp_path):
-    quick = {"poses": "similarity", "lens_unknowns": (), "outliers": False}
+    quick = {"poses": "fixed", "lens_unknowns": ("f",)}
     out = tmp_path / "out"
     adjust(files, out=out, **quick)
     before = (out / "adjustment.json").read_bytes()

@@ -26,8 +26,7 @@ TIES = 3000
 @free
 @true
 @pytest.mark.parametrize(
-    ("ties", "bed_gsd", "land_gsd"),
-    mostly_nightly([("measured", 1.00, 0.80), ("cloud", 0.98, 0.80)]),
+    ("ties", "bed_gsd", "land_gsd"), mostly_nightly([("auto", 1.00, 0.80), ("cloud", 0.98, 0.80)])
 )
 def test_rendered_block(tmp_path, monkeypatch, ties, bed_gsd, land_gsd):
     """Before, land lies 19 GSD (of 5 cm) too low; the matcher's own noise is 0.9 and 0.7."""
@@ -35,7 +34,7 @@ def test_rendered_block(tmp_path, monkeypatch, ties, bed_gsd, land_gsd):
     offset = tuple(np.loadtxt(FREE / "offset.txt"))
     found = adjust_cameras(
         FREE / "sparse", water=WATER_M, cameras_offset=offset, cloud=FREE / "cloud.las",
-        gnss=FREE / "gnss.csv", gcps=FREE / "gcps.csv" if ties == "measured" else None, ties=ties,
+        gnss=FREE / "gnss.csv", gcps=FREE / "gcps.csv" if ties == "auto" else None, ties=ties,
     )  # fmt: skip
     right = pcfix.read_cameras(TRUE / "colmap")
     order = [right.labels.index(label) for label in found.cameras.labels]

@@ -88,7 +88,7 @@ def members_with(covariance, cameras):
     poses, lens = steps[:, :18].reshape(-1, 3, 6), np.repeat(steps[:, None, 18:19], 3, axis=1)
     nothing = np.zeros(UNKNOWNS)
     return Members(
-        cameras.labels, cameras.centres, np.full(3, LENS.focal), poses[:, :, :3],
+        cameras.labels, np.full(3, LENS.focal), poses[:, :, :3],
         np.einsum("kij,mkj->mki", cameras.rotations, poses[:, :, 3:]), ("f",), lens,
         np.column_stack([steps[:, 19], nothing, nothing, steps[:, 20], *[nothing] * 3]),
     )  # fmt: skip
@@ -135,7 +135,7 @@ def members_of(cameras, sigma_m):
     up = np.array([-1.0, 1.0])[:, None, None] * np.array([0.0, 0.0, sigma_m])
     nothing = np.zeros((2, len(cameras), 3))
     return Members(
-        cameras.labels, cameras.centres, np.array([lens.focal for lens in cameras.lenses]),
+        cameras.labels, np.array([lens.focal for lens in cameras.lenses]),
         nothing, nothing + up @ cameras.rotations[0].T, (), nothing[:, :, :0], np.zeros((2, 7)),
     )  # fmt: skip
 
@@ -178,10 +178,9 @@ def test_file(files):
 def test_other_ensemble(files):
     _, bare = corrected(files)
     cameras = pcfix.read_cameras(files[1])
-    centres = cameras.centres.copy()
-    centres[0, 0] += 0.5
+    lenses = tuple(replace(lens, focal=1.001 * lens.focal) for lens in cameras.lenses)
     where = files[1].parent
-    write_members(where, members_of(replace(cameras, centres=centres), 0.1))
+    write_members(where, members_of(replace(cameras, lenses=lenses), 0.1))
     told, las = corrected(files)
     assert any(
         "ensemble.npz: belongs to other cameras" in note["message"] for note in told.warnings

@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcfix.adjust.block import Unknowns, plain_block
+from pcfix.adjust.block import plain_block
+from pcfix.adjust.parameters import Unknowns
 from pcfix.adjust.problem import port_of, prepare
 from pcfix.adjust.solve import solve
 from pcfix.errors import SettingError
 from pcfix.flow.adjust import adjust_cameras, correct_words
 from pcfix.io.cameras.colmap import write_colmap
-from pcfix.model import TiePoints
+from pcfix.model import GnssPositions, TiePoints
 from pcfix.options.correct import AdjustOptions
 from pcfix.port.light import coefficients
 from pcfix.port.shapes import DomePort, FlatPort
@@ -72,7 +73,9 @@ def test_port_from_exact_images(port):
     ties = TiePoints(made.truth, made.views, made.image_xy)
     block = replace(
         plain_block(made.cameras, ties, None, made.refractive_index), port=start,
-        gnss_xyz=made.cameras.centres, gnss_sigma_m=np.full((len(made.cameras), 3), SIGMA_M),
+        gnss=GnssPositions(
+            made.cameras.centres, np.full((len(made.cameras), 3), SIGMA_M), None
+        ),
     )  # fmt: skip
     problem, begin = prepare(block, unknowns)
     with threads(1):
@@ -99,8 +102,8 @@ def test_port_from_noisy_images(tmp_path, port, free):
             gnss=tmp_path / "gnss.csv", index=made.refractive_index, lens_unknowns=(),
         )  # fmt: skip
     summary = json.loads((tmp_path / "out" / "adjustment.json").read_text())
-    told = summary["port_found"]
-    again = port_of_text(told["port"])  # to 0.1 um
+    told = summary["port"]
+    again = port_of_text(told["surface"])  # to 0.1 um
     np.testing.assert_allclose(coefficients(again), coefficients(found.port), atol=1e-7)
     names = ("distance",) if is_flat else ("centre_x", "centre_y", "centre_z")
     true = dict(zip(names, (port.distance_m,) if is_flat else port.centre_m, strict=True))
@@ -108,10 +111,10 @@ def test_port_from_noisy_images(tmp_path, port, free):
         row = told[name]
         assert abs(row["after"] - value) < 3.5 * row["sigma"]
         assert abs(row["before"] - value) > 0.0 or value == 0.0
-    assert f"--port {told['port']}" in adjustment_text(summary)
+    assert f"--port {told['surface']}" in adjustment_text(summary)
     options = AdjustOptions(port=port, free=(free,))
     words = correct_words(found, "model", tmp_path / "out", options)
-    assert words.endswith(f"--port {told['port']}")
+    assert words.endswith(f"--port {told['surface']}")
 
 
 @pytest.mark.parametrize(

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pcfix.adjust.block import Block, Unknowns
+from pcfix.adjust.block import Block
+from pcfix.adjust.parameters import Unknowns
 from pcfix.adjust.precision import Precision, SharedUnknown
 from pcfix.adjust.problem import Intersected, prepare
 from pcfix.adjust.result import Adjusted, ControlRow, adjustment_dict, before_of
 from pcfix.errors import PcfixWarning
-from pcfix.model import Cameras, Lens, WaterPlane
+from pcfix.model import Cameras, GnssPositions, GroundControl, Lens, WaterPlane
 from pcfix.report.adjustment import adjustment_page, adjustment_text
 from tests.report.test_report import Elements
 from tests.utils.shared import ROOT
@@ -64,8 +65,17 @@ def make_block(xyz, images, before, refractive_index=1.34):
     m, k = len(xyz), 3
     return Block(
         before, xyz, np.arange(m + 1) * k, np.tile(np.arange(k), m), images, np.full(m * k, 0.3),
-        WaterPlane(LEVEL), refractive_index, np.ones(m, bool), np.full((m, 3), np.nan),
-        np.full((m, 3), np.inf), before.centres + 0.01, np.full((k, 3), 0.03),
+        np.ones(m, bool), GnssPositions(before.centres + 0.01, np.full((k, 3), 0.03), None),
+        WaterPlane(LEVEL), refractive_index,
+    )  # fmt: skip
+
+
+def surveyed(points, checks=0):
+    """Return control points, the last ones of them check points, without marks."""
+    none, is_check = np.zeros(0, int), np.arange(points) >= points - checks
+    return GroundControl(
+        tuple(f"G{i}" for i in range(points)), np.full((points, 3), np.nan),
+        np.full((points, 3), 0.001), is_check, is_check, none, none, np.zeros((0, 2)), np.zeros(0),
     )  # fmt: skip
 
 
@@ -95,14 +105,15 @@ def adjusted():
         block, unknowns, after, WaterPlane(LEVEL + 0.02), 1.34, xyz, residual, used, is_wet, 1.234,
         60, "tie points", make_precision(len(xyz)), gnss, control,
         [PcfixWarning("adjust.lens", "something <decided>")], problem,
-        replace(start, state=start.state._replace(water=numbers), rounds=2, steps=3),
+        replace(start, state=start.state._replace(water=numbers)),
     )  # fmt: skip
 
 
 def make_precision(m):
     pose = np.zeros((3, 6, 6))
-    pose[:2, range(6), range(6)] = [1e-6, 4e-6, 9e-6, 1e-4, 4e-4, 9e-4]
+    pose[:, range(6), range(6)] = [1e-6, 4e-6, 9e-6, 1e-4, 4e-4, 9e-4]
     pose[1] *= 4.0
+    pose[2] *= 9.0
     shared = SharedUnknown("f", 2.0, 0.25), SharedUnknown("level", 0.02, 0.004)
     # of every point: 1, 2 and 3 cm
     sigma = np.tile([0.01, 0.02, 0.03], (m, 1))
@@ -135,12 +146,9 @@ def test_values(adjusted):
     table = reference[reference.index("| key of `adjustment.json`") :].partition("\n\n")[0]
     rows = re.findall(r"^\| (`.*?) \|", table, re.M)
     assert {name.strip("` ") for row in rows for name in row.split(",")} == set(values)
-    assert values["precision"]["images"] == 2
-    # standard errors 1, 2, 3 cm of one pose, twice these of the other
-    assert values["precision"]["centre_mean_m"] == pytest.approx([0.015, 0.03, 0.045])
-    assert values["precision"]["angle_mean_deg"] == pytest.approx(
-        np.degrees([0.0015, 0.003, 0.0045])
-    )
+    # standard errors 1, 2, 3 cm of one pose, twice and three times these of the others
+    assert values["precision"]["centre_mean_m"] == pytest.approx([0.02, 0.04, 0.06])
+    assert values["precision"]["angle_mean_deg"] == pytest.approx(np.degrees([0.002, 0.004, 0.006]))
     assert values["poses"]["moved_rms_m"] == pytest.approx(0.3)
     assert values["poses"]["turned_rms_deg"] == 0.0
 
@@ -185,12 +193,9 @@ def test_check_points(adjusted):
     used = adjusted.used.copy()
     used[-3:] = False
     used[3:6] = False  # a tie point that is left out wholly
-    block = replace(adjusted.block, control_names=("G1", "C1"), is_check=np.array([False, True]))
-    found = replace(adjusted, block=block, used=used)
+    found = replace(adjusted, block=replace(adjusted.block, control=surveyed(2, 1)), used=used)
     values = adjustment_dict(found, before_px(found))
-    assert values["points"] | {"control": 0, "check": 0} == {
-        "all": 22, "land": 8, "water": 14, "left_out": 1, "control": 0, "check": 0,
-    }  # fmt: skip
+    assert values["points"] == {"all": 22, "land": 8, "water": 14}
     assert values["observations"] == {"used": 64, "left_out": 5}
     assert sum(values["residuals"][key]["points"] for key in ("land", "water")) == 22
 
@@ -201,9 +206,9 @@ def test_before(adjusted):
     start = truth + np.array([0.3, -0.2, 0.4])
     block = make_block(start, pinhole(truth, cameras()), cameras(), 1.0)
     block.image_xy[40] += 25.0  # the outlier, left out
-    block.surveyed_xyz[4] = truth[4] + 1.0
-    block.surveyed_sigma_m[4] = 0.001
-    found = before_of(replace(adjusted, block=block))
+    control = surveyed(len(truth))
+    control.xyz[4] = truth[4] + 1.0
+    found = before_of(replace(adjusted, block=replace(block, control=control)))
     # observations are exact: what is left is Newton's last step, and coordinates of 4e6 m
     np.testing.assert_allclose(found.xyz, truth, atol=1e-6)
     assert np.abs(found.residual_px[adjusted.used]).max() < 1e-4

@@ -79,21 +79,22 @@ class Twin(NamedTuple):
         lens = replace(lens, focal=lens.focal + added.get("f", 0.0))
         seen, _ = project(surface, cameras, block.camera, lens)
         parts = [((block.image_xy - seen) / block.sigma_px[:, None]).ravel()]
+        surveyed, weight = block.survey
         for found, given, sigma in (
-            (xyz, block.surveyed_xyz, block.surveyed_sigma_m),
-            (centres, block.gnss_xyz, block.gnss_sigma_m),
+            (xyz, surveyed, 1.0 / np.sqrt(np.where(weight > 0.0, weight, np.nan))),
+            (centres, block.gnss.xyz, block.gnss.sigma_m),
         ):
-            known = np.isfinite(sigma)
+            known = np.isfinite(sigma) & np.isfinite(given)
             parts.append((found[known] - (given - self.origin)[known]) / sigma[known])
-        given = block.conditions
-        for number, name in enumerate(("water", *given.names) if len(given.on) else ()):
-            on = given.on == number
+        planes, on_surface, sigma_m = block.surfaces
+        for number, name in enumerate(("water", *planes) if len(on_surface) else ()):
+            on = on_surface == number
             plane = [added.get(f"{word} of {name}", 0.0) for word in ("level", "tilt_x", "tilt_y")]
-            if name in given.parallel:  # slopes are those of the water
+            if name in block.parallel:  # slopes are those of the water
                 plane[1:] = b, c
             numbers = (a, b, c, *shape) if number == 0 else (*plane, 0.0, 0.0, 0.0)
             off = height(numbers, *xyz[on, :2].T) - xyz[on, 2]
-            parts.append(off / given.sigma_m[on])
+            parts.append(off / sigma_m[on])
         if np.isfinite(self.index_sigma):
             parts.append(np.array([added["index"] / self.index_sigma]))
         return np.concatenate(parts)

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import Block, Unknowns, plain_block
+from pcfix.adjust.block import Block, plain_block
+from pcfix.adjust.parameters import Unknowns
 from pcfix.adjust.problem import prepare, solved_cameras
 from pcfix.adjust.solve import solve
 from pcfix.io.cameras.colmap import write_colmap
@@ -153,7 +154,7 @@ class KindBlock:
         block = self.block(cameras, water, np.full(len(self.xyz), water is not None))
         block = replace(block, sigma_px=np.full(len(block.camera), NOISE_PX))
         if weighs_gnss:
-            block = replace(block, gnss_xyz=gnss, gnss_sigma_m=np.full(gnss.shape, 0.1))
+            block = replace(block, gnss=GnssPositions(gnss, np.full(gnss.shape, 0.1), None))
         problem, start = prepare(block, unknowns)
         return solved_cameras(problem, solve(problem, start))
 

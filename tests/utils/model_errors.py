@@ -10,13 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import Material, usable_ties
+from pcfix.adjust.block import block_of as block_to_adjust
+from pcfix.adjust.block import usable_ties
 from pcfix.adjust.methods import adjust_block
 from pcfix.adjust.normal import CAUCHY, SQUARES
+from pcfix.adjust.parameters import Unknowns, default_lens
 from pcfix.adjust.problem import intersect_fixed
 from pcfix.adjust.result import Adjusted
 from pcfix.model import Cameras, FloatArray, TiePoints, WaterPlane
-from pcfix.options.correct import AdjustRules
 from tests.utils.tie_blocks import block_of
 from tests.utils.tie_points import TieScene, simulate_tie_points
 from tests.utils.unaware_blocks import unaware
@@ -60,9 +61,10 @@ def run(kind: str, seed: int, **settings: object) -> Run:
     water = WaterPlane(scene.water.a + off_m, scene.water.b, scene.water.c)
     made = unaware(scene, loss=CAUCHY if kind == "mismatches" else SQUARES)
     gnss = scene.cameras.gnss
-    material = Material("block", made.cameras, water, scene.refractive_index, gnss)
-    rules = AdjustRules(sigma_level=SIGMA_LEVEL_M if kind == "level" else None)
-    found = adjust_block(material, rules, ties=usable_ties(made.ties, made.cameras))
+    ties, lens = usable_ties(made.ties, made.cameras), default_lens(made.cameras.lenses)
+    block = block_to_adjust(made.cameras, ties, water, scene.refractive_index)
+    surface = {"level": SIGMA_LEVEL_M} if kind == "level" else {}
+    found = adjust_block(replace(block, gnss=gnss), Unknowns(lens=lens, surface=surface))
     bed = tuple(
         bed_rms_m(scene, cameras, surface) / (80.0 / cameras.lenses[0].focal)
         for cameras, surface in ((made.cameras, water), (found.cameras, found.water))

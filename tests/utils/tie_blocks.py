@@ -7,7 +7,7 @@ import numpy as np
 from pcfix.adjust.block import Block
 from pcfix.adjust.problem import prepare
 from pcfix.adjust.solve import solve
-from pcfix.model import TiePoints
+from pcfix.model import GnssPositions, TiePoints
 from tests.utils.tie_points import TieScene
 
 
@@ -34,11 +34,14 @@ def block_of(
     ties = scene.exact_xy if exact else scene.ties.image_xy
     seen = scene.control_exact_xy if exact else scene.control.image_xy
     xyz = scene.truth if start_xyz is None else start_xyz
-    m, q, k = len(xyz), len(rows), len(cameras)
     survey = scene.control_truth if exact else scene.control.xyz
-    sigma = np.where(scene.control.is_check[rows, None], np.inf, scene.control.sigma_m[rows])
+    surveyed = replace(
+        scene.control, names=tuple(scene.control.names[i] for i in rows), xyz=survey[rows],
+        sigma_m=scene.control.sigma_m[rows], is_check=scene.control.is_check[rows],
+    )  # fmt: skip
     positions = scene.cameras.gnss
     place = scene.true_cameras.centres if exact else positions.xyz
+    nowhere = np.full((len(cameras), 3), np.nan)
     return Block(
         cameras=replace(cameras, gnss=None),
         xyz=np.vstack([xyz, scene.control_truth[rows]]),
@@ -48,13 +51,11 @@ def block_of(
         sigma_px=np.full(
             len(scene.views.camera) + len(each), sigma_px or scene.noise.image_px or 0.5
         ),
+        wet=np.ones(len(xyz) + len(rows), bool),
+        gnss=GnssPositions(place if gnss else nowhere, positions.sigma_m, None),
         water=scene.water if water is None else water,
         refractive_index=scene.refractive_index if index is None else index,
-        wet=np.ones(m + q, bool),
-        surveyed_xyz=np.vstack([np.full((m, 3), np.nan), survey[rows]]),
-        surveyed_sigma_m=np.vstack([np.full((m, 3), np.inf), sigma]),
-        gnss_xyz=place if gnss else np.full((k, 3), np.nan),
-        gnss_sigma_m=positions.sigma_m if gnss else np.full((k, 3), np.inf),
+        control=surveyed if len(rows) else None,
     )
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pcfix.adjust.block import Unknowns
 from pcfix.adjust.normal import SQUARES
+from pcfix.adjust.parameters import Unknowns
 from pcfix.adjust.problem import prepare, solved_cameras
 from pcfix.adjust.solve import solve
 from pcfix.model import Cameras, FloatArray, TiePoints
