@@ -70,8 +70,7 @@ def label_points(
     crs : str, optional
         CRS of the points, for a mask from a file.
     options : LabelRules, optional
-        Or its attributes as keywords: surface_band, dead_band, connected, respect_classes and
-        others.
+        Or its attributes as keywords: surface_band, connected, respect_classes and others.
 
     Returns
     -------
@@ -106,8 +105,7 @@ def label_file(
 ) -> Figures:
     """Set the submerged points of a LAS or LAZ cloud to class 40; what ``pcfix label`` runs.
 
-    With a band, points near the surface get class 41; with ``reset``, points of class 40 or 41 that
-    are neither get class 1. All other classes above the water stay, 42 to 45 too.
+    With a band, points near the surface get class 41. All other classes above the water stay.
 
     Parameters
     ----------
@@ -116,8 +114,7 @@ def label_file(
         see `pcfix.correct_file`. Of a GeoTIFF of heights the classes of its cells are a GeoTIFF
         too, with 255 for nodata.
     options, progress
-        See `pcfix.correct_file`. With a dead band or connectivity the cloud is read twice. A point
-        on the border of the mask is inside.
+        See `pcfix.correct_file`. With connectivity the cloud is read twice.
     """
     given = taken(LabelOptions, options, keywords, "label_file")
     run = command_for(output, given)
@@ -155,10 +152,9 @@ def label_chunk(plan: LabelPlan, points: Points) -> tuple[Classes, LabelCounts]:
 
 
 def check(plan: LabelPlan, counts: LabelCounts) -> None:
-    """Raise GeometryError if no point lies below the water, or inside the mask."""
-    below = counts.submerged + counts.water_surface
-    plan.labelling.check(plan.name, counts, below)
-    check_submerged(below, plan.name, plan.water)
+    """Raise GeometryError if no point is below the water, or inside the mask."""
+    plan.labelling.check(plan.name, counts)
+    check_submerged(counts.submerged + counts.water_surface, plan.name, plan.water)
 
 
 def _labelling(plan: LabelPlan, source: LasSource) -> FileWork:

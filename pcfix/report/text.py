@@ -104,8 +104,8 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
         ("Class 40", "{submerged:,} points ({submerged:of points})", ""),
         ("Class 41", "{water_surface:,} points within {settings[surface_band]:g} m of the surface",
          "settings[surface_band]"),
-        ("Formerly", "{stale:,} points of class 40 or 41 are in neither class now:"
-         " {settings[reset]:?class 1 now|unchanged; --reset sets class 1}", "stale"),
+        ("Formerly", "{stale:,} points of class 40 or 41 are in neither class now; their class is"
+         " unchanged", "stale"),
         _NO_SURFACE,
         *_LABELLING,
         ("Water", "{water}", ""),

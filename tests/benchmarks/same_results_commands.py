@@ -185,7 +185,7 @@ OF_COMPARE = {
 }
 OF_LABEL = {
     "default": "--water 0.37",
-    "band": "--water 0.37 --surface-band 0.2 --dead-band 0.1 --reset",
+    "band": "--water 0.37 --surface-band 0.2",
     "connected": "--water plane:0.37,0,0 --connected --least-pool 20",
     "auto": "--water auto",
 }
