@@ -89,14 +89,13 @@ def nearest_of(
             yield row[some], xyz[some], near.tiles.xyz[first]
 
 
-def nearest_distance(places: FloatArray, points: FloatArray, axes: int = 2) -> FloatArray:
-    """Return the distance (m) of each place, (n,), to the nearest point, in plan or with 3 axes.
+def nearest_distance(places: FloatArray, points: FloatArray) -> FloatArray:
+    """Return the distance (m) of each place, (n,), to the nearest point in space: C2C.
 
-    Places and points, (n, 3), are metres in one frame. In space this is C2C, without a sign. Where
-    the two clouds sample a surface at different places it is at least about half the spacing of the
-    points.
+    Places and points, (n, 3), are metres in one frame. Where the two clouds sample a surface at
+    different places it is at least about half the spacing of the points.
     """
-    near = Neighbours(make_tiles(points), axes)
+    near = Neighbours(make_tiles(points), 3)
     asked, distance = make_tiles(places), empty((len(places),))
     for piece in asked.pieces(PIECE_ROWS):
         distance[asked.row[piece]] = near.nearest(asked.xyz[piece], 1)[0][:, 0]

@@ -12,7 +12,7 @@ import numpy as np
 from pcfix.blocks import blocks, bounds, kept, mapped
 from pcfix.clean.neighbours import nearest_distance
 from pcfix.compare.m3c2 import m3c2_distances
-from pcfix.compare.match import Match, heights_at, spacing_m
+from pcfix.compare.match import Match, heights_at, mean_spacing_m
 from pcfix.compare.statistics import (
     binned,
     distribution_of,
@@ -22,6 +22,7 @@ from pcfix.compare.statistics import (
     tvu_of,
 )
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, plain
+from pcfix.grid.lattice import spacing_m
 from pcfix.model import FloatArray
 from pcfix.sums import Figures
 
@@ -51,23 +52,17 @@ class Comparison(Figures):
         return dict(plain(values | {"sections": sections}))
 
 
-_BIN_COLUMNS = {
-    "count_{}": "count",
-    "bias_{}_m": "mean_m",
-    "sd_{}_m": "sd_m",
-    "rmse_{}_m": "rmse_m",
-    "nmad_{}_m": "nmad_m",
-}
-
-
 def bins_table(bins: Iterable[Figures]) -> str:
     """Return bins as CSV text; the columns of `before` are empty where it is not known."""
-    head = [name.format(when) for when in ("after", "before") for name in _BIN_COLUMNS]
-    rows: list[list[Any]] = [["from_m", "to_m", *head]]
+    columns = ("bias", "mean_m"), ("sd", "sd_m"), ("rmse", "rmse_m"), ("nmad", "nmad_m")
+    rows: list[list[Any]] = [["from_m", "to_m"]]
+    for when in ("after", "before"):
+        rows[0] += [f"count_{when}", *(f"{name}_{when}_m" for name, _ in columns)]
     for one in bins:
         rows.append([f"{one.from_m:g}", f"{one.to_m:g}"])
-        for statistics in (one.after, one.before):
-            rows[-1] += [getattr(statistics, name, None) for name in _BIN_COLUMNS.values()]
+        for found in (one.after, one.before):
+            names = ("count", *(name for _, name in columns))
+            rows[-1] += [getattr(found, name, None) for name in names]
     return _csv(rows)
 
 
@@ -84,6 +79,8 @@ def _csv(rows: Iterable[Iterable[Any]]) -> str:
 
 BINS, TAIL_PERCENT = 64, 0.5
 """Of the histogram of vertical errors: its classes, and what it leaves out on either side."""
+POINTS_PER_SQUARE = 3.0
+"""Of the squares by which the spacing of a cloud is measured, on average."""
 SPARSER = 2.0
 """Ratio of the spacings of two clouds from which one is called sparse."""
 MIN_REACH_M, REACH_FACTOR = 1.0, 1.5
@@ -105,7 +102,7 @@ def figures_of(
     by_depth: dict[str, Any] = {
         "bed": None, "land": None,  # vertical errors of submerged places and of the others
         "depth": None,  # against reference depth, if water is known
-        "depth_bins": [], "shore_bins": [],  # by depth, and by distance from the shore
+        "depth_bins": [],
         "tvu": None,  # of all submerged places
     }  # fmt: skip
     if rules.vertical:
@@ -174,7 +171,7 @@ def c2c_of(match: Match) -> tuple[Figures | None, Figures | None]:
     rules = match.settings
 
     def distribution(places: FloatArray, surface: FloatArray) -> Figures:
-        return distribution_of(nearest_distance(places, surface, 3), rules.classes, rules.share)
+        return distribution_of(nearest_distance(places, surface), None, rules.share)
 
     to = back = None
     if rules.direction != "from-reference":
@@ -188,7 +185,10 @@ def sparse_notes(match: Match, to: Figures | None, back: Figures | None) -> list
     """Return warnings of distances that mostly measure the spacing of a sparse cloud."""
     if match.reference.sparse:
         return []
-    spacings = {"reference": spacing_m(match.reference.xyz), "cloud": spacing_m(match.asked.xyz)}
+    spacings = {}
+    for name, xyz in ("reference", match.reference.xyz), ("cloud", match.asked.xyz):
+        side = POINTS_PER_SQUARE**0.5 * mean_spacing_m(xyz)
+        spacings[name] = spacing_m(xyz, max(side, 1e-9))
     notes = []
     for pair, sparse, dense in zip((to, back), spacings, reversed(spacings), strict=True):
         apart, times = spacings[sparse], spacings[sparse] / max(spacings[dense], 1e-9)
@@ -260,16 +260,12 @@ def _by_depth(match: Match, pairs: Figures, notes: list[PcfixWarning]) -> dict[s
     }
     if not wet.all():
         figures["land"] = both(lambda p: statistics_of(kept(~wet, p.error_m)), pairs)
-    if match.dry.any():
-        dry = kept(match.dry, match.whole.xyz)[:, :2]
-        shore = nearest_distance(kept(wet, after.xy), dry)
-        figures["shore_bins"] = binned(shore, error, error_before, rules.shore_bin_width)
     return figures
 
 
 def _m3c2(match: Match, pairs: Figures | None) -> Figures:
     if pairs is None:
-        far = nearest_distance(*match.facing(match.cloud.xyz), 3)
+        far = nearest_distance(*match.facing(match.cloud.xyz))
     else:
         far = mapped(np.abs, (pairs.before or pairs.after).error_m)
     reach = max(MIN_REACH_M, REACH_FACTOR * float(np.percentile(far, 99)))

@@ -104,29 +104,24 @@ def fit_line(reference_depth_m: FloatArray, depth_m: FloatArray) -> Figures | No
     slope of about 1 / n. None if fewer than three depths, or only equal ones, leave the line
     undefined.
     """
-    if len(depth_m) < 3:
+    if len(depth_m) < 3 or np.ptp(reference_depth_m) <= 1e-9 * np.abs(reference_depth_m).max():
         return None
-    x_mean, y_mean = float(reference_depth_m.mean()), float(depth_m.mean())
-    x, y = reference_depth_m - x_mean, depth_m - y_mean
-    xx, yy, xy = float(x @ x), float(y @ y), float(x @ y)
-    scale = max(float(-reference_depth_m.min()), float(reference_depth_m.max()), 1e-9)
-    if xx <= len(depth_m) * (1e-9 * scale) ** 2:
-        return None
-    r2 = xy * xy / (xx * yy) if yy > 0.0 else 1.0
-    intercept = y_mean - xy / xx * x_mean
-    return Figures(slope=xy / xx, intercept_m=intercept, r2=r2, count=len(depth_m))
+    (xx, xy), (_, yy) = np.cov(reference_depth_m, depth_m, ddof=0).tolist()
+    slope, r2 = xy / xx, xy * xy / (xx * yy) if yy > 0.0 else 1.0
+    intercept = float(depth_m.mean() - slope * reference_depth_m.mean())
+    return Figures(slope=slope, intercept_m=intercept, r2=r2, count=len(depth_m))
 
 
 def binned(
-    by_m: FloatArray, after_m: FloatArray, before_m: FloatArray | None, width_m: float
+    depth_m: FloatArray, after_m: FloatArray, before_m: FloatArray | None, width_m: float
 ) -> list[Figures]:
-    """Return the statistics of bins of reference depth, or of distance, that hold points.
+    """Return the statistics of bins of reference depth that hold points.
 
-    Errors after and before the correction, shape (n,), metres, are sorted `by_m`; edges of bins are
-    multiples of the width. ``before`` is None if it is not known. Raises SettingError
+    Depths, and errors after and before the correction, have the shape (n,), metres; edges of bins
+    are multiples of the width. ``before`` is None if it is not known. Raises SettingError
     ``option.range`` if there are more than `MAX_BINS`.
     """
-    place = mapped(lambda some: np.floor(some / width_m), by_m)
+    place = mapped(lambda some: np.floor(some / width_m), depth_m)
     numbers = np.unique(np.hstack([np.unique(place[rows]) for rows in blocks(len(place))]))
     if len(numbers) > MAX_BINS:
         sentence = f"A bin width of {width_m:g} m makes {len(numbers):,} bins. Use a larger one."

@@ -45,7 +45,6 @@ RESULTS = {
     "run.json": "options and results of the run",
     "compare/compare.json": "all figures of the comparison",
     "compare/depth_bins.csv": "errors by depth",
-    "compare/shore_bins.csv": "errors by distance from the shore",
     DIFFERENCE: "cloud minus reference",
     "compare/reference_dsm.tif": "heights of the reference",
     "adjusted/report.html": "the adjustment of the cameras",

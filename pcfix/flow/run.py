@@ -417,8 +417,8 @@ class RunResults:
     def tables(self) -> dict[str, DataFrame]:
         """Tables of the comparison by name, metres; empty where there was no reference.
 
-        ``statistics`` of the errors before and after; ``depth_bins`` and ``shore_bins``, errors by
-        depth and by distance from the shore; ``section_01`` and so on, heights along a line.
+        ``statistics`` of the errors before and after; ``depth_bins``, errors by depth;
+        ``section_01`` and so on, heights along a line.
         """
         if not self.compared:
             return {}

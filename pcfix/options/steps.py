@@ -234,8 +234,6 @@ class DistanceOptions(OptionSet, panel=Panel.FIGURES):
     )
     """C2C from each point of the cloud to the nearest of the reference, the other way round, or
     both. [default: to-reference; from each check point]"""
-    classes: int | None = option(None, least=2, most=100_000, needs="reference")
-    """Number of classes of the C2C histograms. [default: square root of the number of distances]"""
     share: tuple[Any, ...] = option((), then=_bands, needs="reference", metavar="LOW,HIGH")
     """Report the share of the C2C distances from LOW to HIGH metres; may be repeated."""
     also: tuple[Any, ...] = option(
@@ -263,8 +261,6 @@ class CompareRules(DistanceOptions, panel=Panel.FIGURES):
     """Number of reference points in each fitted plane."""
     bin_width: float = option(1.0, above=0)
     """Bin width of the table by depth. [m]"""
-    shore_bin_width: float = option(10.0, above=0)
-    """Bin width of the table by distance from shore. [m]"""
     max_gap: float | None = option(None, above=0)
     """Points up to this distance outside the reference are compared. [m] [default: 5 point
     spacings, at least 1]"""

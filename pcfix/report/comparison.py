@@ -47,14 +47,6 @@ KINDS = {
 MOMENTS = {
     "mean": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m", "median": "median_m",
 }  # fmt: skip
-BINS = {
-    "depth_bins": ("By depth (m)", "Error against depth", "Reference depth (m)"),
-    "shore_bins": (
-        "By distance from shore (m)", "Error against distance from shore",
-        "Distance from the shore (m)",
-    ),
-}  # fmt: skip
-"""Their titles as a table and as a picture, and the label of the axis."""
 SHOWN = 0.995
 """The share of the distances of each histogram of C2C up to which the axis reaches at least."""
 
@@ -186,20 +178,16 @@ def _tables(compared: Plain) -> list[Table]:
     header = ["", "slope", "intercept (m)", "r²"]
     tables.append(Table("Depth against reference depth", header, rows))
 
-    # of each class of depth or of distance from the shore
-    figures_of = {"bias": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m"}
-    first, *others = figures_of
-    header = ["", "points"]
-    header += [one for _, name, _ in TIMES for one in (f"{name}: {first}", *others)]
-    for key, (title, _, _) in BINS.items():
-        rows = []
-        for one in compared[key]:
-            row = [f"{one['from_m']:g} to {one['to_m']:g}", f"{one['after']['count']:,}"]
-            for when, _, _ in TIMES:
-                s = one[when]
-                row += ["" if s is None else f"{s[key]:z.3f}" for key in figures_of.values()]
-            rows.append(row)
-        tables.append(Table(title, header, rows))
+    header, rows = ["", "points"], []
+    for _, name, _ in TIMES:
+        header += [f"{name}: bias", "sd", "RMSE", "NMAD"]
+    for one in compared["depth_bins"]:
+        row = [f"{one['from_m']:g} to {one['to_m']:g}", f"{one['after']['count']:,}"]
+        for when, _, _ in TIMES:
+            keys, s = ("mean_m", "sd_m", "rmse_m", "nmad_m"), one[when]
+            row += ["" if s is None else f"{s[key]:z.3f}" for key in keys]
+        rows.append(row)
+    tables.append(Table("By depth (m)", header, rows))
     return [table for table in tables if table.rows]
 
 
@@ -234,13 +222,13 @@ def evaluation(
         look: dict[str, Any] = {"cmap": DIFFERENCE, "vmin": -reach, "vmax": reach}
         figure = map_figure(difference_m, extent_m, "Cloud minus reference (m)", **look)
         pictures.append(Picture("dod", "Difference of the surfaces (DoD)", alt, figure))
-    for key, (_, title, label) in BINS.items():
-        if bins := compared[key]:
-            alt = (
-                f"{title}: mean and standard deviation of the vertical error in {len(bins)}"
-                " classes, before and after the correction."
-            )
-            pictures.append(Picture(key, title, alt, _errors_figure(bins, label)))
+    if bins := compared["depth_bins"]:
+        alt = (
+            f"Error against depth: mean and standard deviation of the vertical error in {len(bins)}"
+            " classes, before and after the correction."
+        )
+        figure = _depth_figure(bins)
+        pictures.append(Picture("depth_bins", "Error against depth", alt, figure))
     pictures += [_section(number, one) for number, one in enumerate(sections, start=1)]
     return pictures, _tables(compared)
 
@@ -267,9 +255,8 @@ def _histograms(columns: list[list[Errors]], label: str, *, sharex: bool) -> Fig
 
     rows = len(columns[0])  # each direction has the same clouds
     size = 7.5 * len(columns) + 0.5, 2.4 * rows + 0.4
-    figure, panels = new_figure(
-        *size, nrows=rows, ncols=len(columns), sharex=sharex, squeeze=False
-    )  # fmt: skip
+    grid: dict[str, Any] = {"nrows": rows, "ncols": len(columns), "squeeze": False}
+    figure, panels = new_figure(*size, sharex=sharex, **grid)
     for axes, one in zip(panels.T.flat, (one for some in columns for one in some), strict=True):
         s, histogram = one.found["statistics"], one.found["histogram"]
         edges, counts, mean, sd = histogram["edges_m"], histogram["counts"], s["mean_m"], s["sd_m"]
@@ -288,8 +275,8 @@ def _histograms(columns: list[list[Errors]], label: str, *, sharex: bool) -> Fig
     return figure
 
 
-def _errors_figure(bins: list[Plain], label: str) -> Figure:
-    """Draw the mean error of each class, with its standard deviation."""
+def _depth_figure(bins: list[Plain]) -> Figure:
+    """Draw the mean error of each class of depth, with its standard deviation."""
     figure, axes = new_figure()
     axes.axhline(0.0, color="0.5", linewidth=0.8)
     for when, name, colour in TIMES:
@@ -298,7 +285,7 @@ def _errors_figure(bins: list[Plain], label: str) -> Figure:
             middle = [(b["from_m"] + b["to_m"]) / 2.0 for b in known]
             mean, sd = ([b[when][key] for b in known] for key in ("mean_m", "sd_m"))
             axes.errorbar(middle, mean, sd, fmt="o-", color=colour, capsize=3, label=name)
-    axes.set(xlabel=label, ylabel="Cloud minus reference, Z (m)")
+    axes.set(xlabel="Reference depth (m)", ylabel="Cloud minus reference, Z (m)")
     axes.legend(loc="best")
     return figure
 

@@ -175,7 +175,7 @@ OF_DSM = {
 SECTION = "--section 410200,4650340,410320,4650340 --sections 2 --corridor 2"
 OF_COMPARE = {
     "cloud": "{samples}/scene/lidar.laz",
-    "submerged": "{samples}/scene/lidar.laz --submerged --bin-width 2 --shore-bin-width 5",
+    "submerged": "{samples}/scene/lidar.laz --submerged --bin-width 2",
     "c2c": "{samples}/scene/lidar.laz --c2c-only",
     "sections": f"{{samples}}/scene/lidar.laz {SECTION} --neighbours 12 --max-gap 2",
     "m3c2": "{samples}/scene/lidar.laz --m3c2 --water 0.37",

@@ -57,12 +57,12 @@ def lattice(seed):
 def test_distances(make, monkeypatch):
     cloud, reference = make(1), make(2)
     expected = least_distances(cloud, reference)
-    whole = nearest_distance(cloud, reference, 3)
+    whole = nearest_distance(cloud, reference)
     np.testing.assert_array_equal(whole, expected)
     for points, jobs in ((60, None), (200, 1), (700, 2)):
         in_small_tiles(monkeypatch, points, rows=350)
         with threads(jobs):
-            np.testing.assert_array_equal(nearest_distance(cloud, reference, 3), expected)
+            np.testing.assert_array_equal(nearest_distance(cloud, reference), expected)
 
 
 def figures(folder, name):
