@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
+from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.photos import PhotoBlock, block_of, finished, map_photos, open_record
@@ -40,8 +40,6 @@ from pcfix.sums import Figures
 from pcfix.water.surface import surface_above
 
 RECORD = "pcfix-rebuild.json"
-PAPER_ROUNDS = 3
-"""Rounds after which the mapping by eq 12 is close to its fixed point, which is not the bed."""
 STEREO_CELL_PIXELS = 2.0
 STEREO_STEP_M = 0.001
 CACHED_PHOTOGRAPHS = 16
@@ -74,11 +72,6 @@ def rebuild_rounds(
         Called with (photographs or pairs done, those in all).
     say : callable, optional
         Called with a line for each round.
-
-    Raises
-    ------
-    PcfixError
-        Finished rounds stay.
     """
     started = time.perf_counter()
     given = taken(PhotosOptions, options, keywords, "rebuild_rounds")
@@ -98,15 +91,13 @@ def rebuild_rounds(
     start = str(given.dsm) if is_cloud(Path(given.dsm)) else None
     if start is not None:  # a cloud is gridded to the folder
         raster = target / "dsm.tif"
-        fresh = raster.exists() and raster.stat().st_mtime_ns > Path(start).stat().st_mtime_ns
-        if given.overwrite or not fresh:
+        if not (folders and raster.exists()):
             grid_dsm(start, raster, resolution=given.resolution, overwrite=True)
         given = replace(given, dsm=raster, resolution=None)
     with threads(given.jobs), TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))
     threshold_m = round(given.until_gsd * block.gsd_m, 5)
     rounds, done_before = list[Figures](), 0
-    notes: list[PcfixWarning] = []
     while len(rounds) < given.most_rounds and not (rounds and abs(rounds[-1].mean_m) < threshold_m):
         number, before = len(rounds) + 1, Path(rounds[-1].dsm if rounds else given.dsm)
         folder = target / f"round{number}"
@@ -133,14 +124,6 @@ def rebuild_rounds(
                 f"Round {number}: the bed moved by {one.mean_m:+.3f} m (standard deviation"
                 f" {one.sd_m:.3f} m), {100 * one.within_gsd:.0f} % of it by at most one pixel"
             )
-        if number == PAPER_ROUNDS and given.mapping == "paper":
-            n = block.scene.refractive_index
-            excess = 1.0 / (n * (2.0 - n)) - 1.0  # near nadir the depth tends to h0 / (2 - n)
-            words = (
-                "--mapping paper converges to the apparent depth / (2 - n), here up to"
-                f" {100 * excess:.0f} % too deep. Correct the cloud and use --mapping exact."
-            )
-            notes.append(PcfixWarning("photos.paper_limit", words, excess=excess))
     compared = None
     if given.reference is not None:
         # Figs 16, 18 and 20 of the paper; with the first cloud also 15 and 17
@@ -154,7 +137,7 @@ def rebuild_rounds(
     return finished(
         given,
         started,
-        notes,
+        [],
         rounds=rounds,
         done_before=done_before,  # rounds that an earlier call finished
         settled=abs(rounds[-1].mean_m) < threshold_m,
@@ -189,9 +172,8 @@ def _reconstruct(
         write_points(cloud, xyz, (block.crs, STEREO_STEP_M))
         return
     cloud.unlink(missing_ok=True)
-    places = {"images": images, "cameras": given.cameras, "cloud": cloud}
     words = shlex.split(given.rebuild or "")
-    for name, place in places.items():
+    for name, place in ("images", images), ("cameras", given.cameras), ("cloud", cloud):
         words = [word.replace(f"{{{name}}}", str(Path(place).resolve())) for word in words]
     log = cloud.with_name("rebuild.log")
     code, last = run_logged(words, log)
@@ -208,13 +190,10 @@ def _reconstruct(
 def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> dict[str, Any]:
     """Return by how much the DSM of a round differs from that before, under water."""
     raster = dsm.with_name("difference.tif")
-    write_dod(dsm, before, raster, overwrite=True)
+    write_dod(dsm, before, raster, overwrite=True)  # an error if they do not overlap
     with open_raster(raster) as source, open_raster(dsm) as heights:
         change, z, transform = read_masked(source), read_masked(heights), source.transform
     row, column = np.nonzero(np.isfinite(change))
-    if not len(row):
-        sentence = f"{cloud}: does not overlap the DSM of the round before. Check its CRS."
-        raise GeometryError("cloud.no_overlap", sentence, path=cloud)
     moved, z = change[row, column], z[row, column]
     x, y = place_of(transform, column + 0.5, row + 0.5)
     wet = surface_above(block.scene.water, np.column_stack([x, y, z])).height_m > z

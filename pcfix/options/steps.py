@@ -375,7 +375,7 @@ class PhotosOptions(
     """Cell size to which a cloud is gridded. [m] [default: 2 to 4 points a cell]"""
     mapping: Literal["exact", "paper"] = option("exact", basic=True, panel=Panel.METHOD)
     """exact: trace the light back from the true bed; paper: eq 12 of Skarlatos & Agrafiotis 2018 on
-    the apparent bed, one round of their iteration."""
+    the apparent bed, one round of their iteration, which ends at too large depths."""
     spacing: int | None = option(None, least=1, most=512, panel=Panel.METHOD)
     """Spacing of the grid nodes over the photograph. [px] [default: a cell of the DSM, at least 8
     px]"""
@@ -400,8 +400,7 @@ class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions, pa
     gsd: float | None = option(None, basic=True, above=0, needs="surface")
     """With --surface, instead of --cameras, for a nadir view: pixel size at the bed. [m]"""
     interval: float | None = option(None, above=0, needs="surface")
-    """With --surface: time between frames, before --every; without it frames are independent. [s]
-    [default: as stated in the video]"""
+    """With --surface: time between frames, before --every. [s] [default: as stated in the video]"""
     resolution: float | None = option(None, basic=True, above=0)
     """Cell size of the rasters of the water. [m] [default: so that there are 2,000 cells]"""
     every: int = option(1, least=1, most=100_000, panel=Panel.METHOD)

@@ -26,9 +26,8 @@ PAIRS_AT_ONCE = 2_000_000
 class Scene:
     """A simulated scene; metres, UTM.
 
-    A point in fewer than three images has no views and is not moved. The cloud is
-    intersected with `cameras`; the images were taken with `true_cameras`, the same object without
-    pose noise.
+    A point in fewer than three images has no views and is not moved. The cloud is intersected with
+    `cameras`; the images were taken with `true_cameras`, the same object without pose noise.
     """
 
     apparent_xyz: FloatArray  # (n, 3), the cloud of the SfM software
@@ -63,13 +62,10 @@ class Scene:
     def description(self) -> str:
         """One line about the scene."""
         per_point = len(self.views.camera) / len(self.true_xyz)
-        tilt = 100.0 * float(np.hypot(self.water.b, self.water.c))
-        tilted = f" in the middle, tilted by {tilt:.3g} %" if tilt else ""
-        gsd = f"{100.0 * self.gsd_m:.1f} cm" if self.gsd_m >= 0.005 else f"{self.gsd_m:.2g} m"
         return (
             f"{len(self.true_xyz):,} points seen by {per_point:.0f} of {len(self.cameras)} cameras"
-            f" each, GSD {gsd}, water level {self.water_level_m:g} m{tilted},"
-            f" refractive index {self.refractive_index:g}"
+            f" each, GSD {self.gsd_m:.2g} m, water level {self.water_level_m:g} m, refractive index"
+            f" {self.refractive_index:g}"
         )
 
 
@@ -107,8 +103,7 @@ def simulate_scene(
     chosen = taken(SceneOptions, options, keywords, "simulate_scene").part(SceneSettings)
     site = lay_out(chosen)
     truth = points_on(site.terrain, chosen.points, site.rng)
-    parts = []
-    at_once = max(1, PAIRS_AT_ONCE // len(site.true))
+    parts, at_once = [], max(1, PAIRS_AT_ONCE // len(site.true))
     for first in range(0, len(truth), at_once):
         sight = see(truth[first : first + at_once], site, site.luck)
         apparent = sight.intersected(site.observed(sight.ideal, site.rng))

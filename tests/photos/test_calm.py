@@ -180,4 +180,6 @@ def test_bad_frames(tmp_path, folder, calm):
         pcfix.calm_frames(tmp_path / "film.mp4", tmp_path / "calm.png")
     with refused("output.suffix"):
         pcfix.calm_frames(folder, tmp_path / "calm.jpg")
+    with refused("option.missing"):
+        pcfix.calm_frames(folder, tmp_path / "calm.png", surface=True, depth=2.0, gsd=0.02)
     assert not list(tmp_path.glob("calm*"))

@@ -17,7 +17,7 @@ from pcfix.photos.mapping import Ground
 from pcfix.photos.ortho import Picture
 from pcfix.photos.stereo import pairs_of, stereo_cloud
 from tests.photos.test_mapping import GSD_M, photo, relief
-from tests.utils.codes import refused, warned
+from tests.utils.codes import refused
 from tests.utils.renderer import Texture, rendered
 
 DEPTHS_M = (2.5, 2.66, 2.71, 2.73)
@@ -84,14 +84,6 @@ def test_rounds_stop(block):
     assert len(rounds(block, until_gsd=0.5).rounds) == 2  # the same, and asked for less
     assert not rounds(block, until_gsd=0.001).settled
     assert calls(block) == "xxxx"
-
-
-def test_paper_limit(block):
-    images, out, how = block
-    with warned("photos.paper_limit"):
-        found = pcfix.rebuild_rounds(images, out, **how, until_gsd=0.001, most_rounds=3)
-    assert [note.code for note in found.notes] == ["photos.paper_limit"]
-    assert found.notes[0].values["excess"] == pytest.approx(0.131, abs=0.001)
 
 
 def test_resumed(block):

@@ -15,8 +15,7 @@ FEW = {"points": 200, "lidar_per_m2": 0.2}
     [
         ("scene.too_low", {"flying_height_m": 5.0}),
         ("scene.pixels", {"sensor_mm": (13.2, 4.4)}),
-        ("scene.distortion", {"distortion": (-0.9, 0, 0, 0, 0)}),
-        ("scene.tilt", {"tilt_percent": 19.0, "area_m": (500, 80)}),
+        ("scene.too_low", {"tilt_percent": 19.0, "area_m": (900, 80)}),
         ("option.no_use", {"oblique_share": 0.5}),
     ],
 )
