@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.blocks import kept, row_numbers
-from pcfix.clean.neighbours import PIECE_ROWS, SLACK, Neighbours, height_quartiles, make_tiles
+from pcfix.clean.neighbours import PIECE_ROWS, SLACK, Neighbours, make_tiles
 from pcfix.errors import bad_file
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import LEAST_NEIGHBOURS, CleanRules
@@ -137,7 +137,8 @@ def flag_off_bed(cloud: Cloud, rules: CleanRules) -> None:
     see `CleanRules`. At least ``rules.bed_neighbours`` points are submerged.
     """
     for near, rows, xyz in _pieces(cloud.xyz, cloud.submerged, 2):
-        lower, upper = height_quartiles(near, xyz, rules.bed_neighbours).T
+        heights = near.tiles.xyz[:, 2][near.nearest(xyz, rules.bed_neighbours)[1]]
+        lower, upper = np.percentile(heights, (25, 75), axis=1)
         fence, z = rules.fences * (upper - lower), xyz[:, 2]
         for reason, least_m, off_m in (
             (Reason.BELOW_BED, rules.below, lower - z), (Reason.FLOATING, rules.floating, z - upper)

@@ -13,14 +13,7 @@ from pcfix.blocks import blocks, bounds, kept, mapped
 from pcfix.clean.neighbours import nearest_distance
 from pcfix.compare.m3c2 import m3c2_distances
 from pcfix.compare.match import Match, heights_at, mean_spacing_m
-from pcfix.compare.statistics import (
-    binned,
-    distribution_of,
-    fit_line,
-    own_of,
-    statistics_of,
-    tvu_of,
-)
+from pcfix.compare.statistics import binned, distribution_of, fit_line, statistics_of, tvu_of
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, plain
 from pcfix.grid.lattice import spacing_m
 from pcfix.model import FloatArray
@@ -98,7 +91,7 @@ def figures_of(
     whole, reference, rules = match.whole, match.reference, match.settings
     c2c, c2c_from_reference = found = c2c_of(match)
     notes = sparse_notes(match, *found)
-    pairs = vertical = own = residuals = None
+    pairs = vertical = residuals = None
     by_depth: dict[str, Any] = {
         "bed": None, "land": None,  # vertical errors of submerged places and of the others
         "depth": None,  # against reference depth, if water is known
@@ -109,11 +102,8 @@ def figures_of(
         pairs = _pairs(match)
         vertical = both(lambda p: distribution_of(p.error_m, BINS, (), TAIL_PERCENT), pairs)
         by_depth |= _by_depth(match, pairs, notes)
-        bed, after = by_depth["bed"], pairs.after
-        errors = vertical.after.statistics if bed is None else bed.after
-        of = "all" if bed is None else "bed"
-        own = own_of(errors, of, rules.sigma_reference, reference.kind)
         if reference.sparse:
+            after = pairs.after
             residuals = np.column_stack([after.xy, after.reference_m, after.error_m])
     also = []
     for name, other in others.items():
@@ -142,7 +132,6 @@ def figures_of(
         c2c_from_reference=c2c_from_reference,
         also=also,  # further clouds
         vertical=vertical,  # signed, along the vertical
-        own=own,  # of the bed, or of all, without the noise of the reference
         **by_depth,
         m3c2=_m3c2(match, pairs) if rules.m3c2 else None,
         sections=_sections(match, lines, others),

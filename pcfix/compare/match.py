@@ -72,11 +72,6 @@ class Reference:
     sparse: bool = False  # single check points, not a sampled surface
     raster: bool = False  # centres of cells
 
-    @property
-    def kind(self) -> str:
-        """Key of `SIGMA_REFERENCE_M`."""
-        return "table of check points" if self.sparse else "raster" if self.raster else "cloud"
-
 
 @dataclass(frozen=True, eq=False)
 class Match:

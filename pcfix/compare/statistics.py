@@ -10,7 +10,6 @@ import numpy as np
 from pcfix.blocks import blocks, grouped, mapped
 from pcfix.errors import SettingError
 from pcfix.model import FloatArray
-from pcfix.options.steps import SIGMA_REFERENCE_M
 from pcfix.refract.tally import share_of_orders, within_orders
 from pcfix.sums import Figures
 
@@ -64,25 +63,6 @@ def distribution_of(
     ]
     histogram = Figures(edges_m=edges.tolist(), counts=counts.tolist())
     return Figures(statistics=statistics_of(values), histogram=histogram, shares=shares)
-
-
-def own_of(s: Figures, of: str, stated_m: float | None, kind: str) -> Figures:
-    """Return errors, of the "bed" or of "all", without the noise of the reference, metres.
-
-    The bias stays as it is, and variances of independent errors add up. RMSE and 95 % bound, which
-    shrinks as the RMSE does, are None if the errors scatter no more than the reference, so that
-    nothing is known about the cloud's own share. The noise is `stated_m`, or the usual one of this
-    kind of reference.
-    """
-    sigma = SIGMA_REFERENCE_M[kind] if stated_m is None else stated_m
-    rmse = within = None
-    if not 0.0 < s.sd_m <= sigma:
-        rmse = math.sqrt(s.rmse_m**2 - min(sigma, s.sd_m) ** 2)
-        within = s.within_95_m * (rmse / s.rmse_m if s.rmse_m else 1.0)
-    return Figures(
-        of=of, sigma_reference_m=sigma, is_assumed=stated_m is None,
-        mean_m=s.mean_m, rmse_m=rmse, within_95_m=within,
-    )  # fmt: skip
 
 
 def tvu_of(error_m: FloatArray, depth_m: FloatArray) -> Figures:

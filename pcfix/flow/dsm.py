@@ -91,20 +91,17 @@ def grid_dsm(
     options, progress
         See `pcfix.correct_file`. The bounds of the raster are
         multiples of the resolution (m), by default that of `pcfix.grid.lattice.round_resolution`; a
-        point on an edge belongs to the cell east or north of it. The method "idw" weights points
-        around the centre with 1 / distance squared; "tin" uses Delaunay triangles, and fill is the
-        diameter of the widest circle without a point, by default five times the spacing of the
-        points and at least three cells. Withheld points and noise (classes 7 and 18) are not used.
-        The hillshade is uint8: 1 dark to 255 bright, nodata 0.
+        point on an edge belongs to the cell east or north of it. The method "tin" uses Delaunay
+        triangles, and fill is the diameter of the widest circle without a point, by default five
+        times the spacing of the points and at least three cells. Withheld points and noise (classes
+        7 and 18) are not used. The hillshade is uint8: 1 dark to 255 bright, nodata 0.
     """
     given = taken(DsmOptions, options, keywords, "grid_dsm")
     rules, files = given.part(DsmRules), cloud_of(input)
     named = {"hillshade": given.hillshade, "counts": given.counts}
     more = {name: Path(path) for name, path in named.items() if path is not None}
-    task = file_task(
-        files, output, given,
-        more=more.values(), check=rasters.check_tif, progress=progress,
-    )  # fmt: skip
+    how: dict[str, Any] = {"more": more.values(), "check": rasters.check_tif}
+    task = file_task(files, output, given, progress=progress, **how)
     style = task.target.with_suffix(".qml")
     if given.style:
         check_output(style, overwrite=given.overwrite, inputs=inputs_of(files))
@@ -137,9 +134,8 @@ def grid_dsm(
             warnings.warn(PcfixWarning("dsm.fine", sentence, spacing_m=apart_m), stacklevel=2)
         tiles = make_tiles(used, points=BIN_POINTS)
         # the widest circle around a triangle
-        reach_m = max(
-            TIN_REACH_SPACINGS * apart_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
-        )
+        reach = TIN_REACH_SPACINGS * apart_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
+        reach_m = max(reach)
         # a cloud optimised file is a copy, with overviews of its own
         paths = {name: folder / f"{name}.tif" if given.cog else drafts[name] for name in drafts}
         tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
@@ -171,7 +167,6 @@ def grid_dsm(
         hole_m=reach_m if rules.method == "tin" else rules.fill,  # widest hole that was bridged
         settings=asdict(rules),
         seconds=task.seconds,
-        resolution_is="given" if given.resolution else "chosen",
         part=part_report(task.source),
     )
     write_summary(given, result.as_dict())
@@ -196,7 +191,7 @@ def _write_rasters(
     size_m, method = rules.cell_m, rules.method
     reach, spacing = reach_m / size_m, apart_m / size_m
     # the number of cells around a window whose points decide on it
-    beyond = {"tin": int(np.ceil(reach)) + 1, "idw": 1}.get(method, 0)
+    beyond = int(np.ceil(reach)) + 1 if method == "tin" else 0
     plan = None if crs is None else parts(crs)[0]
     unit = METRE if rules.what == "height" or rules.what in DIMENSIONS else ""
     new = partial(rasters.new_raster, lattice=lattice, tags={"PCFIX": json.dumps(tags)})
@@ -242,7 +237,7 @@ def _write_rasters(
         with rasters.open_raster(paths["dsm"]) as heights, shade as out:
             for window in lattice.window.parts(BLOCK_CELLS):
                 height = rasters.read_within(heights, window.grown(1))
-                light = hillshade(height, size_m, rules.azimuth, rules.altitude)
+                light = hillshade(height, size_m)
                 rasters.write_part(out, light, window, 1)
     found = {"min": low, "mean": total / count, "max": high} if count else {}
     return {
@@ -309,12 +304,9 @@ def _dimension_of(source: LasSource, what: str) -> str | None:
     names = list(source.header.point_format.dimension_names)
     if name is None or name in names:
         return name
+    sentence = f"has no dimension {name}, which --what {what} needs."
     if what in DIMENSIONS:
-        sentence = (
-            f"has no dimension {name}, which --what {what} needs. Correct the cloud first, with"
-            " --dimensions all."
-        )
+        sentence += " Correct the cloud first, with --dimensions all."
         raise bad_file(source.path, "cloud.no_dimension", sentence, dimension=name)
-    known = ", ".join(("height", *DIMENSIONS, *names))
-    sentence = f"{source.path}: has no dimension {what}. --what is one of {known}."
-    raise SettingError("option.choice", sentence, option="what", value=what)
+    sentence += f" --what is one of {', '.join(('height', *DIMENSIONS, *names))}."
+    raise SettingError("option.choice", f"{source.path}: {sentence}", option="what", value=what)

@@ -38,7 +38,6 @@ BED, DEPTH, UNCERTAINTY = "bed.tif", "depth.tif", "uncertainty.tif"
 COUNTS, SHADED, CORRECTED = "surface_counts.tif", "shaded.tif", "corrected.tif"
 HOLE_CELLS = 3.0
 """Width of holes that are filled: of cells with random points, one in twenty is empty."""
-SUN_DEG = 315.0, 45.0
 MOST_CELLS = 4_000_000
 """Of the rasters for contours and outline."""
 SECTIONS = 3
@@ -117,8 +116,8 @@ def _write_shaded(folder: Path) -> None:
                 is_wet = np.isnan(deep) & (height < level) & np.isfinite(level)
                 deep = np.where(is_wet, level - height, deep)[edge:-edge, edge:-edge]
                 around = height[edge - 1 : 1 - edge, edge - 1 : 1 - edge]
-                light = hillshade(around, lattice.resolution_m, *SUN_DEG)
-                colours = relief_colours(light, deep, high, flat=np.sin(np.radians(SUN_DEG[1])))
+                light = hillshade(around, lattice.resolution_m)
+                colours = relief_colours(light, deep, high)
                 for number, band in enumerate(colours, start=1):
                     rasters.write_part(out, band, window, number)
         rasters.copy_as_cog(plain, draft)

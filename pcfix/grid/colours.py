@@ -33,20 +33,23 @@ def stops_of(ramp: str, steps: int = 9) -> list[tuple[float, tuple[int, ...]]]:
 LAND = (214, 205, 188)
 DARKEST = 0.35
 """Share of the colour without light."""
+SUN = np.array([-0.5, 0.5, 0.5**0.5])
+"""Direction of the sun, east, north and up: in the north-west, 45 degrees above the horizon."""
+NO_LIGHT = 0
+"""Value of cells without a height."""
 
 
 def relief_colours(
-    light: npt.NDArray[np.uint8], depth_m: FloatArray, deepest_m: float, *, flat: float
+    light: npt.NDArray[np.uint8], depth_m: FloatArray, deepest_m: float
 ) -> npt.NDArray[np.uint8]:
     """Return red, green, blue and alpha, shape (4, rows, columns), of a shaded bed and its land.
 
-    `light`, shape (rows, columns), is that of `hillshade`; level ground has the
-    share `flat` of it and keeps its colour. Depths are NaN on land; `deepest_m` has the last colour
-    of the ramp.
+    `light`, shape (rows, columns), is that of `hillshade`; level ground keeps its colour. Depths
+    are NaN on land; `deepest_m` has the last colour of the ramp.
     """
     stops = stops_of(DEPTH, 33)
     at = np.array([share for share, _ in stops]) * deepest_m
-    lit = DARKEST + (1.0 - DARKEST) * (light - 1.0) / 254.0 / flat
+    lit = DARKEST + (1.0 - DARKEST) * (light - 1.0) / 254.0 / SUN[2]
     colours = [
         np.where(np.isnan(depth_m), land, np.interp(np.nan_to_num(depth_m), at, ramp))
         for land, ramp in zip(LAND, np.array([colour for _, colour in stops]).T, strict=True)
@@ -56,19 +59,12 @@ def relief_colours(
     return np.where(alpha > 0, [*bands, alpha], 0).astype(np.uint8)
 
 
-NO_LIGHT = 0
-"""Value of cells without a height."""
-
-
-def hillshade(
-    height: FloatArray, resolution_m: float, azimuth_deg: float, altitude_deg: float
-) -> npt.NDArray[np.uint8]:
+def hillshade(height: FloatArray, resolution_m: float) -> npt.NDArray[np.uint8]:
     """Return the brightness of each cell, 1 (dark) to 255; `NO_LIGHT` without a height.
 
     The slope of a cell comes from its eight neighbours, the four nearest counting twice (B. K. P.
     Horn, Hill shading and the reflectance map, 1981); the light is the cosine of the angle between
-    the normal and the direction of the sun, given by its azimuth clockwise from north and its
-    altitude above the horizon. A neighbour without a height gets the cell's own.
+    the normal and `SUN`. A neighbour without a height gets the cell's own.
 
     Heights have the shape (rows + 2, columns + 2), metres, NaN if unknown, with a margin of one
     cell; the first row is the northernmost. The result has the shape (rows, columns).
@@ -85,10 +81,7 @@ def hillshade(
     north = near(-1, -1) + 2.0 * near(-1, 0) + near(-1, 1)
     south = near(1, -1) + 2.0 * near(1, 0) + near(1, 1)
     slope_x, slope_y = (east - west) / (8.0 * resolution_m), (north - south) / (8.0 * resolution_m)
-    azimuth, altitude = np.radians(azimuth_deg), np.radians(altitude_deg)
-    sun_x, sun_y = np.sin(azimuth) * np.cos(altitude), np.cos(azimuth) * np.cos(altitude)
-    cosine = (np.sin(altitude) - sun_x * slope_x - sun_y * slope_y) / np.sqrt(
-        1.0 + slope_x**2 + slope_y**2
-    )
+    cosine = SUN[2] - SUN[0] * slope_x - SUN[1] * slope_y
+    cosine /= np.sqrt(1.0 + slope_x**2 + slope_y**2)
     light = np.rint(1.0 + 254.0 * np.clip(cosine, 0.0, 1.0))
     return np.where(np.isnan(own), NO_LIGHT, light).astype(np.uint8)

@@ -33,7 +33,7 @@ MIN_RESOLUTION_M = 1e-4
 LEAST_PLANE_POINTS, PLANE_POINTS = 6, 8
 """Reference points of each plane of a comparison: the fewest allowed, and the default."""
 
-DsmMethod = Literal["mean", "median", "min", "max", "idw", "tin"]
+DsmMethod = Literal["mean", "median", "min", "max", "tin"]
 SurfaceChoice = Literal["all", "bed"]
 
 
@@ -124,10 +124,6 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
     """Grid land and bed without noise, or only the bed (class 40)."""
     fill: float | None = option(None, above=0)
     """Fill holes up to this width; they get count 0. [m]"""
-    azimuth: float = option(315.0)
-    """Azimuth of the sun in the hillshade, clockwise from north. [deg]"""
-    altitude: float = option(45.0, above=0, most=90)
-    """Altitude of the sun in the hillshade, above the horizon. [deg]"""
 
     @property
     def cell_m(self) -> float:
@@ -165,7 +161,7 @@ class DsmOptions(PartOptions, OverwriteOption, SummaryOption, DsmRules, panel=Pa
     """The options of ``pcfix dsm``."""
 
     hillshade: File | None = option(None, writes=True)
-    """GeoTIFF for a hillshade."""
+    """GeoTIFF for a hillshade, lit from the north-west."""
     counts: File | None = option(None, writes=True)
     """GeoTIFF for the number of points in each cell, and their spread."""
     style: bool = option(False)
@@ -177,10 +173,6 @@ class DsmOptions(PartOptions, OverwriteOption, SummaryOption, DsmRules, panel=Pa
 LAYERS = ("water", "apparent", "corrected", "reference")
 """Names of the lines of a cross-section; other clouds must have other names."""
 _NAME = re.compile(r"[\w .+-]*\w[\w .+-]*")
-
-
-SIGMA_REFERENCE_M = {"cloud": 0.03, "raster": 0.03, "table of check points": 0.02}
-"""Assumed standard deviation of a height by kind of reference: LiDAR on hard ground, RTK."""
 
 
 def _bands(given: Any) -> tuple[tuple[float, ...], ...]:
@@ -240,9 +232,6 @@ class DistanceOptions(OptionSet, panel=Panel.FIGURES):
         (), basic=True, then=_named_clouds, needs="reference", metavar="NAME=CLOUD"
     )
     """Another cloud for the C2C table and the cross-sections; may be repeated."""
-    sigma_reference: float | None = option(None, least=0, needs="reference")
-    """Standard deviation of a height of the reference, which is removed from the errors of the
-    cloud. [m] [default: 0.03 of a cloud, 0.03 of a raster, 0.02 of a table of check points]"""
 
     @property
     def from_reference(self) -> bool:

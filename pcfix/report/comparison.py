@@ -87,9 +87,9 @@ def signed_statistics(compared: Plain) -> list[tuple[str, Plain]]:
     return [(one.name, one.found.get("statistics", one.found)) for one in signed]
 
 
-def raw_of(compared: Plain) -> Plain:
-    """Return the statistics that the cloud's own errors were taken from, before and after."""
-    if compared["own"]["of"] == "bed":
+def measured_of(compared: Plain) -> Plain:
+    """Return the statistics of the vertical errors of the bed, or else of all, before and after."""
+    if compared["bed"] is not None:
         return dict(compared["bed"])
     return {when: of and of["statistics"] for when, of in compared["vertical"].items()}
 
@@ -112,11 +112,6 @@ def comparison_text(c: Comparison) -> str:
     if n.reference_compared:
         of = share(n.reference_compared, in_reference)
         rows.append(("C2C from", f"{n.reference_compared:,} points of the reference ({of})"))
-    if (own := plain["own"]) is not None:
-        noise = noise_sentence(own, raw_of(plain)["after"])
-        if own["rmse_m"] is not None:
-            noise = f"RMSE {own['rmse_m']:.3f} m, 95 % within {own['within_95_m']:.3f} m; {noise}"
-        rows.append(("Bed" if own["of"] == "bed" else "Cloud", noise))
     if c.m3c2 is not None:
         m = c.m3c2.after
         rows.append(("M3C2", f"{m.statistics.count:,} of {m.core_points:,} core points, normals"
@@ -127,16 +122,6 @@ def comparison_text(c: Comparison) -> str:
     tables = [line for table in _tables(plain) for line in ("", *table.lines())]
     notes = [wrapped("", f"Note: {note}") for note in c.notes]
     return "\n".join([aligned(head, rows), *tables, *notes])
-
-
-def noise_sentence(own: Plain, raw: Plain) -> str:
-    """Return how the noise of the reference changes the errors of the cloud."""
-    source = "assumed" if own["is_assumed"] else "stated"
-    noise = f"the noise of the reference ({own['sigma_reference_m']:.3f} m, {source})"
-    if own["rmse_m"] is None:
-        return f"the differences scatter no more than {noise}, so the cloud's error is not known."
-    with_it = f"RMSE {raw['rmse_m']:.3f} m, 95 % within {raw['within_95_m']:.3f} m"
-    return f"{noise} is subtracted; with it {with_it}."
 
 
 def signed(value_m: float) -> str:

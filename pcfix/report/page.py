@@ -286,7 +286,7 @@ def map_json(lattice: Lattice, height_m: FloatArray, layers: Sequence[Layer]) ->
 def relief(height_m: FloatArray, cell_m: float) -> FloatArray:
     """Return the shade of a surface lit from the north-west, 45 degrees up, 0 to 1."""
     smooth = np.pad(smoothed(height_m, SMOOTH_CELLS), 1, constant_values=np.nan)
-    light = hillshade(smooth, cell_m, 315.0, 45.0)
+    light = hillshade(smooth, cell_m)
     return np.where(light == NO_LIGHT, np.nan, (light - 1.0) / 254.0)
 
 

@@ -15,7 +15,7 @@ from pcfix.grid.lattice import Lattice
 from pcfix.grid.maps import contours, depth_interval
 from pcfix.model import Cameras, FloatArray
 from pcfix.refract.tally import ORDERS, largest_tvu_m
-from pcfix.report.comparison import noise_sentence, raw_of, signed
+from pcfix.report.comparison import measured_of, signed
 from pcfix.report.page import (
     AFTER,
     BEFORE,
@@ -45,8 +45,9 @@ Pair = tuple[str, str]
 FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras")
 """Those that are shown where they are there, the first four of them."""
 SHOWN_NOTES = 3
-CONTRADICTS = 1.5
-"""Measured and predicted errors that differ by a larger factor contradict each other."""
+CONTRADICTS, REFERENCE_M = 1.5, 0.03
+"""Measured errors contradict smaller predicted ones by this factor; the latter include the noise of
+LiDAR on hard ground."""
 BESIDE_MAP = ("Submerged", "Cameras", "Water", "")
 """Labels of the rows that are also shown beside the map."""
 UNKNOWN_DATUM = "vertical datum not known"
@@ -254,7 +255,7 @@ def tvu_figure(depth_m: FloatArray, tvu_m: FloatArray, measured: Sequence[Plain]
 
 def accuracy_tile(s: Summary, compared: Plain) -> Tile:
     """Return the accuracy of the bed: measured where there is a reference, else predicted."""
-    if not compared.get("own"):
+    if not compared:
         title, unknown = "Accuracy of the bed", "not known"
         if s.uncertainty is None:
             why = "There is no reference, and the points have no standard errors."
@@ -269,48 +270,40 @@ def accuracy_tile(s: Summary, compared: Plain) -> Tile:
             " bias."
         )
         return Tile(title, "predicted", figures, [why])
-    own, pair = compared["own"], raw_of(compared)
-    raw, before = pair["after"], pair["before"]
-    known = raw if own["rmse_m"] is None else own
-    noise = noise_sentence(own, raw)
+    after, before = measured_of(compared)["after"], measured_of(compared)["before"]
     notes = [
-        f"At {raw['count']:,} points against {name_of(compared['reference'])}"
-        + (f"; before the correction, RMSE {before['rmse_m']:.3f} m." if before else "."),
-        noise[:1].upper() + noise[1:],
+        f"At {after['count']:,} points against {name_of(compared['reference'])}, whose noise is"
+        " included"
+        + (f"; before the correction, RMSE {before['rmse_m']:.3f} m." if before else ".")
     ]
-    if own["of"] == "bed" and compared["land"]:
+    if compared["land"]:
         land = compared["land"]["after"]
-        notes.append(
-            f"Land: bias {signed(land['mean_m'])}, RMSE {land['rmse_m']:.3f} m, reference included."
-        )
+        notes.append(f"Land: bias {signed(land['mean_m'])}, RMSE {land['rmse_m']:.3f} m.")
     figures = [
-        ("bias", signed(own["mean_m"])), ("RMSE", f"{known['rmse_m']:.3f} m"),
-        ("95 % within", f"{known['within_95_m']:.3f} m"),
+        ("bias", signed(after["mean_m"])), ("RMSE", f"{after['rmse_m']:.3f} m"),
+        ("95 % within", f"{after['within_95_m']:.3f} m"),
     ]  # fmt: skip
-    of = "bed" if own["of"] == "bed" else "cloud (bed and land are not separated)"
+    of = "bed" if compared["bed"] else "cloud (bed and land are not separated)"
     return Tile(f"Accuracy of the {of}", "measured", figures, notes)
 
 
 def notes_of(s: Summary, heights: str, compared: Plain) -> list[str]:
     """Return what to check, the most important first; `heights` is the vertical datum."""
     notes = []
-    if not compared.get("own"):
+    if not compared:
         notes.append("No reference: the accuracy is predicted. Check points on the bed measure it.")
-    elif compared.get("bed"):
-        after, noise = compared["bed"]["after"], compared["own"]["sigma_reference_m"]
-        if s.uncertainty is not None and after["count"] >= FEWEST:
-            sigma, measured = s.uncertainty["sigma_z_m"]["mean"], after["rmse_m"]
-            expected = (sigma**2 + noise**2) ** 0.5
-            if not 1.0 / CONTRADICTS <= measured / expected <= CONTRADICTS:
-                is_larger = measured > expected
+    elif compared["bed"]:
+        after, known = compared["bed"]["after"], s.uncertainty is not None
+        if known and after["count"] >= FEWEST:
+            expected = float(np.hypot(s.uncertainty["sigma_z_m"]["mean"], REFERENCE_M))
+            if after["rmse_m"] > CONTRADICTS * expected:
                 notes.append(
-                    f"The measured errors of the bed are {'larger' if is_larger else 'smaller'}"
-                    f" than the predicted ones (RMSE {measured:.3f} m, predicted {expected:.3f} m"
-                    " with the noise of the reference):"
-                    f" {'use the measured ones' if is_larger else 'the prediction is cautious'}."
+                    "The measured errors of the bed are larger than the predicted ones (RMSE"
+                    f" {after['rmse_m']:.3f} m, predicted {expected:.3f} m with the noise of the"
+                    " reference): use the measured ones."
                 )
         bias = after["mean_m"]
-        if abs(bias) > max(after["sd_m"], noise):
+        if abs(bias) > max(after["sd_m"], REFERENCE_M):
             notes.append(
                 f"The bed is too {'high' if bias > 0.0 else 'low'} by {abs(bias):.3f} m on average,"
                 " more than it scatters. Check water level, refractive index, vertical datum and"

@@ -124,7 +124,7 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
             " ({is_bed:?bed, class 40|land and bed}) in {seconds:.1f} s", (
         *_PART,
         ("Raster", "{width:,} x {height:,} cells of {settings[resolution]:g} m"
-         "{is_chosen:?, chosen for 2 to 4 points each|}, {settings[method]}", ""),
+         " ({settings[method]})", ""),
         ("Values", "{what} {values[min]:.4g} to {values[max]:.4g}, mean {values[mean]:.4g}"
          "{is_tvu:? m at 95 % (predicted)|}", "values"),
         ("Bounds", "x {bounds_m[0]:.10g} to {bounds_m[2]:.10g}, y {bounds_m[1]:.10g} to"
@@ -268,7 +268,7 @@ def text_of(command: str, found: Figures) -> str:
     if command == "dsm":
         s |= {
             "all": s["width"] * s["height"], "is_bed": s["settings"]["surface"] == "bed",
-            "is_chosen": s["resolution_is"] == "chosen", "is_tvu": s["what"] == "uncertainty",
+            "is_tvu": s["what"] == "uncertainty",
             "crs_name": s["crs"] or "the cloud states none",
             "heights_name": s["heights"] or "the cloud states no vertical datum",
         }  # fmt: skip

@@ -168,9 +168,9 @@ OF_CLEAN = {
     "nothing": "--no-statistical --no-weak --no-below --no-floating",
 }
 OF_DSM = {
-    **{m: f"--method {m}" for m in ("mean", "median", "min", "max", "idw", "tin")},
+    **{m: f"--method {m}" for m in ("mean", "median", "min", "max", "tin")},
     "bed": "--surface bed --fill 3 --cog",
-    "hillshade": "--hillshade shade.tif --azimuth 200 --altitude 30",
+    "hillshade": "--hillshade shade.tif",
 }
 SECTION = "--section 410200,4650340,410320,4650340 --sections 2 --corridor 2"
 OF_COMPARE = {

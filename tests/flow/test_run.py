@@ -216,7 +216,7 @@ def test_other_request(copied):
     ("more", "first"),
     [
         (["--project", "Lake <2>", "--date", "2024-06-01"], "report"),
-        pytest.param(["--sigma-reference", "0.05"], "compare", marks=pytest.mark.nightly),
+        pytest.param(["--share", "0,0.5"], "compare", marks=pytest.mark.nightly),
         (["--resolution", "2"], "dsm"),
     ],
 )

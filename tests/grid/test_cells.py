@@ -15,7 +15,7 @@ from tests.utils.rasters import read_raster
 
 pytestmark = pytest.mark.quick_but("test_every_cell")
 
-METHODS = ("mean", "median", "min", "max", "idw", "tin")
+METHODS = ("mean", "median", "min", "max", "tin")
 
 FLOAT32_M = 2e-6
 """Heights reach 30 m; half the distance of neighbouring float32 numbers there is 1e-6 m."""
@@ -93,6 +93,5 @@ def test_hillshade():
     height[rng.random(height.shape) < 0.2] = np.nan
     around = np.full((11, 13), np.nan)
     around[1:-1, 1:-1] = height
-    for azimuth, altitude in ((315.0, 45.0), (20.0, 10.0), (180.0, 90.0)):
-        light = hillshade(around, 0.5, azimuth, altitude)
-        np.testing.assert_array_equal(light, slow_hillshade(height, 0.5, azimuth, altitude))
+    light = hillshade(around, 0.5)
+    np.testing.assert_array_equal(light, slow_hillshade(height, 0.5, 315.0, 45.0))
