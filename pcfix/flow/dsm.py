@@ -23,7 +23,6 @@ from pcfix.clean.neighbours import Tiles as PointTiles
 from pcfix.clean.neighbours import make_tiles
 from pcfix.errors import PcfixWarning, SettingError, bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
-from pcfix.grid.colours import NO_LIGHT, hillshade
 from pcfix.grid.heights import fill_holes, grid_window, margin_cells
 from pcfix.grid.lattice import Lattice, lattice_over, round_resolution, spacing_m
 from pcfix.io import rasters
@@ -94,12 +93,11 @@ def grid_dsm(
         point on an edge belongs to the cell east or north of it. The method "tin" uses Delaunay
         triangles, and fill is the diameter of the widest circle without a point, by default five
         times the spacing of the points and at least three cells. Withheld points and noise (classes
-        7 and 18) are not used. The hillshade is uint8: 1 dark to 255 bright, nodata 0.
+        7 and 18) are not used.
     """
     given = taken(DsmOptions, options, keywords, "grid_dsm")
     rules, files = given.part(DsmRules), cloud_of(input)
-    named = {"hillshade": given.hillshade, "counts": given.counts}
-    more = {name: Path(path) for name, path in named.items() if path is not None}
+    more = {} if given.counts is None else {"counts": Path(given.counts)}
     how: dict[str, Any] = {"more": more.values(), "check": rasters.check_tif}
     task = file_task(files, output, given, progress=progress, **how)
     style = task.target.with_suffix(".qml")
@@ -150,7 +148,6 @@ def grid_dsm(
     result = Figures(
         input=str(task.source),
         output=str(task.target),
-        hillshade=None if given.hillshade is None else str(given.hillshade),
         counts=None if given.counts is None else str(given.counts),
         what=rules.what,
         pcfix=__version__,
@@ -184,7 +181,7 @@ def _write_rasters(
     tags: dict[str, Any],
     report: Callable[[float], None],
 ) -> dict[str, Any]:
-    """Write the raster, and hillshade and counts where they have a path.
+    """Write the raster, and the counts if they have a path.
 
     Returns the numbers of cells and the statistics of their values, by their names in the summary.
     """
@@ -230,15 +227,6 @@ def _write_rasters(
             low, high = values.min(initial=low), values.max(initial=high)
             done += height.size
             report(0.5 + 0.5 * done / (lattice.height * lattice.width))
-    if "hillshade" in paths:
-        shade = rasters.new_raster(
-            paths["hillshade"], lattice, plan, {"hillshade": ""}, dtype="uint8", nodata=NO_LIGHT
-        )
-        with rasters.open_raster(paths["dsm"]) as heights, shade as out:
-            for window in lattice.window.parts(BLOCK_CELLS):
-                height = rasters.read_within(heights, window.grown(1))
-                light = hillshade(height, size_m)
-                rasters.write_part(out, light, window, 1)
     found = {"min": low, "mean": total / count, "max": high} if count else {}
     return {
         "cells": cells,  # with points

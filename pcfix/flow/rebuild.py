@@ -22,12 +22,11 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
-from pcfix.flow.compare import compare_clouds
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.photos import PhotoBlock, block_of, finished, map_photos, open_record
 from pcfix.flow.runner import Progress, check_summary, json_text, key_of
 from pcfix.io.clouds import is_cloud
-from pcfix.io.files import check_input, run_logged, write_text
+from pcfix.io.files import run_logged, write_text
 from pcfix.io.las.writing import write_points
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.io.rasters import open_raster, place_of, read_masked, write_dod
@@ -43,7 +42,7 @@ RECORD = "pcfix-rebuild.json"
 STEREO_CELL_PIXELS = 2.0
 STEREO_STEP_M = 0.001
 CACHED_PHOTOGRAPHS = 16
-COMMAND_ONLY = ("overwrite", "jobs", "summary", "rebuild", "until_gsd", "most_rounds", "reference")
+COMMAND_ONLY = ("overwrite", "jobs", "summary", "rebuild", "until_gsd", "most_rounds")
 """Options that a later call may change and still resume."""
 
 
@@ -80,19 +79,16 @@ def rebuild_rounds(
         raise SettingError("option.missing", sentence, option="rebuild")
     paths, target = photographs_in(Path(images)), Path(out)
     check_summary(given)
-    if given.reference is not None:
-        check_input(given.reference)
     target.mkdir(parents=True, exist_ok=True)
     folders = list(target.glob("round[0-9]*"))
     while given.overwrite and folders:
         shutil.rmtree(folders.pop())
     record = open_record(target / RECORD, key_of("rebuild", given, ignored=COMMAND_ONLY), folders)
     record.setdefault("rounds", [])
-    start = str(given.dsm) if is_cloud(Path(given.dsm)) else None
-    if start is not None:  # a cloud is gridded to the folder
+    if is_cloud(Path(given.dsm)):  # it is gridded to the folder
         raster = target / "dsm.tif"
         if not (folders and raster.exists()):
-            grid_dsm(start, raster, resolution=given.resolution, overwrite=True)
+            grid_dsm(given.dsm, raster, resolution=given.resolution, overwrite=True)
         given = replace(given, dsm=raster, resolution=None)
     with threads(given.jobs), TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))
@@ -124,16 +120,6 @@ def rebuild_rounds(
                 f"Round {number}: the bed moved by {one.mean_m:+.3f} m (standard deviation"
                 f" {one.sd_m:.3f} m), {100 * one.within_gsd:.0f} % of it by at most one pixel"
             )
-    compared = None
-    if given.reference is not None:
-        # Figs 16, 18 and 20 of the paper; with the first cloud also 15 and 17
-        also = {} if start is None else {"round0": start}
-        also |= {f"round{k}": one.cloud for k, one in enumerate(rounds[:-1], start=1)}
-        compared = str(target / "compare")
-        compare_clouds(
-            rounds[-1].cloud, given.reference, water=given.water, submerged=True, out_dir=compared,
-            also=also, overwrite=True,
-        )  # fmt: skip
     return finished(
         given,
         started,
@@ -145,7 +131,6 @@ def rebuild_rounds(
         threshold_m=threshold_m,
         mapping=given.mapping,
         rebuild=str(given.rebuild),
-        compared=compared,  # folder, where a reference was given
     )
 
 

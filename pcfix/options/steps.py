@@ -160,8 +160,6 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
 class DsmOptions(PartOptions, OverwriteOption, SummaryOption, DsmRules, panel=Panel.OUTPUT):
     """The options of ``pcfix dsm``."""
 
-    hillshade: File | None = option(None, writes=True)
-    """GeoTIFF for a hillshade, lit from the north-west."""
     counts: File | None = option(None, writes=True)
     """GeoTIFF for the number of points in each cell, and their spread."""
     style: bool = option(False)
@@ -347,8 +345,6 @@ class RebuildOptions(OptionSet, panel=Panel.ROUNDS):
     """Stop if the mean change of the bed is less than this many ground pixels."""
     most_rounds: int = option(4, least=1)
     """Maximum number of rounds."""
-    reference: File | None = option(None, basic=True, needs="rebuild")
-    """Reference to compare the clouds of all rounds with, in OUT/compare; see 'pcfix compare'."""
 
 
 class PhotosOptions(

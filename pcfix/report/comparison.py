@@ -6,6 +6,7 @@ earlier one measured. The terminal and the page show the same tables.
 
 from __future__ import annotations
 
+from itertools import cycle
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from pcfix.compare.figures import Comparison
 
 TIMES = (("before", "uncorrected", BEFORE), ("after", "corrected", AFTER))
+NAMES = {"apparent": "uncorrected"}
 FURTHER = ("#6a3d9a", "#33804d", "#c51b7d", "#8c6d1f", "#5f6b73")
 """Colours of further clouds, in turn."""
 KINDS = {
@@ -47,8 +49,6 @@ KINDS = {
 MOMENTS = {
     "mean": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m", "median": "median_m",
 }  # fmt: skip
-SHOWN = 0.995
-"""The share of the distances of each histogram of C2C up to which the axis reaches at least."""
 
 
 class Errors(NamedTuple):
@@ -144,15 +144,14 @@ def _tables(compared: Plain) -> list[Table]:
     title = f"Against {name_of(compared['reference'])} (m)"
     tables = [Table(title, ["", "points", *MOMENTS, "5 %", "95 %", "max"], rows)]
 
-    header, rows = [], []
+    header, rows = [""], []
     for one in errors_of(compared, "c2c", "c2c_from_reference"):
         s, bands = one.found["statistics"], one.found["shares"]
-        header = [f"{band['low_m']:g} to {band['high_m']:g} m" for band in bands]
-        shares = [f"{100 * band['share']:.1f} %" for band in bands]
+        header = ["", "mean (m)", "std.dev. (m)", "classes"]
+        header += [f"{band['low_m']:g} to {band['high_m']:g} m" for band in bands]
         classes = str(len(one.found["histogram"]["counts"]))
-        figures = [f"{s['mean_m']:.6f}", f"{s['sd_m']:.6f}", classes]
-        rows.append([f"{one.title}, {one.cloud}", *figures, *shares])
-    header = ["", "mean (m)", "std.dev. (m)", "classes", *header]
+        row = [f"{one.title}, {one.cloud}", f"{s['mean_m']:.6f}", f"{s['sd_m']:.6f}", classes]
+        rows.append([*row, *(f"{100 * band['share']:.1f} %" for band in bands)])
     tables.append(Table("C2C, normal distribution", header, rows))
 
     rows = [
@@ -220,17 +219,12 @@ def evaluation(
 
 def c2c_figure(compared: Plain) -> Figure:
     """Draw the histograms of all C2C: a column a direction, a row a cloud, one axis."""
-    columns = [errors_of(compared, kind) for kind in ("c2c", "c2c_from_reference")]
-    columns = [one for one in columns if one]
+    both = (errors_of(compared, kind) for kind in ("c2c", "c2c_from_reference"))
+    columns = [one for one in both if one]
     figure = _histograms(columns, "Distance to the nearest point (m)", sharex=True)
-    reach = 0.0
-    for column in columns:
-        for one in column:
-            # the upper edge of the class in which the last of the distances shown lies
-            up_to = np.cumsum(one.found["histogram"]["counts"])
-            last = int(np.searchsorted(up_to, SHOWN * up_to[-1]))
-            reach = max(reach, one.found["histogram"]["edges_m"][1 + last])
-    figure.axes[0].set_xlim(0.0, reach)
+    # nearly all distances, but not the outliers
+    ends = [one.found["statistics"]["percentiles_m"]["p95"] for some in columns for one in some]
+    figure.axes[0].set_xlim(0.0, 1.5 * max(*ends, 1e-6))
     return figure
 
 
@@ -279,18 +273,13 @@ def _section(number: int, section: Plain) -> Picture:
     """Draw the heights along a line."""
     figure, axes = new_figure(8.0, 4.0)
     heights, further = section["heights_m"], [n for n in section["heights_m"] if n not in LAYERS]
-    looks: dict[str, dict[str, Any]] = {
-        "water": {"color": WATER, "linewidth": 1.2},
-        "reference": {"color": REFERENCE, "linewidth": 2.5, "alpha": 0.45},
-        "apparent": {"color": BEFORE, "linestyle": "--", "label": "uncorrected"},
-        "corrected": {"color": AFTER},
-    }
-    for place, name in enumerate(further):
-        looks[name] = {"color": FURTHER[place % len(FURTHER)], "linewidth": 1.0}
-    for name, look in looks.items():
+    colours = {"water": WATER, "reference": REFERENCE, "apparent": BEFORE, "corrected": AFTER}
+    colours |= dict(zip(further, cycle(FURTHER), strict=False))
+    for name, colour in colours.items():
         if name in heights:
-            line = np.array(heights[name], float)
-            axes.plot(section["distance_m"], line, **{"label": name} | look)
+            line, label = np.array(heights[name], float), NAMES.get(name, name)
+            width = 2.5 if name == "reference" else 1.2  # it lies under the others
+            axes.plot(section["distance_m"], line, color=colour, linewidth=width, label=label)
     axes.set(xlabel="Distance along the line (m)", ylabel="Height (m)")
     axes.legend(loc="best")
     alt = (

@@ -134,7 +134,6 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
         ("", "{filled:,} interpolated ({filled:of all}), across holes up to {hole_m:.3g} m",
          "hole_m"),
         ("", "{empty:,} empty ({empty:of all})", ""),
-        ("Hillshade", "{hillshade}", "hillshade"),
         ("Counts", "{counts}", "counts"),
     )),
     "calm": ("Combined {input} -> {output}      {frames} frames of {columns:,} x {rows:,} pixels in"
@@ -162,7 +161,6 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
         ("Result", "{settled:?settled|not settled}: the last round moved the bed by"
          " {settled:?less|more} than {threshold_m:.3f} m on average", ""),
         ("Cloud", "{last[cloud]}", ""),
-        ("Compared", "{compared}", "compared"),
     )),
     "ortho": ("Orthophoto {output} in {seconds:.1f} s", (
         ("Raster", "{width:,} x {height:,} cells of {resolution_m:g} m", ""),

@@ -312,7 +312,7 @@ def tiled(tmp_path_factory):
 
 def without_names(value):
     """Return plain values without those of a call, and words without the names of files."""
-    own = ("seconds", "input", "output", "hillshade", "counts")
+    own = ("seconds", "input", "output", "counts")
     own += ("cloud", "reference")
     if isinstance(value, dict):
         return {name: without_names(one) for name, one in value.items() if name not in own}

@@ -45,11 +45,10 @@ def test_no_seams(awkward_cloud, tmp_path, monkeypatch, method, fill):
     """Chunks, squares of the store and windows of any size give the same raster, bit by bit."""
 
     def run(name):
-        shade = tmp_path / f"{name}_shade.tif"
-        files = {"hillshade": shade, "counts": tmp_path / f"{name}_counts.tif"}
-        options = {"resolution": 0.3, "method": method, "fill": fill, **files}
-        grid_dsm(awkward_cloud, tmp_path / f"{name}.tif", **options)
-        return [read_raster(one).array for one in (tmp_path / f"{name}.tif", *files.values())]
+        files = tmp_path / f"{name}.tif", tmp_path / f"{name}_counts.tif"
+        options = {"resolution": 0.3, "method": method, "fill": fill, "counts": files[1]}
+        grid_dsm(awkward_cloud, files[0], **options)
+        return [read_raster(one).array for one in files]
 
     whole = run("whole")
     for name, sizes in SIZES.items():
@@ -147,12 +146,9 @@ def test_chosen_resolution(tmp_path):
 @pytest.mark.parametrize("cog", [False, True])
 def test_file(tmp_path, cog):
     cloud = write(tmp_path / "cloud.laz", scattered(20_000, 80.0, 70.0), crs="EPSG:32633+5773")
-    shade = tmp_path / "shade.tif"
     with pytest.warns(PcfixWarning):  # finer than the spacing of the points
-        grid_dsm(
-            cloud, tmp_path / "d.tif", resolution=0.2, hillshade=shade, cog=cog,
-            counts=tmp_path / "n.tif",
-        )  # fmt: skip
+        counts = tmp_path / "n.tif"
+        grid_dsm(cloud, tmp_path / "d.tif", resolution=0.2, cog=cog, counts=counts)
     with rasterio.open(tmp_path / "n.tif") as counts:
         assert counts.descriptions == ("count", "spread")
         assert counts.crs.to_epsg() == 32633, "no vertical datum of what is no height"
@@ -175,10 +171,7 @@ def test_file(tmp_path, cog):
         assert count.sum() == 20_000
         np.testing.assert_array_equal(dsm.read(1) == -9999.0, count == 0)
         np.testing.assert_array_equal(spread == -9999.0, count == 0)
-    with rasterio.open(shade) as light:
-        assert (light.dtypes, light.nodata, light.overviews(1)) == (("uint8",), 0, [2])
-        np.testing.assert_array_equal(light.read(1) == 0, count == 0)
-    assert {p.name for p in tmp_path.iterdir()} == {"cloud.laz", "d.tif", "n.tif", "shade.tif"}
+    assert {p.name for p in tmp_path.iterdir()} == {"cloud.laz", "d.tif", "n.tif"}
 
 
 def test_fill(tmp_path):
@@ -241,7 +234,7 @@ def test_wrong_header(tmp_path):
         {"resolution": float("inf")}, {"method": "kriging"}, {"surface": "water"}, {"fill": 0.0},
         {"fill": 2000.0},
         {"what": "uncertainty", "method": "tin"}, {"what": "Colour"}, {"output": "d.asc"},
-        {"hillshade": "h.png"}, {"hillshade": "d.tif"}, {"output": "nowhere/d.tif"},
+        {"counts": "n.png"}, {"counts": "d.tif"}, {"output": "nowhere/d.tif"},
         {"output": "there.tif"},
     ],
     ids=str,

@@ -104,13 +104,7 @@ def test_resumed(block):
 
 
 @pytest.mark.parametrize(
-    "more",
-    [
-        {"rebuild": "odm {images}"},
-        {"rebuild": None, "reference": "lidar.laz"},
-        {"until_gsd": 0},
-        {"most_rounds": 0},
-    ],
+    "more", [{"rebuild": "odm {images}"}, {"rebuild": None}, {"until_gsd": 0}, {"most_rounds": 0}]
 )
 def test_bad_options(block, more):
     with pytest.raises(SettingError):
