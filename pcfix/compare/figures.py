@@ -186,8 +186,6 @@ def sparse_notes(match: Match, to: Figures | None, back: Figures | None) -> list
         remedy = f"Give --direction {'from' if sparse == 'reference' else 'to'}-reference."
         if match.reference.raster:
             remedy = "Use the vertical error, or give the reference as points."
-        elif to and back:
-            remedy = f"Use C2C from each point of the {sparse}."
         text = (
             f"C2C to the {sparse} ({mean:.3f} m on average) mostly measures the spacing of its"
             f" points: {apart:.2g} m, {times:.0f} times that of the {dense}. {remedy}"

@@ -1,11 +1,11 @@
-"""Remove refraction from photographs, several at a time; an interrupted call is resumed."""
+"""Remove refraction from photographs, several at a time."""
 
 from __future__ import annotations
 
 import json
 import time
 import warnings
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,16 +18,9 @@ import numpy.typing as npt
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.runner import (
-    Progress,
-    check_folder,
-    check_summary,
-    json_text,
-    key_of,
-    write_summary,
-)
+from pcfix.flow.runner import Progress, check_folder, check_summary, write_summary
 from pcfix.io.clouds import is_cloud
-from pcfix.io.files import read_json, write_text
+from pcfix.io.files import check_output
 from pcfix.io.labels import match_labels
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
 from pcfix.io.rasters import filled_heights, open_raster
@@ -41,7 +34,6 @@ from pcfix.sums import Figures
 from pcfix.water.checks import check_above_water
 from pcfix.water.index import index_of
 
-RECORD = "pcfix-photos.json"
 LEAST_STEP_PX = 8
 COARSE_STEP_PX = 100
 """Between the rays that test whether an image sees any of the ground."""
@@ -67,7 +59,7 @@ def map_photos(
         Folder of JPEG, TIFF or PNG files, named as in the camera file.
     out : path
         Folder, created if needed. Files keep their names, sizes, bands and metadata, so the camera
-        file needs no change. Images that an equal call has written are not written again.
+        file needs no change.
     options, progress
         See `pcfix.correct_file`; progress is in images. After an error finished images stay.
     """
@@ -81,11 +73,8 @@ def map_photos(
     with threads(given.jobs), TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))
         target.mkdir(parents=True, exist_ok=True)
-        results = () if given.overwrite else (target / path.name for path in block.paths)
-        old = {path.name: path for path in results if path.exists()}
-        open_record(target / RECORD, key_of("photos", given), old.values())
-        both = zip(block.paths, block.photos, strict=True)
-        todo = {path: photo for path, photo in both if path.name not in old}
+        for path in block.paths:
+            check_output(target / path.name, overwrite=given.overwrite, inputs=paths)
 
         def write(path: Path, photo: Photo) -> tuple[str, int, int, float]:
             """Write a photograph; return its name, pixels, black pixels, and largest shift."""
@@ -96,16 +85,13 @@ def map_photos(
             return path.name, touched.size, black, float(np.abs(shifts.shift_px).max())
 
         found: list[tuple[str, int, int, float]] = []
-        with ThreadPoolExecutor(max(1, min(current().threads, len(todo)))) as pool:
-            for one in pool.map(write, todo.keys(), todo.values()):
+        with ThreadPoolExecutor(min(current().threads, len(block.paths))) as pool:
+            for one in pool.map(write, block.paths, block.photos):
                 found.append(one)
                 if progress is not None:
-                    progress(len(old) + len(found), len(block.paths))
-    notes = list(block.notes)
-    poor = [
-        (black / pixels, name) for name, pixels, black, _ in found if black > MOST_BLACK * pixels
-    ]
-    if poor:
+                    progress(len(found), len(block.paths))
+    notes, shares = list(block.notes), [(black / pixels, name) for name, pixels, black, _ in found]
+    if poor := [one for one in shares if one[0] > MOST_BLACK]:
         worst, name = max(poor)
         words = (
             f"{given.dsm}: does not cover the frames of {len(poor)} photographs; more than"
@@ -118,37 +104,16 @@ def map_photos(
         started,
         notes,
         images=len(block.photos),
-        done_before=len(old),  # images that an earlier call wrote
         megapixels=round(1e-6 * pixels, 1),
-        largest_shift_px=round(max((one[3] for one in found), default=0.0), 2),
+        largest_shift_px=round(max(one[3] for one in found), 2),
         # of the pixels: without ground, occluded, or outside the original image
-        black_share=round(sum(one[2] for one in found) / max(pixels, 1), 5),
+        black_share=round(sum(one[2] for one in found) / pixels, 5),
         mapping=given.mapping,
         dsm=str(given.dsm),
         water=str(block.scene.water),
         refractive_index=block.scene.refractive_index,
         spacing_px=block.step_px,
     )
-
-
-def open_record(place: Path, key: str, written: Collection[Path]) -> dict[str, Any]:
-    """Return the record of an equal call that wrote to a folder; without results, a new one.
-
-    `key` is that of `key_of`. `written` are the results in the folder, which another call must not
-    mix with its own.
-    """
-    record: dict[str, Any] = read_json(place) if place.exists() else {}
-    if not written:
-        record = {"key": key}
-        write_text(place, json_text(record), overwrite=True)
-    elif record.get("key") != key:
-        raise SettingError(
-            "output.exists",
-            f"{min(written)}: exists, from other options or inputs. Add --overwrite to"
-            " replace it, or give another folder.",
-            path=min(written),
-        )
-    return record
 
 
 def finished(given: Any, started: float, notes: Iterable[PcfixWarning], **figures: Any) -> Figures:

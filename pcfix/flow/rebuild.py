@@ -23,10 +23,10 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.dsm import grid_dsm
-from pcfix.flow.photos import PhotoBlock, block_of, finished, map_photos, open_record
+from pcfix.flow.photos import PhotoBlock, block_of, finished, map_photos
 from pcfix.flow.runner import Progress, check_summary, json_text, key_of
 from pcfix.io.clouds import is_cloud
-from pcfix.io.files import run_logged, write_text
+from pcfix.io.files import read_json, run_logged, write_text
 from pcfix.io.las.writing import write_points
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.io.rasters import open_raster, place_of, read_masked, write_dod
@@ -83,8 +83,15 @@ def rebuild_rounds(
     folders = list(target.glob("round[0-9]*"))
     while given.overwrite and folders:
         shutil.rmtree(folders.pop())
-    record = open_record(target / RECORD, key_of("rebuild", given, ignored=COMMAND_ONLY), folders)
-    record.setdefault("rounds", [])
+    place, key = target / RECORD, key_of("rebuild", given, ignored=COMMAND_ONLY)
+    record: dict[str, Any] = {"key": key, "rounds": []}
+    if folders and place.exists():
+        record = read_json(place)
+    if record["key"] != key:
+        sentence = (
+            f"{target}: has rounds of other options or inputs. Add --overwrite to replace them."
+        )
+        raise SettingError("output.exists", sentence, path=target)
     if is_cloud(Path(given.dsm)):  # it is gridded to the folder
         raster = target / "dsm.tif"
         if not (folders and raster.exists()):
@@ -102,7 +109,12 @@ def rebuild_rounds(
             done_before += 1
         else:
             how = replace(
-                given, dsm=before, resolution=None, summary=None, **RebuildOptions().as_dict()
+                given,
+                dsm=before,
+                resolution=None,
+                summary=None,
+                overwrite=True,
+                **RebuildOptions().as_dict(),
             )
             with warnings.catch_warnings():
                 if number > 1:  # the DSM is pcfix's own
@@ -112,7 +124,7 @@ def rebuild_rounds(
                 _reconstruct(given, block, number, folder / "images", cloud, progress)
             grid_dsm(cloud, dsm, resolution=block.scene.ground.cell_m, overwrite=True)
             record["rounds"][number - 1 :] = [_difference(block, cloud, dsm, before)]
-            write_text(target / RECORD, json_text(record), overwrite=True)
+            write_text(place, json_text(record), overwrite=True)
         one = Figures(**record["rounds"][number - 1])
         rounds.append(one)
         if say is not None:

@@ -147,13 +147,12 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
         ("", "heights {water[height_m]:.1f cm} rms, standard error {water[sigma_m]:.1f cm}:"
          " {water[folder]}", "water"),
     )),
-    "photos": ("Mapped {mapped:,} images in {seconds:.1f} s", (
+    "photos": ("Mapped {images:,} images in {seconds:.1f} s", (
         ("Pixels", "{megapixels:.1f} million", "megapixels"),
         ("Mapping", "{mapping}, nodes every {spacing_px} px, largest shift"
          " {largest_shift_px:.1f} px", ""),
         ("Black", "{black_share:.1f %} of the pixels: no ground, occluded, or outside the image",
          ""),
-        ("Skipped", "{done_before:,} images, already done", "done_before"),
         ("Ground", "{dsm}", ""),
         ("Water", "{water}, refractive index {refractive_index:g}", ""),
     )),
@@ -270,8 +269,6 @@ def text_of(command: str, found: Figures) -> str:
             "crs_name": s["crs"] or "the cloud states none",
             "heights_name": s["heights"] or "the cloud states no vertical datum",
         }  # fmt: skip
-    elif command == "photos":
-        s["mapped"] = s["images"] - s["done_before"]
     elif command == "rebuild":
         s |= {"count": len(s["rounds"]), "last": s["rounds"][-1]}
     elif command == "ortho":

@@ -1,4 +1,4 @@
-"""``pcfix photos`` over files: names, metadata, bits of land, resuming, bad input."""
+"""``pcfix photos`` over files: names, metadata, bits of land, bad input."""
 
 import json
 
@@ -93,15 +93,10 @@ def test_land_unchanged(project):
     assert (before == after)[inland].all()
 
 
-def test_resumed(project):
-    run_pcfix(*words(project, out="again"))
-    (project / "again" / "IMG_1.JPG").unlink()
-    kept = (project / "again" / "IMG_0.JPG").stat().st_mtime_ns
-    done = run_pcfix(*words(project, out="again"))
-    assert (project / "again" / "IMG_0.JPG").stat().st_mtime_ns == kept
-    assert done.returncode == 0
-    assert (project / "again" / "IMG_1.JPG").exists()
-    assert run_pcfix(*words(project, "--index", "1.33", out="again")).code == "output.exists"
+def test_existing(project):
+    assert run_pcfix(*words(project, out="again")).returncode == 0
+    assert run_pcfix(*words(project, out="again")).code == "output.exists"
+    assert run_pcfix(*words(project, "--overwrite", out="again")).returncode == 0
 
 
 @pytest.mark.parametrize(

