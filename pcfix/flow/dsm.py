@@ -8,7 +8,6 @@ size of chunks, tiles and windows.
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -21,7 +20,7 @@ import numpy as np
 from pcfix.blocks import bounds, empty, release
 from pcfix.clean.neighbours import Tiles as PointTiles
 from pcfix.clean.neighbours import make_tiles
-from pcfix.errors import PcfixWarning, SettingError, bad_file
+from pcfix.errors import bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.heights import fill_holes, grid_window, margin_cells
 from pcfix.grid.lattice import Lattice, lattice_over, round_resolution, spacing_m
@@ -53,10 +52,8 @@ BIN_POINTS = 200_000
 TO_95 = 1.959964
 """Half-width of 95 % of a normal distribution, in standard deviations."""
 SIGMA_Z = "SigmaZ"
-FEWEST_A_CELL = 0.9
-"""Points per cell, on average where there are any; fewer give a warning."""
-DIMENSIONS = {"depth": "WaterDepth", "uncertainty": SIGMA_Z}
-"""Dimensions of these quantities; any other quantity is the dimension of its name."""
+DIMENSIONS = {"height": None, "depth": "WaterDepth", "uncertainty": SIGMA_Z}
+"""Where the values of a quantity are."""
 POINTS_A_SQUARE, MOST_SQUARES = 6.0, 4_000_000
 """Points of a square, if these fill the area, and squares to measure the spacing of points."""
 
@@ -124,12 +121,6 @@ def grid_dsm(
                 rules = replace(rules, resolution=cell_m)
             apart_m = _spacing_m(source, used, rules.cell_m)
         lattice = lattice_over(*bounds(used[:, :2]), rules.cell_m, str(task.source))
-        if (density := (rules.cell_m / apart_m) ** 2 if apart_m else np.inf) < FEWEST_A_CELL:
-            sentence = (
-                f"The resolution {rules.cell_m:g} m is finer than the points allow: their spacing"
-                f" is {apart_m:.2g} m, or {density:.2g} points a cell. Use at least that spacing."
-            )
-            warnings.warn(PcfixWarning("dsm.fine", sentence, spacing_m=apart_m), stacklevel=2)
         tiles = make_tiles(used, points=BIN_POINTS)
         # the widest circle around a triangle
         reach = TIN_REACH_SPACINGS * apart_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
@@ -190,7 +181,6 @@ def _write_rasters(
     # the number of cells around a window whose points decide on it
     beyond = int(np.ceil(reach)) + 1 if method == "tin" else 0
     plan = None if crs is None else parts(crs)[0]
-    unit = METRE if rules.what == "height" or rules.what in DIMENSIONS else ""
     new = partial(rasters.new_raster, lattice=lattice, tags={"PCFIX": json.dumps(tags)})
     # the width of holes to fill, in cells; a TIN has filled its own
     widest = 0.0 if method == "tin" else (rules.fill or 0.0) / size_m
@@ -199,11 +189,11 @@ def _write_rasters(
     side = np.sqrt(WINDOW_POINTS) * spacing or BLOCK_CELLS
     cells, filled, known, count, total, low, high, done = 0, 0, 0, 0, 0.0, np.inf, -np.inf, 0
     with ExitStack() as files:
-        bands = {rules.what: unit}
+        bands: dict[str, str] = {rules.what: METRE}
         system = crs if rules.what == "height" else plan
         dsm = files.enter_context(new(paths["dsm"], crs=system, bands=bands))
         if "counts" in paths:
-            bands = {"count": "", "spread": unit}
+            bands = {"count": "", "spread": METRE}
             counts = files.enter_context(new(paths["counts"], crs=plan, bands=bands))
         for window in lattice.window.parts(int(np.clip(side, 4 * margin + 1, BLOCK_CELLS))):
             around = window.grown(margin).clipped(lattice.window)
@@ -257,7 +247,13 @@ def _spacing_m(source: LasSource, xyz: FloatArray, finest_m: float = MIN_RESOLUT
 
 def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], None]) -> FloatArray:
     """Read the points to grid, shape (n, 3), the gridded values in the place of z."""
-    dimension = _dimension_of(source, rules.what)
+    dimension = DIMENSIONS[rules.what]
+    if dimension not in (None, *source.header.point_format.dimension_names):
+        sentence = (
+            f"has no dimension {dimension}, which --what {rules.what} needs. Correct the cloud"
+            " first, with --dimensions all."
+        )
+        raise bad_file(source.path, "cloud.no_dimension", sentence, dimension=dimension)
     result, count, done = empty((len(source), 3)), 0, 0
     for points in source.chunks():
         xyz = coordinates(points)
@@ -284,17 +280,3 @@ def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], Non
         sentence = "all points are noise (classes 7 and 18) or withheld. Classify it again."
         raise bad_file(source.path, "cloud.all_withheld", sentence)
     return result[:count]
-
-
-def _dimension_of(source: LasSource, what: str) -> str | None:
-    """Return the dimension whose values are gridded, None for heights."""
-    name = None if what == "height" else DIMENSIONS.get(what, what)
-    names = list(source.header.point_format.dimension_names)
-    if name is None or name in names:
-        return name
-    sentence = f"has no dimension {name}, which --what {what} needs."
-    if what in DIMENSIONS:
-        sentence += " Correct the cloud first, with --dimensions all."
-        raise bad_file(source.path, "cloud.no_dimension", sentence, dimension=name)
-    sentence += f" --what is one of {', '.join(('height', *DIMENSIONS, *names))}."
-    raise SettingError("option.choice", f"{source.path}: {sentence}", option="what", value=what)

@@ -17,7 +17,7 @@ from pcfix.flow.request import SURFACE, RunFolder
 from pcfix.flow.runner import Progress
 from pcfix.flow.surfaces import file_points, shoreline_layer, view_of
 from pcfix.grid.colours import hillshade, relief_colours
-from pcfix.grid.lattice import round_resolution
+from pcfix.grid.lattice import Window, round_resolution
 from pcfix.grid.maps import contours, depth_interval
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters
@@ -111,7 +111,8 @@ def _write_shaded(folder: Path) -> None:
             for window in lattice.window.parts(BLOCK_CELLS):
                 wide = window.grown(edge)
                 height = rasters.read_within(surface, wide)
-                deep = rasters.read_within(depth, wide.moved(down, right))
+                moved = Window(*np.add(wide, (down, down, right, right)).tolist())
+                deep = rasters.read_within(depth, moved)
                 level = minimum_filter(np.nan_to_num(height + deep, nan=np.inf), 2 * edge + 1)
                 is_wet = np.isnan(deep) & (height < level) & np.isfinite(level)
                 deep = np.where(is_wet, level - height, deep)[edge:-edge, edge:-edge]

@@ -115,9 +115,9 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
 
     resolution: float | None = option(None, basic=True, least=MIN_RESOLUTION_M)
     """Cell size. [m] [default: 2 to 4 points a cell]"""
-    what: str = option("height", metavar="height|depth|uncertainty|DIMENSION")
-    """Value of a cell: height; depth (of the bed below the water); uncertainty (vertical, of the
-    bed, at 95 %); or the name of a dimension."""
+    what: Literal["height", "depth", "uncertainty"] = option("height")
+    """Value of a cell: height; depth (of the bed below the water); or uncertainty (vertical, of the
+    bed, at 95 %)."""
     method: DsmMethod = option("mean", basic=True)
     """Gridding method."""
     surface: SurfaceChoice = option("all", basic=True)

@@ -324,17 +324,11 @@ class Sight:
 
         Shape (n, 3); a point without pairs stays where it is.
         """
-        paired, apparent = self.paired, self.truth.copy()
+        paired, apparent, site = self.paired, self.truth.copy(), self.site
         if paired.any():
-            starts = np.concatenate([self.start[:-1][paired], self.start[-1:]])
-            apparent[paired] = triangulate(
-                pixels,
-                self.site.given,
-                self.camera,
-                starts,
-                self.site.optics.lens,
-                apparent[paired],
-            )
+            begin = np.concatenate([self.start[:-1][paired], self.start[-1:]])
+            rays = pixels, site.given, self.camera, begin, site.optics.lens
+            apparent[paired] = triangulate(*rays, apparent[paired])
         return apparent
 
 
@@ -362,6 +356,5 @@ def see(truth: FloatArray, site: Site, rng: np.random.Generator) -> Sight:
         rank[np.lexsort((luck, point))] = np.arange(len(point)) - np.searchsorted(point, point)
         taken &= (luck < site.detection) | (rank < LEAST_VIEWS)
     point, camera, ideal = point[taken], camera[taken], ideal[taken]
-    return Sight(
-        site, truth, starts(np.bincount(point, minlength=len(truth))), point, camera, ideal
-    )
+    begin = starts(np.bincount(point, minlength=len(truth)))
+    return Sight(site, truth, begin, point, camera, ideal)

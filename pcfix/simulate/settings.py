@@ -67,12 +67,12 @@ class SceneSettings(SceneOptions):
         object.__setattr__(self, "index", index_of(self.index, self.index_formula)[0])
         pitch = [mm / px for mm, px in zip(self.sensor_mm, self.sensor_px, strict=True)]
         if not 0.98 < pitch[0] / pitch[1] < 1.02:
-            raise SettingError(
-                "scene.pixels",
+            um = [1000 * side for side in pitch]
+            sentence = (
                 f"sensor_mm {self.sensor_mm} and sensor_px {self.sensor_px} make pixels of"
-                f" {1000 * pitch[0]:.3g} x {1000 * pitch[1]:.3g} um. Give square pixels.",
-                pixel_um=[1000 * side for side in pitch],
+                f" {um[0]:.3g} x {um[1]:.3g} um. Give square pixels."
             )
+            raise SettingError("scene.pixels", sentence, pixel_um=um)
         # above the highest water of the area
         height = self.flying_height_m - self.water_tilt * float(np.hypot(*self.area_m)) / 2.0
         if height <= 0.5 * self.depth_m:

@@ -27,12 +27,9 @@ _CONVERGED_M = 1e-11
 
 
 def piercing_points_of_planes(
-    points: FloatArray,
-    centres: FloatArray,
-    anchors: FloatArray,
-    normals: FloatArray,
+    points: FloatArray, centres: FloatArray, anchors: FloatArray, normals: FloatArray,
     refractive_index: float,
-) -> FloatArray:
+) -> FloatArray:  # fmt: skip
     """Return where the light from each point to its camera passes a plane, (m, 3).
 
     `anchors` and `normals` are a point of each pair's plane and its unit normal, away from the
@@ -92,13 +89,9 @@ def project(
 
 
 def triangulate(
-    pixels: FloatArray,
-    cameras: Cameras,
-    camera: IntArray,
-    start: IntArray,
-    lens: Lens,
+    pixels: FloatArray, cameras: Cameras, camera: IntArray, start: IntArray, lens: Lens,
     guess: FloatArray,
-) -> FloatArray:
+) -> FloatArray:  # fmt: skip
     """Intersect straight rays through image points: least squared reprojection errors.
 
     Gauss-Newton from a guess, shape (n, 3). Point i has the pairs from ``start[i]`` to

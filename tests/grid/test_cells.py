@@ -32,7 +32,6 @@ def cloud(tmp_path_factory):
 KINDS = [(m, r) for m in METHODS for r in ("1", "0.7", "0.1") if (m, r) != ("tin", "0.1")]
 
 
-@pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
 @pytest.mark.parametrize(
     ("method", "resolution"), mostly_nightly(KINDS, *((m, r) for m, r in KINDS if r != "0.7"))
 )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.errors import InputError, SettingError
 from pcfix.flow import dsm as flow
 from pcfix.flow.dsm import grid_dsm
 from pcfix.io.las import source
@@ -38,7 +38,6 @@ SIZES = {
 }
 
 
-@pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
 @pytest.mark.parametrize("fill", mostly_nightly([None, 2.0], 2.0))
 @pytest.mark.parametrize("method", mostly_nightly(METHODS, "median", "tin"))
 def test_no_seams(awkward_cloud, tmp_path, monkeypatch, method, fill):
@@ -121,20 +120,6 @@ def test_uncertainty(tmp_path):
     assert summary.values["max"] == pytest.approx(known.max(), abs=5e-5)
 
 
-def test_any_dimension(tmp_path):
-    xyz = scattered(2000, 10.0, 10.0)
-    path = write(tmp_path / "c.las", xyz)
-    las = laspy.read(path)
-    las.intensity[:] = 100.0 * (xyz[:, 0] - EAST)
-    las.write(path)
-    grid_dsm(path, tmp_path / "d.tif", resolution=1.0, what="intensity", style=True)
-    with rasterio.open(tmp_path / "d.tif") as dsm:
-        assert (dsm.descriptions, dsm.units) == (("intensity",), (None,))
-        rows = dsm.read(1)[-10:, :10].mean(axis=0)
-    np.testing.assert_allclose(rows, 100.0 * np.arange(0.5, 10.0), atol=8.0)
-    assert "singlebandpseudocolor" in (tmp_path / "d.qml").read_text()
-
-
 def test_chosen_resolution(tmp_path):
     """Points at random: so many a cell are as many as those of the cells without any, too."""
     for count, side in ((4000, 40.0), (9000, 25.0)):
@@ -146,9 +131,8 @@ def test_chosen_resolution(tmp_path):
 @pytest.mark.parametrize("cog", [False, True])
 def test_file(tmp_path, cog):
     cloud = write(tmp_path / "cloud.laz", scattered(20_000, 80.0, 70.0), crs="EPSG:32633+5773")
-    with pytest.warns(PcfixWarning):  # finer than the spacing of the points
-        counts = tmp_path / "n.tif"
-        grid_dsm(cloud, tmp_path / "d.tif", resolution=0.2, cog=cog, counts=counts)
+    counts = tmp_path / "n.tif"
+    grid_dsm(cloud, tmp_path / "d.tif", resolution=0.2, cog=cog, counts=counts)
     with rasterio.open(tmp_path / "n.tif") as counts:
         assert counts.descriptions == ("count", "spread")
         assert counts.crs.to_epsg() == 32633, "no vertical datum of what is no height"
@@ -252,7 +236,7 @@ def test_settings_refused(tmp_path, monkeypatch, change):
 def test_clouds_refused(tmp_path, monkeypatch):
     """Too many cells, only noise, no bed, degrees or feet, no COG driver."""
     large = write(tmp_path / "large.las", scattered(5000, 900.0, 300.0))
-    with refused("option.resolution", value=0.001, finest=0.0165):
+    with refused("option.resolution", value=0.001, finest=0.017):
         grid_dsm(large, tmp_path / "d.tif", resolution=0.001)
     xyz = scattered(50, 10.0, 10.0)
     noise = write(tmp_path / "noise.las", xyz, classes=np.full(50, 7))
