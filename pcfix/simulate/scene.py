@@ -14,7 +14,7 @@ from pcfix.options.declare import taken
 from pcfix.options.scenes import SceneOptions
 from pcfix.simulate.settings import Optics, SceneSettings
 from pcfix.simulate.terrain import Terrain
-from pcfix.simulate.tracing import Water, Waves, project, rotations_of, triangulate
+from pcfix.simulate.tracing import Water, project, rotations_of, triangulate
 
 ORIGIN_M = np.array([410_200.0, 4_650_300.0, 0.0])  # in UTM zone 33 north
 EPSG = 32633
@@ -144,9 +144,9 @@ def scene_of(
 
 def lay_out(chosen: SceneSettings) -> Site:
     """Return ground and block of a scene, in local coordinates."""
-    # poses, waves and detection have their own random numbers, as they can be switched on
+    # poses and detection have their own random numbers, as they can be switched on
     rng, extent = np.random.default_rng(chosen.seed), chosen.area_m
-    of_poses, of_waves, luck = (np.random.default_rng([chosen.seed, i]) for i in (1, 2, 3))
+    of_poses, luck = (np.random.default_rng([chosen.seed, i]) for i in (1, 3))
     if chosen.cameras is not None:  # the area that about this number of nadir images covers
         (length, width), (base, spacing) = extent, chosen.base_and_spacing_m
         side = float(np.sqrt(chosen.cameras * base * spacing * length / width))
@@ -156,13 +156,10 @@ def lay_out(chosen: SceneSettings) -> Site:
     terrain = Terrain.random(chosen.bed, extent, plane, chosen.depth_m, rng)
     true, true_angles = fly_block(extent, chosen, rng)
     given, given_angles = misplaced(true, true_angles, chosen, of_poses)
-    waves = None
-    if chosen.wave_slope_deg > 0.0:
-        waves = Waves.random(len(true), chosen.wave_slope_deg, chosen.wave_length_m, of_waves)
     fall_m = chosen.water_tilt * float(np.hypot(*extent)) / 2.0
     return Site(
         terrain, true, true_angles, given, given_angles, chosen.optics,
-        Water(plane, chosen.refractive_index, waves), chosen.water - chosen.depth_m - fall_m,
+        Water(plane, chosen.refractive_index), chosen.water - chosen.depth_m - fall_m,
         chosen.image_noise, chosen.detection, rng, luck,
     )  # fmt: skip
 
@@ -345,7 +342,7 @@ def see(truth: FloatArray, site: Site, rng: np.random.Generator) -> Sight:
     reach = (cameras.centres[:, 2] - site.lowest_m) * np.tan(widest)
     across = truth[:, None, 0] - cameras.centres[:, 0], truth[:, None, 1] - cameras.centres[:, 1]
     point, camera = np.nonzero(np.hypot(*across) < reach)
-    surface = site.water.piercing_points(truth[point], cameras.centres[camera], camera)
+    surface = site.water.piercing_points(truth[point], cameras.centres[camera])
     ideal, z = project(surface, cameras, camera, site.optics.lens)
     inside = (z > 0) & site.optics.frames(site.optics.to_image(ideal))
     point, camera, ideal = point[inside], camera[inside], ideal[inside]

@@ -341,7 +341,7 @@ def table() -> dict[str, str]:
     commands["pipeline.river"] = IN_RIVER.replace("correct ", "pipeline ", 1)
     flight = "--block oblique --detection 0.9 --position-noise-m 0.03"
     kinds = {"tracks": "", "river": "--bed river", "oblique": flight}
-    kinds["waves"] = "--wave-slope-deg 1 --tilt-percent 0.2 --bed steps --seed 3 --lidar-per-m2 1"
+    kinds["tilted"] = "--tilt-percent 0.2 --bed steps --seed 3 --lidar-per-m2 1"
     add("simulate", SIMULATE, kinds)
     reference = f"{RUN} --reference {{samples}}/scene/lidar.laz --resolution 2"
     commands["run.reference"] = reference
