@@ -212,9 +212,8 @@ def _bed(given: CalmOptions) -> tuple[Callable[[FloatArray], FloatArray], str | 
             raise SettingError("option.range", sentence, option="depth", value=depth)
         return lambda xy: np.full(len(xy), level - depth), None
     with tempfile.TemporaryDirectory() as scratch:
-        height, (left, top, cell), crs, corrected = read_heights(
-            given.depth, given.resolution, Path(scratch), fill=True
-        )
+        found = read_heights(given.depth, given.resolution, Path(scratch))
+    height, (left, top, cell), crs, corrected = found
     if not corrected:
         index = index_of(given.index, given.index_formula)[0]
         height = np.where(height < level, level - index * (level - height), height)

@@ -56,7 +56,7 @@ from pcfix.options.correct import (
 from pcfix.options.declare import File, taken
 from pcfix.refract.regression import LEAST_BEYOND, DepthRegression
 from pcfix.refract.tally import Tally
-from pcfix.report.summary import Summary
+from pcfix.report.text import Summary
 from pcfix.version import __version__
 from pcfix.water.checks import as_surface, check_submerged, checked_points, refuse_under_water
 from pcfix.water.index import with_index

@@ -16,9 +16,8 @@ from pcfix.flow.raster import write_cells
 from pcfix.flow.request import SURFACE, RunFolder
 from pcfix.flow.runner import Progress
 from pcfix.flow.surfaces import file_points, shoreline_layer, view_of
-from pcfix.grid.colours import hillshade, relief_colours
 from pcfix.grid.lattice import Window, round_resolution
-from pcfix.grid.maps import contours, depth_interval
+from pcfix.grid.maps import contours, depth_interval, hillshade, relief_colours
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output

@@ -166,21 +166,14 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
     if given.resolution is not None and not is_cloud(Path(given.dsm)):
         sentence = "--resolution applies only to a cloud, but the DSM is a raster. Omit it."
         raise SettingError("option.no_use", sentence, option="resolution")
-    heights, origin, crs, corrected = read_heights(
-        given.dsm, given.resolution, scratch, fill=given.holes == "fill"
-    )
-    is_exact, notes = given.mapping == "exact", list[PcfixWarning]()
-    if corrected and not is_exact:
-        raise SettingError(
-            "dsm.corrected",
+    heights, origin, crs, corrected = read_heights(given.dsm, given.resolution, scratch)
+    if corrected and given.mapping == "paper":
+        sentence = (
             f"{given.dsm}: is of a corrected cloud, but --mapping paper needs the apparent bed."
-            " Give the DSM of the uncorrected cloud, or --mapping exact.",
-            path=given.dsm,
+            " Give the DSM of the uncorrected cloud, or --mapping exact."
         )
-    if not corrected:
-        bed = "the true bed, as from 'pcfix correct'" if is_exact else "the apparent bed"
-        words = f"{given.dsm}: does not state whether it was corrected; it is used as {bed}."
-        notes.append(PcfixWarning("dsm.origin_unknown", words, path=given.dsm))
+        raise SettingError("dsm.corrected", sentence, path=given.dsm)
+    notes = list[PcfixWarning]()
     cameras, _ = inputs.block(crs, read)
     row = match_labels([path.name for path in paths], cameras.labels, one_to_one=False)[0]
     lost = [path.name for path, one in zip(paths, row, strict=True) if one < 0]
@@ -211,30 +204,28 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
     low = float(np.nanmin(ground.height_m))
     sizes = [(photo.centre[2] - low) / photo.lens.focal for photo in photos]
     if not min(sizes) > 0.0:
-        raise GeometryError(
-            "cameras.below_ground",
+        sentence = (
             f"{name}: cameras are below the DSM, whose lowest height is {low:.1f} m. Check its CRS"
-            " and vertical datum.",
-            path=name, lowest_m=low,
-        )  # fmt: skip
+            " and vertical datum."
+        )
+        raise GeometryError("cameras.below_ground", sentence, path=name, lowest_m=low)
     scene = Scene(ground, surface, index_of(given.index, given.index_formula)[0])
     coarse = ((photo, nodes_of(photo.lens, COARSE_STEP_PX)[0]) for photo in photos)
     if not any(ground_seen(photo, scene, nodes)[2].any() for photo, nodes in coarse):
-        raise GeometryError(
-            "cameras.no_overlap",
+        sentence = (
             f"{given.dsm}: is in none of the {len(photos)} photographs. Check its CRS and that of"
-            f" {given.cameras} (--cameras-crs, --cameras-offset).",
-            path=given.dsm,
+            f" {given.cameras} (--cameras-crs, --cameras-offset)."
         )
+        raise GeometryError("cameras.no_overlap", sentence, path=given.dsm)
     gsd = float(np.median(sizes))
-    step = given.spacing or max(LEAST_STEP_PX, int(np.ceil(ground.cell_m / gsd)))
+    step = max(LEAST_STEP_PX, int(np.ceil(ground.cell_m / gsd)))
     return PhotoBlock(tuple(paths), tuple(photos), scene, step, tuple(notes), crs, gsd, waters)
 
 
 def read_heights(
-    dsm: File, resolution: float | None, scratch: Path, *, fill: bool
+    dsm: File, resolution: float | None, scratch: Path
 ) -> tuple[FloatArray, tuple[float, float, float], str | None, bool]:
-    """Read a DSM, or grid a cloud in a folder for temporary files.
+    """Read a DSM and fill its holes, or grid a cloud in a folder for temporary files.
 
     Returns the heights, shape (rows, columns); left, top and size of the cells; the CRS; and
     whether pcfix made it of a corrected cloud.
@@ -246,7 +237,7 @@ def read_heights(
     with open_raster(path) as source:
         t, tags = source.transform, source.tags()
         crs = None if source.crs is None else source.crs.to_wkt()
-        heights = filled_heights(source, fill=fill)
+        heights = filled_heights(source)
     if abs(t.a + t.e) >= 1e-6 * t.a or t.b or t.d:
         sentence = "its cells are rotated or not square. Warp it to north up first."
         raise bad_file(dsm, "raster.rotated", sentence)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import shlex
 import shutil
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
@@ -21,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, SettingError
+from pcfix.errors import InputError, SettingError
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.photos import PhotoBlock, block_of, finished, map_photos
 from pcfix.flow.runner import Progress, check_summary, json_text, key_of
@@ -116,10 +115,7 @@ def rebuild_rounds(
                 overwrite=True,
                 **RebuildOptions().as_dict(),
             )
-            with warnings.catch_warnings():
-                if number > 1:  # the DSM is pcfix's own
-                    warnings.filterwarnings("ignore", ".*does not state whether", PcfixWarning)
-                map_photos(images, folder / "images", options=how, progress=progress)
+            map_photos(images, folder / "images", options=how, progress=progress)
             with threads(given.jobs):
                 _reconstruct(given, block, number, folder / "images", cloud, progress)
             grid_dsm(cloud, dsm, resolution=block.scene.ground.cell_m, overwrite=True)

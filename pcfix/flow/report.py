@@ -25,8 +25,7 @@ from pcfix.report.adjustment import adjustment_sentence
 from pcfix.report.comparison import evaluation
 from pcfix.report.page import Report, Table, extent_of, render
 from pcfix.report.run import RunMaps, run_report
-from pcfix.report.summary import Summary
-from pcfix.report.text import Plain
+from pcfix.report.text import Plain, Summary
 
 DIFFERENCE = "compare/dod.tif"
 MOST_CELLS = 300_000

@@ -43,7 +43,7 @@ from pcfix.options.declare import File, options_of, taken
 from pcfix.options.steps import CleanOptions, DistanceOptions
 from pcfix.report.adjustment import adjustment_sentence, all_notes
 from pcfix.report.comparison import signed_statistics
-from pcfix.report.summary import Summary
+from pcfix.report.text import Summary
 from pcfix.running import threads
 from pcfix.water.index import with_index
 

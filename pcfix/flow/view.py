@@ -15,7 +15,7 @@ from pcfix.compare.match import gap_m, heights_at, near_in_plan
 from pcfix.errors import InputError, SettingError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.surfaces import find_surface, view_of
-from pcfix.grid import colours
+from pcfix.grid.maps import DEPTH, DIFFERENCE, HEIGHT, UNCERTAINTY
 from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.files import check_input, check_output, write_bytes
 from pcfix.io.las.columns import SHIFTS
@@ -44,15 +44,15 @@ GREY = 0.72
 """Of points without a value, such as land where depths are shown."""
 MOST_PERCENT = 98.0
 COLOURS = {
-    "depth": (colours.DEPTH, "Depth below the water (m)", "WaterDepth", 1.0,
+    "depth": (DEPTH, "Depth below the water (m)", "WaterDepth", 1.0,
               "Give --water, or a cloud from 'pcfix correct'."),
-    "shift": (colours.HEIGHT, "Lowered by the correction (m)", "ShiftZ", -1.0,
+    "shift": (HEIGHT, "Lowered by the correction (m)", "ShiftZ", -1.0,
               "Give a cloud from 'pcfix correct'."),
-    "error": (colours.DIFFERENCE, "Height above the reference (m)", "", 1.0,
+    "error": (DIFFERENCE, "Height above the reference (m)", "", 1.0,
               "Cloud and reference do not overlap."),
-    "uncertainty": (colours.UNCERTAINTY, "Uncertainty of Z at 95 % (m)", "SigmaZ", COVERAGE_95,
+    "uncertainty": (UNCERTAINTY, "Uncertainty of Z at 95 % (m)", "SigmaZ", COVERAGE_95,
                     "Give a cloud from 'pcfix correct --dimensions all'."),
-    "height": (colours.HEIGHT, "Height (m)", "", 1.0, "Its heights are not numbers."),
+    "height": (HEIGHT, "Height (m)", "", 1.0, "Its heights are not numbers."),
 }  # fmt: skip
 """Ramp, name, dimension and factor of the values, and what to do where no cloud has any."""
 

@@ -361,11 +361,6 @@ class PhotosOptions(
     mapping: Literal["exact", "paper"] = option("exact", basic=True, panel=Panel.METHOD)
     """exact: trace the light back from the true bed; paper: eq 12 of Skarlatos & Agrafiotis 2018 on
     the apparent bed, one round of their iteration, which ends at too large depths."""
-    spacing: int | None = option(None, least=1, most=512, panel=Panel.METHOD)
-    """Spacing of the grid nodes over the photograph. [px] [default: a cell of the DSM, at least 8
-    px]"""
-    holes: Literal["fill", "black"] = option("fill", panel=Panel.METHOD)
-    """Interpolate holes of the DSM, or make them black."""
 
 
 class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions, panel=Panel.WATER):

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.grid.colours import DIFFERENCE
-from pcfix.grid.maps import Extent
+from pcfix.grid.maps import DIFFERENCE, Extent
 from pcfix.model import FloatArray
 from pcfix.options.steps import LAYERS
 from pcfix.report.page import (

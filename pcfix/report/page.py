@@ -19,9 +19,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.grid.colours import DEPTH, HEIGHT, NO_LIGHT, hillshade, stops_of
 from pcfix.grid.lattice import Lattice
-from pcfix.grid.maps import Extent, contours, depth_interval, smoothed
+from pcfix.grid.maps import (
+    DEPTH,
+    HEIGHT,
+    NO_LIGHT,
+    Extent,
+    contours,
+    depth_interval,
+    hillshade,
+    smoothed,
+    stops_of,
+)
 from pcfix.model import FloatArray
 from pcfix.sums import nice_step
 
@@ -180,7 +189,7 @@ class Layer:
     name: str
     unit: str
     values: FloatArray
-    ramp: str = HEIGHT  # of `pcfix.grid.colours`
+    ramp: str = HEIGHT  # of `pcfix.grid.maps`
     plus_minus: str = ""  # name of the layer with the uncertainty of this one at 95 %
     is_centred: bool = False  # whether its colours are centred on zero
     has_contours: bool = False

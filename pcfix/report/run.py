@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.grid.colours import DEPTH, DIFFERENCE, UNCERTAINTY
 from pcfix.grid.lattice import Lattice
-from pcfix.grid.maps import contours, depth_interval
+from pcfix.grid.maps import DEPTH, DIFFERENCE, UNCERTAINTY, contours, depth_interval
 from pcfix.model import Cameras, FloatArray
 from pcfix.refract.tally import ORDERS, largest_tvu_m
 from pcfix.report.comparison import measured_of, signed
@@ -33,8 +32,7 @@ from pcfix.report.page import (
     new_figure,
     relief,
 )
-from pcfix.report.summary import Summary
-from pcfix.report.text import FEWEST, formal_words, summary_rows
+from pcfix.report.text import FEWEST, Summary, formal_words, summary_rows
 from pcfix.version import __version__
 
 if TYPE_CHECKING:

@@ -22,8 +22,7 @@ from pcfix.flow.request import STEPS, Record, Request, request_of
 from pcfix.flow.run import run_all
 from pcfix.io import vectors
 from pcfix.io.rasters import values_at
-from pcfix.report.summary import Summary
-from pcfix.report.text import tvu_sentence
+from pcfix.report.text import Summary, tvu_sentence
 from tests.utils.program import run_pcfix
 from tests.utils.shared import SCENE
 from tests.utils.tiles import finished as finished_in

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pcfix.flow.dsm import grid_dsm
-from pcfix.grid.colours import hillshade
 from pcfix.grid.lattice import cells_of
+from pcfix.grid.maps import hillshade
 from tests.grid.clouds import EAST, NORTH, SCALE, scattered, write
 from tests.grid.twins import exact, slow_hillshade, slow_raster
 from tests.utils.nightly import mostly_nightly
