@@ -126,21 +126,14 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
     Raises PcfixError if the clouds do not overlap, nothing is under water where that was asked for,
     or the reference does not allow the direction of C2C.
     """
-    direction = settings.direction
+    code, why, direction = "", "", settings.direction
     if target.raster and settings.from_reference:
-        raise SettingError(
-            "reference.no_points",
-            f"{target.name} is a raster, and --direction {direction} starts at measured points of"
-            " the reference. Give the reference as LAS or LAZ, or omit --direction.",
-            path=target.name, direction=direction,
-        )  # fmt: skip
-    if target.sparse and direction not in (None, "from-reference"):
-        raise SettingError(
-            "reference.check_points",
-            f"{target.name} has check points, and --direction {direction} needs a dense reference."
-            " Use --direction from-reference, or omit it.",
-            path=target.name, direction=direction,
-        )  # fmt: skip
+        code, why = "reference.no_points", "is a raster, without measured points"
+    elif target.sparse and direction not in (None, "from-reference"):
+        code, why = "reference.check_points", "has check points, too few for C2C to them"
+    if code:
+        sentence = f"{target.name} {why}. Omit --direction {direction}, or give a cloud."
+        raise SettingError(code, sentence, path=target.name, direction=direction)
     wet = mapped(lambda xyz, water: xyz[:, 2] < water, whole.xyz, whole.water_m)
     if not given:
         wet |= whole.bathymetric

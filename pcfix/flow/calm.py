@@ -142,12 +142,11 @@ def _registered(frames: Frames, images: Iterable[Any]) -> tuple[FloatArray, Floa
     lost = np.flatnonzero(~np.isfinite(homographies).all(axis=(1, 2)))
     if len(lost):
         names = [frames.names[row] for row in lost]
-        raise InputError(
-            "frames.no_overlap",
+        sentence = (
             f"{frames.path}: {len(lost)} frames share fewer than {LEAST_CORNERS} corners with the"
-            f" first, such as {names[0]}. Remove them, or start with another frame.",
-            frames=names,
+            f" first, such as {names[0]}. Remove them, or start with another frame."
         )
+        raise InputError("frames.no_overlap", sentence, frames=names)
     return homographies, scatter
 
 
@@ -192,9 +191,7 @@ def _view(given: CalmOptions, frames: Frames) -> tuple[View, str | None]:
     rows = [row for row, label in enumerate(cameras.labels) if Path(label).stem == first]
     rows = [0] if len(cameras.labels) == 1 else rows
     if len(rows) != 1 or cameras.rotations is None or cameras.lenses is None:
-        sentence = (
-            f"has no single pose with angles and a lens for {first}. Give one row of that name."
-        )
+        sentence = f"has no single pose with angles and a lens for {first}. Give one such row."
         raise bad_file(given.cameras, "photos.no_pose", sentence, photograph=first)
     photo = photo_of(frames.path, cameras, rows[0], size)
     return View(photo, level, index, bed), crs or cameras.crs

@@ -46,14 +46,9 @@ from pcfix.model import (
     WaterDimension,
     WaterSurface,
 )
-from pcfix.options.correct import (
-    CorrectOptions,
-    LabelRules,
-    PointsOptions,
-    RefractionOptions,
-    ScienceOptions,
-)
+from pcfix.options.correct import CorrectOptions, PointsOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import File, taken
+from pcfix.options.shared import LandRules
 from pcfix.refract.regression import LEAST_BEYOND, DepthRegression
 from pcfix.refract.tally import Tally
 from pcfix.report.text import Summary
@@ -415,7 +410,7 @@ def correct_points(
         FoundSurface(surface),
         offset,
         views,
-        Labelling(LabelRules(respect_classes=(NOT_SUBMERGED,))),
+        Labelling(LandRules(respect_classes=(NOT_SUBMERGED,))),
         line,
     )
     plan = plan_correction(plan)

@@ -83,14 +83,12 @@ def rebuild_rounds(
     while given.overwrite and folders:
         shutil.rmtree(folders.pop())
     place, key = target / RECORD, key_of("rebuild", given, ignored=COMMAND_ONLY)
-    record: dict[str, Any] = {"key": key, "rounds": []}
-    if folders and place.exists():
-        record = read_json(place)
-    if record["key"] != key:
+    if folders and place.exists() and read_json(place) != {"key": key}:
         sentence = (
             f"{target}: has rounds of other options or inputs. Add --overwrite to replace them."
         )
         raise SettingError("output.exists", sentence, path=target)
+    write_text(place, json_text({"key": key}), overwrite=True)
     if is_cloud(Path(given.dsm)):  # it is gridded to the folder
         raster = target / "dsm.tif"
         if not (folders and raster.exists()):
@@ -100,28 +98,21 @@ def rebuild_rounds(
         block = block_of(given, paths, Path(scratch))
     threshold_m = round(given.until_gsd * block.gsd_m, 5)
     rounds, done_before = list[Figures](), 0
+    # each round starts from the original images
+    how = replace(given, resolution=None, summary=None, **RebuildOptions().as_dict())
     while len(rounds) < given.most_rounds and not (rounds and abs(rounds[-1].mean_m) < threshold_m):
         number, before = len(rounds) + 1, Path(rounds[-1].dsm if rounds else given.dsm)
         folder = target / f"round{number}"
         cloud, dsm = folder / "cloud.laz", folder / "dsm.tif"
-        if number <= len(record["rounds"]) and cloud.exists() and dsm.exists():
+        if dsm.exists():
             done_before += 1
         else:
-            how = replace(
-                given,
-                dsm=before,
-                resolution=None,
-                summary=None,
-                overwrite=True,
-                **RebuildOptions().as_dict(),
-            )
+            how = replace(how, dsm=before, overwrite=True)
             map_photos(images, folder / "images", options=how, progress=progress)
             with threads(given.jobs):
                 _reconstruct(given, block, number, folder / "images", cloud, progress)
-            grid_dsm(cloud, dsm, resolution=block.scene.ground.cell_m, overwrite=True)
-            record["rounds"][number - 1 :] = [_difference(block, cloud, dsm, before)]
-            write_text(place, json_text(record), overwrite=True)
-        one = Figures(**record["rounds"][number - 1])
+            grid_dsm(cloud, dsm, resolution=block.scene.ground.cell_m)
+        one = _difference(block, cloud, dsm, before)
         rounds.append(one)
         if say is not None:
             say(
@@ -180,7 +171,7 @@ def _reconstruct(
         )  # fmt: skip
 
 
-def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> dict[str, Any]:
+def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> Figures:
     """Return by how much the DSM of a round differs from that before, under water."""
     raster = dsm.with_name("difference.tif")
     write_dod(dsm, before, raster, overwrite=True)  # an error if they do not overlap
@@ -191,12 +182,12 @@ def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> dict
     x, y = place_of(transform, column + 0.5, row + 0.5)
     wet = surface_above(block.scene.water, np.column_stack([x, y, z])).height_m > z
     moved = moved[wet] if wet.any() else moved
-    return {
-        "cloud": str(cloud),
-        "dsm": str(dsm),
+    return Figures(
+        cloud=str(cloud),
+        dsm=str(dsm),
         # its DSM minus the one before, over submerged cells
-        "cells": len(moved),
-        "mean_m": round(float(moved.mean()), 5),
-        "sd_m": round(float(moved.std()), 5),
-        "within_gsd": round(float((np.abs(moved) <= block.gsd_m).mean()), 5),
-    }
+        cells=len(moved),
+        mean_m=round(float(moved.mean()), 5),
+        sd_m=round(float(moved.std()), 5),
+        within_gsd=round(float((np.abs(moved) <= block.gsd_m).mean()), 5),
+    )

@@ -80,12 +80,11 @@ def report_run(
         run.folder, summary, run.cameras, maps, inputs,
         project=request.project or "", date=request.date or "", **more,
     )  # fmt: skip
-    shown = [
-        f"{tile.title}{f', {tile.tag}' if tile.tag else ''}: "
-        + ", ".join(f"{name} {value}" for name, value in tile.figures)
+    shown = (
+        f"{tile.title} {tile.tag}: " + ", ".join(f"{name} {value}" for name, value in tile.figures)
         for tile in page.tiles
         if tile.figures
-    ]
+    )
     return {"in_short": "; ".join(shown)}
 
 

@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from pcfix.cells import CellFrame, Cells, Layer
 from pcfix.errors import GeometryError
-from pcfix.model import BATHYMETRIC_POINT, WATER_SURFACE, BoolArray, FloatArray
-from pcfix.options.correct import LabelRules
+from pcfix.model import BATHYMETRIC_POINT, BoolArray, FloatArray
+from pcfix.options.shared import LandRules
 from pcfix.sums import LEAST, Sums
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
@@ -57,7 +57,6 @@ class Pools(NamedTuple):
     frame: CellFrame
     number: npt.NDArray[np.int32]  # (rows, columns), the water body of each cell
     stays: BoolArray  # (bodies + 1,), whether a body counts as water
-    joined: BoolArray  # (rows, columns), whether water is in the cell or next to it
 
 
 class Part(NamedTuple):
@@ -74,8 +73,7 @@ class LabelCounts(Sums):
 
     points: int = 0
     submerged: int = 0  # of class 40 now because they are submerged
-    water_surface: int = 0  # of class 41 now because they are in the band
-    stale: int = 0  # of class 40 or 41 in the input although they are neither now
+    stale: int = 0  # of class 40 in the input although they are not submerged
     water_unknown: int = 0  # without a known height of the water
     # depth of the point that is nearest to the water surface, negative above it, metres
     least_m: float = field(default=np.inf, metadata=LEAST)
@@ -87,7 +85,7 @@ class LabelCounts(Sums):
 
     def of_classes(self) -> dict[str, int]:
         """Return the counts by new classes, by their names in a summary."""
-        names = ("submerged", "water_surface", "stale", "water_unknown", "points")
+        names = ("submerged", "stale", "water_unknown", "points")
         return {name: getattr(self, name) for name in names}
 
 
@@ -95,7 +93,7 @@ class LabelCounts(Sums):
 class Labelling:
     """The rules of a labelling, and the water bodies if only connected water counts."""
 
-    settings: LabelRules
+    settings: LandRules
     mask: WaterMask | None = None
     pools: Pools | None = None
 
@@ -147,8 +145,7 @@ class Labelling:
         stays = area >= (SHARE_OF_LARGEST * area.max() if least is None else least)
         stays |= area == area.max()
         stays[0] = False
-        joined = binary_dilation(stays[number], _AROUND)
-        return replace(self, pools=Pools(frame, number, stays, joined))
+        return replace(self, pools=Pools(frame, number, stays))
 
     def submerged(
         self, xyz: FloatArray, surface: SurfaceAbove, classes: Classes
@@ -177,24 +174,11 @@ class Labelling:
         """Return the new classes of points, and their counts; those of land do not change."""
         wet, counts = self.submerged(*part)
         depth_m = part.surface.height_m - part.xyz[:, 2]
-        at_surface = np.zeros(len(wet), np.bool_)
-        if self.settings.surface_band > 0.0:
-            near = np.abs(depth_m) <= self.settings.surface_band
-            rows = np.flatnonzero(near & ~self._is_respected(part.classes))
-            x, y = np.ascontiguousarray(part.xyz[rows, :2].T)
-            at_surface[rows] = self._is_inside(x, y)
-            if self.pools is not None:
-                at_surface[rows] &= self.pools.joined[self.pools.frame.cells(x, y)]
-        wet &= ~at_surface
-        new = part.classes.copy()
-        new[wet], new[at_surface] = BATHYMETRIC_POINT, WATER_SURFACE
-        before = np.isin(part.classes, (BATHYMETRIC_POINT, WATER_SURFACE))
-        return new, replace(
+        return np.where(wet, np.uint8(BATHYMETRIC_POINT), part.classes), replace(
             counts,
             points=len(wet),
             submerged=int(wet.sum()),
-            water_surface=int(at_surface.sum()),
-            stale=int((before & ~(wet | at_surface)).sum()),
+            stale=int(((part.classes == BATHYMETRIC_POINT) & ~wet).sum()),
             water_unknown=int(np.isnan(depth_m).sum()),
             least_m=float(np.fmin.reduce(depth_m, initial=np.inf)),
         )

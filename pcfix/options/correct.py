@@ -208,15 +208,7 @@ class CorrectOptions(
     """JSON file for the line fitted to --check-depths."""
 
 
-class LabelRules(LandRules, panel=Panel.WATER):
-    """The rules of a labelling; see `pcfix.label`."""
-
-    surface_band: float = option(0.0, least=0)
-    """Points up to this distance from the surface, above or below, become class 41. [m] [default:
-    no class 41]"""
-
-
-class StageLabelOptions(LabelRules, MaskOption, NeededOptions):
+class StageLabelOptions(LandRules, MaskOption, NeededOptions):
     """The options of the PDAL stage ``label``, which writes no files."""
 
 

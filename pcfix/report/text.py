@@ -12,7 +12,6 @@ report page use the same rows.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator
 from string import Formatter
 from textwrap import fill
@@ -33,8 +32,6 @@ FEWEST = 59
 SHOWN_NAMES = 5
 WIDTH = 100
 """Columns of a printed line."""
-UNIT = re.compile(r"(?<=\d) (?=(?:m|cm|px|deg|%)(?:\W|$))")
-"""The space between a number and its unit."""
 
 _PART: RowTable = (
     ("Read", "a part of {part[of]:,} points", "part"),
@@ -99,10 +96,7 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
     "label": ("Labelled {input} -> {output}      {points:,} points in {seconds:.1f} s", (
         *_PART,
         ("Class 40", "{submerged:,} points ({submerged:of points})", ""),
-        ("Class 41", "{water_surface:,} points within {settings[surface_band]:g} m of the surface",
-         "settings[surface_band]"),
-        ("Formerly", "{stale:,} points of class 40 or 41 are in neither class now; their class is"
-         " unchanged", "stale"),
+        ("Formerly", "{stale:,} points of class 40 are not submerged; their class stays", "stale"),
         _NO_SURFACE,
         *_LABELLING,
         ("Water", "{water}", ""),
@@ -274,12 +268,10 @@ def wrapped(start: str, text: str) -> str:
     """Return a text in lines of `WIDTH` with a hanging indent, unless it has a command."""
     if "pcfix " in text:
         return start + text
-    text = UNIT.sub("\xa0", text)  # a number and its unit stay together
-    lines = fill(
+    return fill(
         text, WIDTH, initial_indent=start, subsequent_indent=" " * len(start),
         break_long_words=False, break_on_hyphens=False,
     )  # fmt: skip
-    return lines.replace("\xa0", " ")
 
 
 def share(part: int, whole: int) -> str:
@@ -288,6 +280,12 @@ def share(part: int, whole: int) -> str:
     if percent >= 99.5 and part < whole:
         return f"all but {whole - part:,}"
     return f"{percent:.0f} %" if percent >= 10 or percent == 0 else f"{percent:.1f} %"
+
+
+def summary_text(summary: Summary) -> str:
+    """Return the summary of a correction."""
+    head = _Words(vars(summary)).written(_TABLES["correct"][0], {})
+    return aligned(head, summary_rows(summary), summary.notes)
 
 
 def text_of(command: str, found: Figures) -> str:
@@ -308,12 +306,6 @@ def text_of(command: str, found: Figures) -> str:
         s["is_dry"] = s["water"] is None
     head, rows = _TABLES[command]
     return aligned(_Words(s).written(head, {}), filled(rows, s))
-
-
-def summary_text(summary: Summary) -> str:
-    """Return the summary of a correction."""
-    head = _Words(vars(summary)).written(_TABLES["correct"][0], {})
-    return aligned(head, summary_rows(summary), summary.notes)
 
 
 def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
@@ -356,15 +348,11 @@ def shoreline_rows(found: Plain | None) -> Rows:
     return filled(_SHORELINE, {"shoreline": found})
 
 
-_BUDGET: RowTable = (
-    ("image", "{sigma_image:g} px", ""),
-    ("level", "{level:.3f} m{source}", ""),
-    ("index", "{sigma_index:g}", ""),
-    ("tilt", "{sigma_tilt:g} deg", "sigma_tilt"),
-    ("waves", "{sigma_waves:g} deg", "sigma_waves"),
-    ("camera positions", "{sigma_centre:g} m", "sigma_centre"),
-    ("attitude", "{sigma_attitude:g} deg", "sigma_attitude"),
-)
+_UNITS = {
+    "image": " px", "index": "", "tilt": " deg", "waves": " deg", "centre": " m",
+    "attitude": " deg",
+}  # fmt: skip
+"""Of the standard deviations of a budget."""
 
 
 def formal_words(s: Summary) -> str:
@@ -379,8 +367,10 @@ def formal_words(s: Summary) -> str:
         fitted = (s.water_fit or {}).get("sigma_level_m")
         is_fitted = fitted is not None and np.isfinite(fitted)
         level, source = (fitted, " (fitted)") if is_fitted else (LEVEL_M, " (assumed)")
-    budget = filled(_BUDGET, s.settings | {"level": level, "source": source})
-    words = "Assumed standard deviations: " + ", ".join(f"{name} {text}" for name, text in budget)
+    words = f"Assumed standard deviations: level {level:.3f} m{source}"
+    for name, unit in _UNITS.items():
+        if value := s.settings[f"sigma_{name}"]:
+            words += f", {name} {value:g}{unit}"
     known = s.uncertainty or {}
     if (found := known.get("of_cloud")) is not None:
         words += (

@@ -28,14 +28,9 @@ class Optics:
     lens: Lens
     reach: float
 
-    @property
-    def is_ideal(self) -> bool:
-        """Whether there is no distortion."""
-        return not (any(self.lens.radial) or any(self.lens.tangential))
-
     def to_image(self, ideal: FloatArray) -> FloatArray:
         """Return image pixels of ideal pixels, shape (m, 2); NaN beyond the fold of the lens."""
-        if self.is_ideal:
+        if not self.lens.radial:
             return ideal
         principal = [self.lens.principal_x, self.lens.principal_y]
         plane = (ideal - principal) / self.lens.focal
@@ -43,7 +38,7 @@ class Optics:
 
     def to_ideal(self, image: FloatArray) -> FloatArray:
         """Return ideal pixels of image pixels, shape (m, 2)."""
-        if self.is_ideal:
+        if not self.lens.radial:
             return image
         rays = unproject(self.lens, image)
         principal = [self.lens.principal_x, self.lens.principal_y]
@@ -109,9 +104,8 @@ class SceneSettings(SceneOptions):
         width, height = self.sensor_px
         middle = np.array([width / 2.0, height / 2.0])
         lens = Lens(self.focal_mm / self.sensor_mm[0] * width, width, height, *middle.tolist())
-        if not any(self.distortion):
-            return Optics(lens, float(np.hypot(*self.sensor_mm) / 2.0 / self.focal_mm))
-        lens = replace(lens, radial=self.distortion[:3], tangential=self.distortion[3:])
+        if any(self.distortion):
+            lens = replace(lens, radial=self.distortion[:3], tangential=self.distortion[3:])
         along = np.linspace(-1.0, 1.0, 41)
         side = np.ones_like(along)
         edges = [(along, side), (along, -side), (side, along), (-side, along)]

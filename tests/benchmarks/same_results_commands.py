@@ -184,7 +184,6 @@ OF_COMPARE = {
 }
 OF_LABEL = {
     "default": "--water 0.37",
-    "band": "--water 0.37 --surface-band 0.2",
     "connected": "--water plane:0.37,0,0 --connected --least-pool 20",
     "auto": "--water auto",
 }
@@ -304,8 +303,8 @@ def table() -> dict[str, str]:
     compare = "compare {scene.snell/out.laz} --out-dir out --summary summary.json"
     add("compare", compare, OF_COMPARE)
     add("label", "label {samples}/scene/cloud.laz out.laz --summary summary.json", OF_LABEL)
-    labelled = "{label.band/out.laz} out.las --water 0.37 --cameras {samples}/scene/cameras.csv"
-    commands["label.respected"] = f"correct {labelled} --respect-classes 41 --summary summary.json"
+    labelled = "{label.default/out.laz} out.las --water 0.37 --cameras {samples}/scene/cameras.csv"
+    commands["label.respected"] = f"correct {labelled} --respect-classes 2 --summary summary.json"
     commands["restore"] = "restore {clean.default/out.laz} out.laz"
     commands["restore.river"] = "restore {river.sigmas/out.laz} out.las"
     commands["restore.minimal"] = "restore {river.max-cameras/out.laz} out.las"

@@ -99,7 +99,7 @@ def test_corrected_and_restored(path, tmp_path):
 CHOICES = [
     {},
     {"connected": True, "least_pool": 300.0},
-    {"surface_band": 0.2, "connected": True, "respect_classes": "2,5,6,7,8,9"},
+    {"connected": True, "respect_classes": "2,5,6,7,8,9"},
 ]
 
 
@@ -126,9 +126,7 @@ def test_label_doors(path, tmp_path, mask, choices, monkeypatch):
     np.testing.assert_array_equal(found, outs["Classification"])
     written = json.loads(summary.read_text())
     assert report["children"][0]["value"] == written["submerged"]
-    assert (
-        written["submerged"] + written["water_surface"] <= (found == 40).sum() + (found == 41).sum()
-    )
+    assert written["submerged"] <= (found == 40).sum()
     assert written["labelling"]["outside_mask"] > 0
     monkeypatch.setattr("pcfix.io.las.source.CHUNK_POINTS", 333)
     label_file(path, tmp_path / "b.las", water=WATER_M, water_mask=mask, **choices)

@@ -1,4 +1,4 @@
-"""Connectivity, class 41 and respected classes on shores with a known waterline."""
+"""Connectivity and respected classes on shores with a known waterline."""
 
 from functools import reduce
 from operator import add
@@ -9,7 +9,7 @@ import pytest
 
 from pcfix.errors import SettingError
 from pcfix.label.labelling import Labelling, Part, WaterMask
-from pcfix.options.correct import LabelRules
+from pcfix.options.shared import LandRules
 from pcfix.water.surface import SurfaceAbove
 from tests.utils.codes import refused
 
@@ -32,7 +32,7 @@ def labelled(part, mask=None, pieces=1, corners=None, **choices):
             yield Part(part.xyz[r], above, part.classes[r])
 
     low, high = part.xyz[:, :2].min(axis=0), part.xyz[:, :2].max(axis=0)
-    labelling = Labelling(LabelRules(**choices), mask).scanned(parts(), *(corners or (low, high)))
+    labelling = Labelling(LandRules(**choices), mask).scanned(parts(), *(corners or (low, high)))
     labels = [labelling.labels(p) for p in parts()]
     counts = reduce(add, [one for _, one in labels])
     counted = SimpleNamespace(
@@ -93,17 +93,6 @@ def test_least_pool():
     assert (labelled(part_of(xyz), connected=True)[0][two & (x < 42)] == 40).all()
 
 
-def test_band():
-    x, _, _, xyz = beach(20_000)
-    height = xyz[:, 2] - WATER_M
-    found, _ = labelled(part_of(xyz), surface_band=0.05)
-    expected = np.where(np.abs(height) <= 0.05, 41, np.where(height < 0, 40, 0))
-    np.testing.assert_array_equal(found, expected)
-    joined, _ = labelled(part_of(xyz), surface_band=0.05, connected=True)
-    assert not np.isin(joined[x > 70.0], (40, 41)).any()
-    np.testing.assert_array_equal(joined[x < 48], expected[x < 48])
-
-
 def test_respect_classes():
     *_, xyz = beach(20_000)
     classes = np.random.default_rng(0).choice([0, 2, 5, 40, 41], 20_000).astype(np.uint8)
@@ -128,14 +117,13 @@ def test_line_and_outlier():
 @pytest.mark.parametrize(
     "choices",
     [
-        {"surface_band": -0.1}, {"surface_band": float("nan")},
         {"respect_classes": (2, 256)}, {"respect_classes": (-1,)}, {"least_pool": 5.0},
         {"least_pool": -5.0, "connected": True},
     ],
 )  # fmt: skip
 def test_settings_refused(choices):
     with pytest.raises(SettingError):
-        LabelRules(**choices)
+        LandRules(**choices)
 
 
 def test_nothing_left_refused():
