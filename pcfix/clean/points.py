@@ -17,7 +17,7 @@ from pcfix.clean.neighbours import PIECE_ROWS, SLACK, Neighbours, make_tiles
 from pcfix.errors import bad_file
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import LEAST_NEIGHBOURS, CleanRules
-from pcfix.running import current, threads
+from pcfix.running import current
 from pcfix.water.checks import as_surface, checked_column, checked_points
 from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
@@ -164,7 +164,6 @@ def clean_points(
     incidence_deg: npt.ArrayLike | None = None,
     used: npt.ArrayLike | None = None,
     settings: CleanRules | None = None,
-    jobs: int | None = None,
 ) -> npt.NDArray[np.uint8]:
     """Find the points that are noise, and the reasons.
 
@@ -184,8 +183,6 @@ def clean_points(
         Points to test; the others are not neighbours of any. Default: all.
     settings : CleanRules, optional
         The thresholds.
-    jobs : int, optional
-        Threads; default all cores.
 
     Returns
     -------
@@ -223,6 +220,5 @@ def clean_points(
         above = surface_above(surface, points, heights)
     cloud = Cloud(np.empty((n, 3)), *(np.zeros(n, kind) for kind in (bool, bool, np.uint8)))
     cloud.add(slice(n), points, mask, above, rays, rules)
-    with threads(jobs):
-        flag_neighbours("xyz", cloud, rules)
+    flag_neighbours("xyz", cloud, rules)
     return cloud.reasons

@@ -68,12 +68,12 @@ def grid_dsm(
 ) -> Figures:
     """Grid a cloud to a GeoTIFF of heights or another quantity; what ``pcfix dsm`` runs.
 
-    The file has one band of float32, -9999 (nodata) if a cell has no value. Heights keep the
-    vertical datum of the cloud; other quantities have the horizontal CRS only, as programs would
-    take their values for heights. Depth is `WaterDepth`, and uncertainty the vertical one at 95 %,
-    of the bed (class 40), as `pcfix.correct_file` writes them. The uncertainty of a cell is not
-    divided by the square root of the number of its points: errors of level, index and tilt of the
-    water and of poses are common to them. To treat all errors as common is conservative.
+    The file is a cloud optimised GeoTIFF with one band of float32, -9999 (nodata) if a cell has no
+    value. Heights keep the vertical datum of the cloud; other quantities have the horizontal CRS
+    only, as programs would take their values for heights. Depth is `WaterDepth`, and uncertainty
+    the vertical one at 95 %, of the bed (class 40), as `pcfix.correct_file` writes them. The
+    uncertainty of a cell is not divided by the square root of the number of its points, because
+    their errors are mostly common.
 
     With `counts` a second file has two bands: count (points in the cell) and spread (population
     standard deviation of their values). A cell with a value and count 0 was interpolated.
@@ -106,10 +106,8 @@ def grid_dsm(
             progress(round(share * count), count)
 
     with ExitStack() as stack:
-        drafts = {
-            name: stack.enter_context(temporary_output(path))
-            for name, path in {"dsm": task.target, **more}.items()
-        }
+        outputs = {"dsm": task.target, **more}
+        drafts = {n: stack.enter_context(temporary_output(path)) for n, path in outputs.items()}
         folder = stack.enter_context(scratch_folder(task.target))
         stack.enter_context(scratch_arrays(task.target))
         with open_cloud(task.source) as source:
@@ -125,15 +123,11 @@ def grid_dsm(
         # the widest circle around a triangle
         reach = TIN_REACH_SPACINGS * apart_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
         reach_m = max(reach)
-        # a cloud optimised file is a copy, with overviews of its own
-        paths = {name: folder / f"{name}.tif" if given.cog else drafts[name] for name in drafts}
+        paths = {name: folder / f"{name}.tif" for name in drafts}
         tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
         counted = _write_rasters(tiles, lattice, reach_m, apart_m, rules, paths, crs, tags, report)
         for name, path in paths.items():
-            if given.cog:
-                rasters.copy_as_cog(path, drafts[name])
-            else:
-                rasters.add_overviews(path)
+            rasters.copy_as_cog(path, drafts[name])
     if given.style:
         write_text(style, raster_style(task.target, rules.what), overwrite=given.overwrite)
     result = Figures(

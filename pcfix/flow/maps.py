@@ -68,7 +68,7 @@ def write_rasters(run: RunFolder, *, errors: bool, progress: Progress | None = N
             cell_m = cell_m or float(raster.res[0])
     if cell_m is None:
         cell_m = round_resolution(point_spacing_m(cloud, folder / SURFACE))
-    plain = DsmOptions(resolution=cell_m, cog=True, style=True, overwrite=True)
+    plain = DsmOptions(resolution=cell_m, style=True, overwrite=True)
     filled = replace(plain, fill=HOLE_CELLS * cell_m)
     asked = {
         SURFACE: replace(filled, counts=folder / COUNTS),

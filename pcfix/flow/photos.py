@@ -37,8 +37,6 @@ from pcfix.water.index import index_of
 LEAST_STEP_PX = 8
 COARSE_STEP_PX = 100
 """Between the rays that test whether an image sees any of the ground."""
-MOST_BLACK = 0.2
-"""Share of an image; more gives a warning."""
 LENS_TOLERANCE = 0.005
 """Of the shape of a frame in millimetres against that of the image."""
 
@@ -76,38 +74,30 @@ def map_photos(
         for path in block.paths:
             check_output(target / path.name, overwrite=given.overwrite, inputs=paths)
 
-        def write(path: Path, photo: Photo) -> tuple[str, int, int, float]:
-            """Write a photograph; return its name, pixels, black pixels, and largest shift."""
+        def write(path: Path, photo: Photo) -> tuple[int, int, float]:
+            """Write a photograph; return its pixels, black pixels, and largest shift."""
             with threads(1):  # each photograph has a thread
                 shifts = mapped(photo, block.scene_of(path), block.step_px)
             image, touched, black = resample(read_photograph(path), shifts)
             write_photograph(path, target / path.name, image, touched)
-            return path.name, touched.size, black, float(np.abs(shifts.shift_px).max())
+            return touched.size, black, float(np.abs(shifts.shift_px).max())
 
-        found: list[tuple[str, int, int, float]] = []
+        found = list[tuple[int, int, float]]()
         with ThreadPoolExecutor(min(current().threads, len(block.paths))) as pool:
             for one in pool.map(write, block.paths, block.photos):
                 found.append(one)
                 if progress is not None:
                     progress(len(found), len(block.paths))
-    notes, shares = list(block.notes), [(black / pixels, name) for name, pixels, black, _ in found]
-    if poor := [one for one in shares if one[0] > MOST_BLACK]:
-        worst, name = max(poor)
-        words = (
-            f"{given.dsm}: does not cover the frames of {len(poor)} photographs; more than"
-            f" {100 * MOST_BLACK:.0f} % of them is black ({name}: {100 * worst:.0f} %)."
-        )
-        notes.append(PcfixWarning("dsm.too_small", words, photographs=len(poor)))
-    pixels = sum(one[1] for one in found)
+    pixels, black, largest = zip(*found, strict=True)
     return finished(
         given,
         started,
-        notes,
+        block.notes,
         images=len(block.photos),
-        megapixels=round(1e-6 * pixels, 1),
-        largest_shift_px=round(max(one[3] for one in found), 2),
+        megapixels=round(1e-6 * sum(pixels), 1),
+        largest_shift_px=round(max(largest), 2),
         # of the pixels: without ground, occluded, or outside the original image
-        black_share=round(sum(one[2] for one in found) / pixels, 5),
+        black_share=round(sum(black) / sum(pixels), 5),
         mapping=given.mapping,
         dsm=str(given.dsm),
         water=str(block.scene.water),

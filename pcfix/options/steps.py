@@ -164,8 +164,6 @@ class DsmOptions(PartOptions, OverwriteOption, SummaryOption, DsmRules, panel=Pa
     """GeoTIFF for the number of points in each cell, and their spread."""
     style: bool = option(False)
     """Also write a QGIS style (.qml)."""
-    cog: bool = option(False)
-    """Write a cloud optimised GeoTIFF."""
 
 
 LAYERS = ("water", "apparent", "corrected", "reference")

@@ -248,8 +248,8 @@ def render(report: Report) -> str:
 _NO_DATA = -32768
 _STEPS = 32_000
 """Of the 16 bits in which the page holds the values of its map."""
-_SMALLEST_STEP = {"m": 0.001, "px": 0.001}
-"""By unit; finer ones would only be noise that does not pack."""
+_SMALLEST_STEP = 0.001
+"""In metres or pixels; finer steps would only be noise that does not pack."""
 _COLOURS = 64
 _TICKS = 7
 SMOOTH_CELLS = 1.5
@@ -303,7 +303,7 @@ def _of_layer(layer: Layer) -> dict[str, Any]:
     """Return a layer; the range of its colours is round, and leaves out a percent at each end."""
     known = layer.values[np.isfinite(layer.values)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-    step = max((high - low) / _STEPS, _SMALLEST_STEP.get(layer.unit, 0.01))
+    step = max((high - low) / _STEPS, _SMALLEST_STEP)
     shown = np.percentile(known, [1.0, 99.0]) if known.size else np.array([0.0, 1.0])
     if layer.is_centred:
         shown = np.abs(shown).max() * np.array([-1.0, 1.0])

@@ -29,7 +29,6 @@ RowTable = tuple[tuple[str, str, str], ...]
 
 FEWEST = 59
 """Differences of which all keep an order before 95 % of all are likely to: 0.95^59 is 0.05."""
-SHOWN_NAMES = 5
 WIDTH = 100
 """Columns of a printed line."""
 
@@ -75,7 +74,6 @@ _CORRECTED: RowTable = (
     ("Cameras", "{cameras_used} of {cameras} used, {rays_per_point:.1f} rays per point, incidence"
      " angles up to {incidence_deg:.0f} deg", "cameras"),
     ("Cameras", "none; ray counts of 1 and incidence angles of 0 are placeholders", "!cameras"),
-    ("Unused", "{unused_count} cameras without corrected points: {unused}", "unused"),
     ("Water", "{water}, refractive index {settings[index]:.6g}", ""),
     ("", "fitted {water_fit[model]}, standard error {water_fit[sigma_level_m]:.3f} m",
      "water_fit"),
@@ -313,7 +311,7 @@ def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
 
     `measured` is the vertical uncertainty against a reference, `Comparison.tvu` in plain values.
     """
-    detected, unused, check = s.reconstruction, s.cameras_unused, ""
+    detected, check = s.reconstruction, ""
     method = str(s.settings["method"])
     if detected is not None and detected.get("type", "") not in ("", method):
         sure = f"detected, confidence {100.0 * detected['confidence']:.0f} %"
@@ -333,8 +331,6 @@ def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
         "corrected_words": "all corrected" if s.corrected == s.submerged else corrected,
         "method": method,
         "rays_per_point": s.rays / max(s.corrected, 1),
-        "unused_count": len(unused),
-        "unused": ", ".join([*unused[:SHOWN_NAMES], *(["..."] if unused[SHOWN_NAMES:] else [])]),
         "no_uncertainty": s.uncertainty is None and s.settings["dimensions"] == "all"
         and not s.cameras,
         "measured": measured,

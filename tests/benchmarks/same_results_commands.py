@@ -169,7 +169,7 @@ OF_CLEAN = {
 }
 OF_DSM = {
     **{m: f"--method {m}" for m in ("mean", "median", "min", "max", "tin")},
-    "bed": "--surface bed --fill 3 --cog",
+    "bed": "--surface bed --fill 3",
 }
 SECTION = "--section 410200,4650340,410320,4650340 --sections 2 --corridor 2"
 OF_COMPARE = {

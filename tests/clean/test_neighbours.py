@@ -52,7 +52,7 @@ def test_tiles_do_not_matter(points: int, monkeypatch: pytest.MonkeyPatch) -> No
     settings = CleanRules(deviations=2.0, radius=1.0)
     whole = clean_points(s.xyz, water=s.water_level_m, settings=settings)
     monkeypatch.setattr("pcfix.clean.neighbours.POINTS_PER_TILE", points)
-    cut = clean_points(s.xyz, water=s.water_level_m, settings=settings, jobs=1)
+    cut = clean_points(s.xyz, water=s.water_level_m, settings=settings)
     assert np.array_equal(cut, whole)
     for reason in (Reason.STATISTICAL, Reason.RADIUS, Reason.BELOW_BED, Reason.FLOATING):
         assert (whole & reason).any()

@@ -61,7 +61,6 @@ COMMANDS = {
     "clean": ("clean", "corrected.laz", "DISK/n.laz", "--summary", "DISK/n.json"),
     "dsm": ("dsm", "corrected.laz", "DISK/d.tif", "--resolution", "0.25", "--counts",
             "DISK/k.tif", "--style", "--summary", "DISK/d.json"),
-    "dsm, COG": ("dsm", "corrected.laz", "DISK/d.tif", "--cog"),
     "compare": (*COMPARE, "--out-dir", "DISK/of", "--plot", "DISK/p.png", "--summary", "DISK/s"),
 }  # fmt: skip
 """By what does not find its place, sizes of the disk, kB."""

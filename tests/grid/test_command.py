@@ -11,7 +11,7 @@ def test_command(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "c.laz", scattered(2000, 20.0, 10.0), classes=40)
     words = "c.laz d.tif --resolution 0.5 --method max --surface bed --fill 1.5 --summary s.json"
-    words += " --cog --counts n.tif --what height --style"
+    words += " --counts n.tif --what height --style"
     answer = run_pcfix("dsm", *words.split())
     assert answer.returncode == 0, answer.stderr
     assert json.loads((tmp_path / "s.json").read_text())["settings"] == {
