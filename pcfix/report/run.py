@@ -207,34 +207,23 @@ def cameras_figure(maps: RunMaps, cameras: Cameras, unused: Sequence[str]) -> Fi
 
 
 def tvu_figure(depth_m: FloatArray, tvu_m: FloatArray, measured: Sequence[Plain]) -> Figure:
-    """Draw TVU at 95 % over depth, and the limits of the orders of IHO S-44 up to one above it.
+    """Draw TVU at 95 % of cells over depth, (n,), metres, and the limits of the orders of S-44.
 
-    Both have the shape (n,), metres. `measured` are the `Comparison.depth_bins` of a reference, in
-    plain values.
+    `measured` are the `Comparison.depth_bins` of a reference, in plain values.
     """
     figure, axes = new_figure()
-    deepest = float(max(depth_m.max(), 1e-3))
-    edges = np.linspace(0.0, deepest * (1.0 + 1e-9), 31)
-    slot = np.clip(np.digitize(depth_m, edges) - 1, 0, 29)
-    used = np.unique(slot)
-    low, middle, high = np.array([np.percentile(tvu_m[slot == i], [5, 50, 95]) for i in used]).T
-    centres = 0.5 * (edges[:-1] + edges[1:])[used]
-    axes.fill_between(
-        centres, low, high, color=WATER, alpha=0.6, linewidth=0.0, label="predicted, 90 %"
-    )
-    axes.plot(centres, middle, color=AFTER, label="predicted, median")
+    axes.plot(depth_m, tvu_m, ".", markersize=1, color=WATER, label="predicted, each cell")
     within = [one["after"]["within_95_m"] for one in measured]
     if measured:
         at = [0.5 * (one["from_m"] + one["to_m"]) for one in measured]
         axes.plot(at, within, "o", color=REFERENCE, label="measured")
+    deepest = max(float(depth_m.max()), 1e-3)
     depths = np.linspace(0.0, deepest, 100)
     for order, style in zip(ORDERS, ("-", "--", "-.", ":"), strict=True):
-        largest = largest_tvu_m(order, depths)
-        name = order.name if order.name[0].isalpha() else f"order {order.name}"
-        axes.plot(depths, largest, style, color=BEFORE, label=f"IHO S-44 {name}")
-        if largest[0] > max(high.max(), *within, 0.0):
-            break  # laxer limits would only press the points down
-    axes.set(xlim=(0.0, deepest), ylim=(0.0, None), xlabel="Depth (m)", ylabel="TVU at 95 % (m)")
+        label = f"IHO S-44 {order.name}"
+        axes.plot(depths, largest_tvu_m(order, depths), style, color=BEFORE, label=label)
+    most = 1.3 * max(float(np.percentile(tvu_m, 99.0)), *within, 0.2)
+    axes.set(xlim=(0.0, deepest), ylim=(0.0, most), xlabel="Depth (m)", ylabel="TVU at 95 % (m)")
     axes.legend(loc="best")
     return figure
 
