@@ -14,17 +14,7 @@ import numpy as np
 from pcfix.grid.maps import DIFFERENCE, Extent
 from pcfix.model import FloatArray
 from pcfix.options.steps import LAYERS
-from pcfix.report.page import (
-    AFTER,
-    BEFORE,
-    REFERENCE,
-    WATER,
-    Picture,
-    Table,
-    map_figure,
-    name_of,
-    new_figure,
-)
+from pcfix.report.page import AFTER, BEFORE, WATER, Picture, Table, map_figure, name_of, new_figure
 from pcfix.report.text import Plain, aligned, share, wrapped
 
 if TYPE_CHECKING:
@@ -223,7 +213,7 @@ def c2c_figure(compared: Plain) -> Figure:
     figure = _histograms(columns, "Distance to the nearest point (m)", sharex=True)
     # nearly all distances, but not the outliers
     ends = [one.found["statistics"]["percentiles_m"]["p95"] for some in columns for one in some]
-    figure.axes[0].set_xlim(0.0, 1.5 * max(*ends, 1e-6))
+    figure.axes[0].set_xlim(0.0, 1.25 * max(*ends, 1e-6))
     return figure
 
 
@@ -272,7 +262,7 @@ def _section(number: int, section: Plain) -> Picture:
     """Draw the heights along a line."""
     figure, axes = new_figure(8.0, 4.0)
     heights, further = section["heights_m"], [n for n in section["heights_m"] if n not in LAYERS]
-    colours = {"water": WATER, "reference": REFERENCE, "apparent": BEFORE, "corrected": AFTER}
+    colours = {"water": WATER, "reference": "0.65", "apparent": BEFORE, "corrected": AFTER}
     colours |= dict(zip(further, cycle(FURTHER), strict=False))
     for name, colour in colours.items():
         if name in heights:

@@ -218,11 +218,11 @@ def tvu_figure(depth_m: FloatArray, tvu_m: FloatArray, measured: Sequence[Plain]
         at = [0.5 * (one["from_m"] + one["to_m"]) for one in measured]
         axes.plot(at, within, "o", color=REFERENCE, label="measured")
     deepest = max(float(depth_m.max()), 1e-3)
-    depths = np.linspace(0.0, deepest, 100)
+    depths, most = np.linspace(0.0, deepest, 100), 1.3 * max(np.percentile(tvu_m, 99), *within, 0.2)
     for order, style in zip(ORDERS, ("-", "--", "-.", ":"), strict=True):
-        label = f"IHO S-44 {order.name}"
-        axes.plot(depths, largest_tvu_m(order, depths), style, color=BEFORE, label=label)
-    most = 1.3 * max(float(np.percentile(tvu_m, 99.0)), *within, 0.2)
+        largest = largest_tvu_m(order, depths)
+        if largest[0] < most:
+            axes.plot(depths, largest, style, color=BEFORE, label=f"IHO S-44 {order.name}")
     axes.set(xlim=(0.0, deepest), ylim=(0.0, most), xlabel="Depth (m)", ylabel="TVU at 95 % (m)")
     axes.legend(loc="best")
     return figure
