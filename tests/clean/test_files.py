@@ -156,12 +156,6 @@ def test_command(tmp_path: Path) -> None:
     assert f"{said['noise']:,}" in done.stdout
     assert said["settings"]["neighbours"] == 20
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.laz", "out.laz", "s.json"]
-    off = ["--no-statistical", "--no-weak", "--no-below", "--overwrite", "--quiet"]
-    done = run_pcfix("clean", *words, *off, "--summary", tmp_path / "s.json")
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-    reasons = json.loads((tmp_path / "s.json").read_text())["reasons"]
-    assert reasons.pop("floating") > 0
-    assert not any(reasons.values())
 
 
 def test_refused_files(tmp_path: Path) -> None:

@@ -61,30 +61,6 @@ def test_no_seams(awkward_cloud, tmp_path, monkeypatch, method, fill):
             np.testing.assert_array_equal(one, other, err_msg=name)
 
 
-def sloping(x, y):
-    return 20.0 + 0.3 * (x - EAST) - 0.2 * (y - NORTH)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_plane(tmp_path, method):
-    """Four points a cell, alike about its centre, on a plane.
-
-    Their heights are whole millimetres, so they lie on it, and float32 rounds by 1e-6 m at most
-    up to 32 m. Lowest and highest are those of the points at the corners.
-    """
-    x, y = (
-        grid.ravel() for grid in np.meshgrid(np.arange(0.25, 20, 0.5), np.arange(0.25, 15, 0.5))
-    )
-    x, y = x + EAST, y + NORTH
-    cloud = write(tmp_path / "plane.las", np.column_stack([x, y, sloping(x, y)]))
-    grid_dsm(cloud, tmp_path / "plane.tif", resolution=1.0, method=method)
-    found = heights(tmp_path / "plane.tif")
-    centre_x, centre_y = np.meshgrid(EAST + np.arange(20) + 0.5, NORTH + 14.5 - np.arange(15))
-    corner = {"min": -0.125, "max": 0.125}.get(method, 0.0)
-    expected = sloping(centre_x, centre_y) + corner
-    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6)
-
-
 def with_sigma(path, xyz, sigma):
     """Write a cloud with the dimension that a correction leaves, in tenths of a millimetre."""
     las = laspy.read(write(path, xyz, classes=40))
