@@ -38,7 +38,7 @@ from pcfix.model import WaterRaster as WaterRaster
 from pcfix.model import WaterSurface as WaterSurface
 from pcfix.options.correct import Options as Options
 from pcfix.refract.tracing import trace as trace
-from pcfix.report.summary import Summary as Summary
+from pcfix.report.text import Summary as Summary
 from pcfix.simulate import simulate_scene as simulate_scene
 from pcfix.version import __version__ as __version__
 from pcfix.water.index import refractive_index as refractive_index

@@ -20,7 +20,7 @@ FloatArray: TypeAlias = npt.NDArray[np.float64]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
-UNCLASSIFIED, BATHYMETRIC_POINT, WATER_SURFACE = 1, 40, 41
+BATHYMETRIC_POINT = 40
 """Classes of LAS 1.4 and its topo-bathy lidar domain profile; 40 is a point on the bed."""
 NOISE_CLASSES = LOW_NOISE, HIGH_NOISE = 7, 18
 

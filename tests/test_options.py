@@ -7,7 +7,6 @@ from pcfix.cli.commands import COMMANDS
 from pcfix.options.correct import LEVEL_M, CorrectOptions, RunOptions, ScienceOptions
 from pcfix.options.declare import options_of
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX, Panel
-from pcfix.options.steps import SIGMA_REFERENCE_M
 from pcfix.water.index import with_index
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
@@ -82,10 +81,8 @@ def test_help():
 def test_defaults_in_words():
     """Texts that name a default say what the code has."""
     found = {one.name: one.default_text for one in options_of(RunOptions)}
-    sigmas = (f"{sigma:g} of a {kind}" for kind, sigma in SIGMA_REFERENCE_M.items())
     assert found["index"] == f"{DEFAULT_REFRACTIVE_INDEX:g}"
     assert found["sigma_level"].endswith(f" {LEVEL_M:g}")
-    assert found["sigma_reference"] == ", ".join(sigmas)
 
 
 def test_part():

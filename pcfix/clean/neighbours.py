@@ -25,8 +25,6 @@ LEAF_POINTS = 32
 SLACK = 1.0 + 1e-9
 """Distances whose ratio is smaller than this count as equal: more than rounding, less than any step
 of a LAS file at the distance of neighbours."""
-_SPARE_COLUMNS, _MOST_COLUMNS = 8, 1024
-_ENTRIES = 4_000_000
 
 
 class Neighbours:
@@ -44,32 +42,12 @@ class Neighbours:
         """Return the k nearest points of the tiles, which hold at least k.
 
         Queries are quicker if the points, shape (q, 3), are near to each other. Returns distances
-        (m), ascending, and indices in the arrays of the tiles, both of shape (q, k). The order of
-        equally far points is not defined, nor which of them are returned if the last ones are
-        equally far.
+        (m), ascending, and indices in the arrays of the tiles, both of shape (q, k). Equally far
+        points are in any order, and if the last ones are equally far, any of them are returned.
         """
         columns = list(range(1, k + 1))
         found = self._tree.query(xyz[:, : self.axes], columns, workers=current().threads)
         return np.asarray(found[0]), np.asarray(found[1])
-
-    def with_ties(
-        self, xyz: FloatArray, k: int, spare: int
-    ) -> Iterator[tuple[IntArray, FloatArray, IntArray]]:
-        """Yield rows of xyz with their k nearest points and all that are as far as the last.
-
-        The number of columns begins with k + spare and is doubled until the last column is farther
-        than column k, or there are a thousand.
-        """
-        most = min(len(self.tiles.row), max(_MOST_COLUMNS, k))
-        columns, rest = min(k + spare, most), np.arange(len(xyz))
-        while rest.size:
-            size, tied = max(1, _ENTRIES // columns), []
-            for rows in (rest[first : first + size] for first in range(0, len(rest), size)):
-                distance, place = self.nearest(xyz[rows], columns)
-                more = (distance[:, -1] <= distance[:, k - 1] * SLACK) & (columns < most)
-                tied.append(rows[more])
-                yield rows[~more], distance[~more], place[~more]
-            columns, rest = min(2 * columns, most), np.concatenate(tied)
 
 
 def nearest_of(
@@ -78,51 +56,25 @@ def nearest_of(
     """Yield rows (c,) of places, these places, and their k nearest points in plan, (c, k, 3).
 
     Places and points, (n, 2) or (n, 3), are in one frame, metres; there are at least k points. The
-    nearest comes first; of equally far ones, the first of the cloud.
+    nearest comes first.
     """
     near, asked = Neighbours(make_tiles(points), 2), make_tiles(places)
     for piece in asked.pieces(PIECE_ROWS):
-        row, xyz = asked.row[piece], asked.xyz[piece]
-        for some, distance, place in near.with_ties(xyz, k, 1):
-            order = np.lexsort((near.tiles.row[place], distance), axis=1)[:, :k]
-            first = np.take_along_axis(place, order, axis=1)
-            yield row[some], xyz[some], near.tiles.xyz[first]
+        xyz = asked.xyz[piece]
+        yield asked.row[piece], xyz, near.tiles.xyz[near.nearest(xyz, k)[1]]
 
 
-def nearest_distance(places: FloatArray, points: FloatArray, axes: int = 2) -> FloatArray:
-    """Return the distance (m) of each place, (n,), to the nearest point, in plan or with 3 axes.
+def nearest_distance(places: FloatArray, points: FloatArray) -> FloatArray:
+    """Return the distance (m) of each place, (n,), to the nearest point in space: C2C.
 
-    Places and points, (n, 3), are metres in one frame. In space this is C2C, without a sign. Where
-    the two clouds sample a surface at different places it is at least about half the spacing of the
-    points.
+    Places and points, (n, 3), are metres in one frame. Where the two clouds sample a surface at
+    different places it is at least about half the spacing of the points.
     """
-    near = Neighbours(make_tiles(points), axes)
+    near = Neighbours(make_tiles(points), 3)
     asked, distance = make_tiles(places), empty((len(places),))
     for piece in asked.pieces(PIECE_ROWS):
         distance[asked.row[piece]] = near.nearest(asked.xyz[piece], 1)[0][:, 0]
     return distance
-
-
-def height_quartiles(near: Neighbours, xyz: FloatArray, k: int) -> FloatArray:
-    """Return the lower and upper quartile of the neighbours' heights, shape (q, 2), metres.
-
-    The neighbours of points (q, 3) are the k nearest in plan and all that are as far as the last of
-    them, so that the result does not depend on the order of the points. (If more than a thousand
-    are equally far, any thousand of them.) `near` has two axes.
-    """
-    quartiles = np.empty((len(xyz), 2))
-    for rows, distance, place in near.with_ties(xyz, k, _SPARE_COLUMNS):
-        counts = distance <= distance[:, k - 1 : k] * SLACK
-        heights = np.sort(np.where(counts, near.tiles.xyz[:, 2][place], np.inf), axis=1)
-        last = counts.sum(axis=1)[:, None] - 1
-        # linear between order statistics, as numpy.percentile has it, but for rows of own lengths
-        position = last * np.array([0.25, 0.75])
-        left = np.floor(position).astype(np.int64)
-        a, b = (
-            np.take_along_axis(heights, at, axis=1) for at in (left, np.minimum(left + 1, last))
-        )
-        quartiles[rows] = a + (position - left) * (b - a)
-    return quartiles
 
 
 POINTS_PER_TILE = 250_000

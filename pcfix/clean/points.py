@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.blocks import kept, row_numbers
-from pcfix.clean.neighbours import PIECE_ROWS, SLACK, Neighbours, height_quartiles, make_tiles
+from pcfix.clean.neighbours import PIECE_ROWS, SLACK, Neighbours, make_tiles
 from pcfix.errors import bad_file
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import LEAST_NEIGHBOURS, CleanRules
-from pcfix.running import current, threads
+from pcfix.running import current
 from pcfix.water.checks import as_surface, checked_column, checked_points
 from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 
@@ -54,14 +54,9 @@ class Cloud(NamedTuple):
     reasons: ReasonArray  # (n,), bits of `Reason`, set by the tests
 
     def add(
-        self,
-        rows: slice,
-        xyz: FloatArray,
-        used: BoolArray,
-        above: SurfaceAbove | None,
-        rays: Mapping[str, FloatArray],
-        rules: CleanRules,
-    ) -> None:
+        self, rows: slice, xyz: FloatArray, used: BoolArray, above: SurfaceAbove | None,
+        rays: Mapping[str, FloatArray], rules: CleanRules,
+    ) -> None:  # fmt: skip
         """Set some rows, and flag the weak intersections among their corrected points.
 
         `above` is the water; without it the points with rays are submerged. `rays` are the
@@ -75,7 +70,8 @@ class Cloud(NamedTuple):
             for name, (reason, limit, is_beyond) in WEAK.items():
                 value = getattr(rules, limit)
                 if value is not None and name in rays:
-                    _set(self.reasons[rows], corrected & is_beyond(rays[name], value), reason)
+                    weak = corrected & is_beyond(rays[name], value)
+                    self.reasons[rows][weak] |= np.uint8(reason)
         if above is not None:
             self.submerged[rows] = used & is_submerged(xyz[:, 2], above)
 
@@ -120,13 +116,13 @@ def flag_sparse(cloud: Cloud, rules: CleanRules) -> dict[str, float]:
             mean_m[rows] = distance[:, : rules.neighbours].mean(axis=1)
         if rules.radius is not None:
             lonely = distance[:, rules.radius_neighbours] * SLACK >= rules.radius
-            _set(cloud.reasons, rows[lonely], Reason.RADIUS)
+            cloud.reasons[rows[lonely]] |= np.uint8(Reason.RADIUS)
     if mean_m is None:
         return {}
     known = mean_m[cloud.used]  # in the order of the file
     mean, sd = float(known.mean()), float(known.std(ddof=1))
     limit = mean + (rules.deviations or 0.0) * sd
-    _set(cloud.reasons, cloud.used & (mean_m > limit * SLACK), Reason.STATISTICAL)
+    cloud.reasons[cloud.used & (mean_m > limit * SLACK)] |= np.uint8(Reason.STATISTICAL)
     return {"mean": mean, "sd": sd, "limit": limit}
 
 
@@ -137,13 +133,15 @@ def flag_off_bed(cloud: Cloud, rules: CleanRules) -> None:
     see `CleanRules`. At least ``rules.bed_neighbours`` points are submerged.
     """
     for near, rows, xyz in _pieces(cloud.xyz, cloud.submerged, 2):
-        lower, upper = height_quartiles(near, xyz, rules.bed_neighbours).T
+        heights = near.tiles.xyz[:, 2][near.nearest(xyz, rules.bed_neighbours)[1]]
+        lower, upper = np.percentile(heights, (25, 75), axis=1)
         fence, z = rules.fences * (upper - lower), xyz[:, 2]
-        for reason, least_m, off_m in (
-            (Reason.BELOW_BED, rules.below, lower - z), (Reason.FLOATING, rules.floating, z - upper)
-        ):  # fmt: skip
+        below = Reason.BELOW_BED, rules.below, lower - z
+        above = Reason.FLOATING, rules.floating, z - upper
+        for reason, least_m, off_m in below, above:
             if least_m is not None:
-                _set(cloud.reasons, rows[off_m > np.maximum(fence, least_m)], reason)
+                off = rows[off_m > np.maximum(fence, least_m)]
+                cloud.reasons[off] |= np.uint8(reason)
 
 
 def _pieces(
@@ -157,11 +155,6 @@ def _pieces(
         current().report(piece.stop - piece.start)
 
 
-def _set(reasons: ReasonArray, where: BoolArray | IntArray, reason: Reason) -> None:
-    """Set a bit in the rows of a mask, or with the given numbers."""
-    reasons[where] |= np.uint8(reason)
-
-
 def clean_points(
     xyz: npt.ArrayLike,
     *,
@@ -171,7 +164,6 @@ def clean_points(
     incidence_deg: npt.ArrayLike | None = None,
     used: npt.ArrayLike | None = None,
     settings: CleanRules | None = None,
-    jobs: int | None = None,
 ) -> npt.NDArray[np.uint8]:
     """Find the points that are noise, and the reasons.
 
@@ -191,20 +183,11 @@ def clean_points(
         Points to test; the others are not neighbours of any. Default: all.
     settings : CleanRules, optional
         The thresholds.
-    jobs : int, optional
-        Threads; default all cores.
 
     Returns
     -------
     array of uint8, shape (n,)
         Bits of `Reason`; 0 for a good point.
-
-    Raises
-    ------
-    SettingError
-        If an argument breaks its rule.
-    InputError
-        If there are fewer points than a neighbourhood has.
 
     Examples
     --------
@@ -237,6 +220,5 @@ def clean_points(
         above = surface_above(surface, points, heights)
     cloud = Cloud(np.empty((n, 3)), *(np.zeros(n, kind) for kind in (bool, bool, np.uint8)))
     cloud.add(slice(n), points, mask, above, rays, rules)
-    with threads(jobs):
-        flag_neighbours("xyz", cloud, rules)
+    flag_neighbours("xyz", cloud, rules)
     return cloud.reasons

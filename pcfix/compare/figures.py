@@ -12,16 +12,10 @@ import numpy as np
 from pcfix.blocks import blocks, bounds, kept, mapped
 from pcfix.clean.neighbours import nearest_distance
 from pcfix.compare.m3c2 import m3c2_distances
-from pcfix.compare.match import Match, heights_at, spacing_m
-from pcfix.compare.statistics import (
-    binned,
-    distribution_of,
-    fit_line,
-    own_of,
-    statistics_of,
-    tvu_of,
-)
+from pcfix.compare.match import Match, heights_at, mean_spacing_m
+from pcfix.compare.statistics import binned, distribution_of, fit_line, statistics_of, tvu_of
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, plain
+from pcfix.grid.lattice import spacing_m
 from pcfix.model import FloatArray
 from pcfix.sums import Figures
 
@@ -51,23 +45,17 @@ class Comparison(Figures):
         return dict(plain(values | {"sections": sections}))
 
 
-_BIN_COLUMNS = {
-    "count_{}": "count",
-    "bias_{}_m": "mean_m",
-    "sd_{}_m": "sd_m",
-    "rmse_{}_m": "rmse_m",
-    "nmad_{}_m": "nmad_m",
-}
-
-
 def bins_table(bins: Iterable[Figures]) -> str:
     """Return bins as CSV text; the columns of `before` are empty where it is not known."""
-    head = [name.format(when) for when in ("after", "before") for name in _BIN_COLUMNS]
-    rows: list[list[Any]] = [["from_m", "to_m", *head]]
+    columns = ("bias", "mean_m"), ("sd", "sd_m"), ("rmse", "rmse_m"), ("nmad", "nmad_m")
+    rows: list[list[Any]] = [["from_m", "to_m"]]
+    for when in ("after", "before"):
+        rows[0] += [f"count_{when}", *(f"{name}_{when}_m" for name, _ in columns)]
     for one in bins:
         rows.append([f"{one.from_m:g}", f"{one.to_m:g}"])
-        for statistics in (one.after, one.before):
-            rows[-1] += [getattr(statistics, name, None) for name in _BIN_COLUMNS.values()]
+        for found in (one.after, one.before):
+            names = ("count", *(name for _, name in columns))
+            rows[-1] += [getattr(found, name, None) for name in names]
     return _csv(rows)
 
 
@@ -84,6 +72,8 @@ def _csv(rows: Iterable[Iterable[Any]]) -> str:
 
 BINS, TAIL_PERCENT = 64, 0.5
 """Of the histogram of vertical errors: its classes, and what it leaves out on either side."""
+POINTS_PER_SQUARE = 3.0
+"""Of the squares by which the spacing of a cloud is measured, on average."""
 SPARSER = 2.0
 """Ratio of the spacings of two clouds from which one is called sparse."""
 MIN_REACH_M, REACH_FACTOR = 1.0, 1.5
@@ -101,22 +91,19 @@ def figures_of(
     whole, reference, rules = match.whole, match.reference, match.settings
     c2c, c2c_from_reference = found = c2c_of(match)
     notes = sparse_notes(match, *found)
-    pairs = vertical = own = residuals = None
+    pairs = vertical = residuals = None
     by_depth: dict[str, Any] = {
         "bed": None, "land": None,  # vertical errors of submerged places and of the others
         "depth": None,  # against reference depth, if water is known
-        "depth_bins": [], "shore_bins": [],  # by depth, and by distance from the shore
+        "depth_bins": [],
         "tvu": None,  # of all submerged places
     }  # fmt: skip
     if rules.vertical:
         pairs = _pairs(match)
         vertical = both(lambda p: distribution_of(p.error_m, BINS, (), TAIL_PERCENT), pairs)
         by_depth |= _by_depth(match, pairs, notes)
-        bed, after = by_depth["bed"], pairs.after
-        errors = vertical.after.statistics if bed is None else bed.after
-        of = "all" if bed is None else "bed"
-        own = own_of(errors, of, rules.sigma_reference, reference.kind)
         if reference.sparse:
+            after = pairs.after
             residuals = np.column_stack([after.xy, after.reference_m, after.error_m])
     also = []
     for name, other in others.items():
@@ -145,7 +132,6 @@ def figures_of(
         c2c_from_reference=c2c_from_reference,
         also=also,  # further clouds
         vertical=vertical,  # signed, along the vertical
-        own=own,  # of the bed, or of all, without the noise of the reference
         **by_depth,
         m3c2=_m3c2(match, pairs) if rules.m3c2 else None,
         sections=_sections(match, lines, others),
@@ -174,7 +160,7 @@ def c2c_of(match: Match) -> tuple[Figures | None, Figures | None]:
     rules = match.settings
 
     def distribution(places: FloatArray, surface: FloatArray) -> Figures:
-        return distribution_of(nearest_distance(places, surface, 3), rules.classes, rules.share)
+        return distribution_of(nearest_distance(places, surface), None, rules.share)
 
     to = back = None
     if rules.direction != "from-reference":
@@ -188,7 +174,10 @@ def sparse_notes(match: Match, to: Figures | None, back: Figures | None) -> list
     """Return warnings of distances that mostly measure the spacing of a sparse cloud."""
     if match.reference.sparse:
         return []
-    spacings = {"reference": spacing_m(match.reference.xyz), "cloud": spacing_m(match.asked.xyz)}
+    spacings = {}
+    for name, xyz in ("reference", match.reference.xyz), ("cloud", match.asked.xyz):
+        side = POINTS_PER_SQUARE**0.5 * mean_spacing_m(xyz)
+        spacings[name] = spacing_m(xyz, max(side, 1e-9))
     notes = []
     for pair, sparse, dense in zip((to, back), spacings, reversed(spacings), strict=True):
         apart, times = spacings[sparse], spacings[sparse] / max(spacings[dense], 1e-9)
@@ -197,8 +186,6 @@ def sparse_notes(match: Match, to: Figures | None, back: Figures | None) -> list
         remedy = f"Give --direction {'from' if sparse == 'reference' else 'to'}-reference."
         if match.reference.raster:
             remedy = "Use the vertical error, or give the reference as points."
-        elif to and back:
-            remedy = f"Use C2C from each point of the {sparse}."
         text = (
             f"C2C to the {sparse} ({mean:.3f} m on average) mostly measures the spacing of its"
             f" points: {apart:.2g} m, {times:.0f} times that of the {dense}. {remedy}"
@@ -260,16 +247,12 @@ def _by_depth(match: Match, pairs: Figures, notes: list[PcfixWarning]) -> dict[s
     }
     if not wet.all():
         figures["land"] = both(lambda p: statistics_of(kept(~wet, p.error_m)), pairs)
-    if match.dry.any():
-        dry = kept(match.dry, match.whole.xyz)[:, :2]
-        shore = nearest_distance(kept(wet, after.xy), dry)
-        figures["shore_bins"] = binned(shore, error, error_before, rules.shore_bin_width)
     return figures
 
 
 def _m3c2(match: Match, pairs: Figures | None) -> Figures:
     if pairs is None:
-        far = nearest_distance(*match.facing(match.cloud.xyz), 3)
+        far = nearest_distance(*match.facing(match.cloud.xyz))
     else:
         far = mapped(np.abs, (pairs.before or pairs.after).error_m)
     reach = max(MIN_REACH_M, REACH_FACTOR * float(np.percentile(far, 99)))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.clean.neighbours import SLACK, Neighbours, make_tiles
+from pcfix.clean.neighbours import Neighbours, make_tiles
 from pcfix.compare.statistics import statistics_of
 from pcfix.errors import GeometryError
 from pcfix.libraries import optional_library
@@ -18,8 +18,6 @@ from pcfix.model import FloatArray, IntArray
 from pcfix.sums import Figures
 
 MAX_CORE_POINTS = 100_000
-TILE_POINTS = 500_000
-"""Points of either cloud that are passed to py4dgeo at a time, without those of the margin."""
 SPACING_SAMPLE = 10_000
 NORMAL_SPACINGS, CYLINDER_SPACINGS = 6.0, 3.0
 """Radii in point spacings of the sparser cloud: a cylinder holds about 28 points."""
@@ -42,14 +40,14 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
     They are along the local normal, positive where the cloud is above. The core points are rows of
     the cloud, (n, 3), which also gives the normals; the reference has the shape (m, 3), both
     metres, world frame. The cylinders reach at least `max_distance_m` to either side. Raises
-    GeometryError ``reference.no_overlap`` if no cylinder holds points of both.
+    GeometryError ``reference.no_overlap`` if no cylinder holds points of both. py4dgeo needs about
+    100 bytes of memory per point.
     """
     py4dgeo = load_py4dgeo()
-    clouds = make_tiles(xyz, points=TILE_POINTS), make_tiles(reference, points=TILE_POINTS)
     spacing = 1e-3  # median distance to the nearest other point, of the sparser cloud
-    for one, cut in zip((xyz, reference), clouds, strict=True):
+    for one in xyz, reference:
         sample = one[sample_rows(len(one), SPACING_SAMPLE)]
-        near, _ = Neighbours(cut, 3).nearest(sample, min(2, len(one)))
+        near, _ = Neighbours(make_tiles(one), 3).nearest(sample, min(2, len(one)))
         spacing = max(spacing, float(np.median(near[:, -1])))
     normal, cylinder = NORMAL_SPACINGS * spacing, CYLINDER_SPACINGS * spacing
     # py4dgeo cuts a cylinder into lengths of its radius: an odd number of them, as a core point on
@@ -57,30 +55,18 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
     pieces = 2 * math.ceil((max_distance_m / cylinder - 1.0) / 2.0) + 1
     max_distance_m = (max(pieces, 1) - 1e-6) * cylinder
     core = xyz[sample_rows(len(xyz), MAX_CORE_POINTS)]
-    # a tile of core points gets both clouds with a margin as wide as a normal or a tilted cylinder
-    reach = max(normal, math.hypot(cylinder, max_distance_m)) * SLACK
-    share = len(core) / max(len(one.row) for one in clouds)
-    tiles = make_tiles(core, points=max(1, round(TILE_POINTS * share)))
-    origin = np.floor(clouds[1].low.min(axis=0))
-    distance, detection = np.full((2, len(core)), np.nan)
-    for piece in tiles.pieces(len(core)):
-        some = tiles.xyz[piece]
-        low, high = some.min(axis=0) - reach, some.max(axis=0) + reach
-        cloud, below = (one.xyz[one.within(low, high)] - origin for one in clouds)
-        if len(below) == 0:
-            continue
-        with _silence():
-            epoch = py4dgeo.Epoch(cloud)
-            found, uncertainty = py4dgeo.M3C2(
-                epochs=(py4dgeo.Epoch(below), epoch),
-                corepoints=np.ascontiguousarray(some - origin),
-                normal_radii=[normal],
-                cyl_radius=cylinder,
-                max_distance=max_distance_m,
-                cloud_for_normals=epoch,
-            ).run()
-        row = tiles.row[piece]
-        distance[row], detection[row] = found, uncertainty["lodetection"]
+    origin = np.floor(reference.min(axis=0))
+    with _silence():
+        cloud = py4dgeo.Epoch(xyz - origin)
+        distance, uncertainty = py4dgeo.M3C2(
+            epochs=(py4dgeo.Epoch(reference - origin), cloud),
+            corepoints=core - origin,
+            normal_radii=[normal],
+            cyl_radius=cylinder,
+            max_distance=max_distance_m,
+            cloud_for_normals=cloud,
+        ).run()
+    detection = uncertainty["lodetection"]
     known = np.isfinite(distance)
     if not known.any():
         sentence = (

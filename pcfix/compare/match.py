@@ -16,7 +16,6 @@ from pcfix.options.steps import CompareRules
 
 GAP_SPACINGS, MIN_GAP_M = 5.0, 1.0
 """A point counts up to this distance outside the other cloud, unless the user sets it."""
-POINTS_PER_SQUARE = 3.0
 MIN_SHAPE = 1e-3
 """Points are on a line if the determinant of their covariance over its squared trace is less."""
 MAX_REACH = 3.0
@@ -73,11 +72,6 @@ class Reference:
     sparse: bool = False  # single check points, not a sampled surface
     raster: bool = False  # centres of cells
 
-    @property
-    def kind(self) -> str:
-        """Key of `SIGMA_REFERENCE_M`."""
-        return "table of check points" if self.sparse else "raster" if self.raster else "cloud"
-
 
 @dataclass(frozen=True, eq=False)
 class Match:
@@ -87,7 +81,6 @@ class Match:
     asked: SurveyCloud  # those under water, if only these are compared
     cloud: SurveyCloud  # the n points of these within the reference
     wet: BoolArray  # (n,), those under water
-    dry: BoolArray  # those of the whole cloud above the water
     reference: Reference
     places: FloatArray  # (p, 3), points of the reference that the cloud covers, metres
     outside: int  # points outside the overlap, and on land; check points if the reference is sparse
@@ -133,21 +126,14 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
     Raises PcfixError if the clouds do not overlap, nothing is under water where that was asked for,
     or the reference does not allow the direction of C2C.
     """
-    direction = settings.direction
+    code, why, direction = "", "", settings.direction
     if target.raster and settings.from_reference:
-        raise SettingError(
-            "reference.no_points",
-            f"{target.name} is a raster, and --direction {direction} starts at measured points of"
-            " the reference. Give the reference as LAS or LAZ, or omit --direction.",
-            path=target.name, direction=direction,
-        )  # fmt: skip
-    if target.sparse and direction not in (None, "from-reference"):
-        raise SettingError(
-            "reference.check_points",
-            f"{target.name} has check points, and --direction {direction} needs a dense reference."
-            " Use --direction from-reference, or omit it.",
-            path=target.name, direction=direction,
-        )  # fmt: skip
+        code, why = "reference.no_points", "is a raster, without measured points"
+    elif target.sparse and direction not in (None, "from-reference"):
+        code, why = "reference.check_points", "has check points, too few for C2C to them"
+    if code:
+        sentence = f"{target.name} {why}. Omit --direction {direction}, or give a cloud."
+        raise SettingError(code, sentence, path=target.name, direction=direction)
     wet = mapped(lambda xyz, water: xyz[:, 2] < water, whole.xyz, whole.water_m)
     if not given:
         wet |= whole.bathymetric
@@ -180,8 +166,8 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
         )  # fmt: skip
     outside = len(target.xyz) - len(places) if target.sparse else int((chosen & ~near).sum())
     found = Match(
-        whole, asked, whole.take(near), kept(near, wet), ~wet, target, places, outside,
-        not_submerged, settings,
+        whole, asked, whole.take(near), kept(near, wet), target, places, outside, not_submerged,
+        settings,
     )  # fmt: skip
     surface = found.water_at(places[:, :2]) if by_place and settings.submerged else None
     if surface is None:
@@ -190,43 +176,26 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
     under = mapped(lambda xyz, water: xyz[:, 2] < water, places, surface)
     if not under.any():
         sentence = (
-            "none of its points near the cloud is under water. Check the water level, or omit"
-            " --submerged."
+            f"{target.name}: none of its points near the cloud is under water. Check the water"
+            " level, or omit --submerged."
         )
-        raise GeometryError(
-            "reference.not_submerged", f"{target.name}: {sentence}", path=target.name
-        )
+        raise GeometryError("reference.not_submerged", sentence, path=target.name)
     dry = int((~under).sum()) if target.sparse else 0
     return replace(found, places=kept(under, places), not_submerged=not_submerged + dry)
 
 
 def gap_m(xyz: FloatArray) -> float:
     """Return up to which distance outside a cloud, (n, 3), points count, metres."""
-    return max(GAP_SPACINGS * _mean_spacing_m(xyz), MIN_GAP_M)
+    return max(GAP_SPACINGS * mean_spacing_m(xyz), MIN_GAP_M)
 
 
-def _mean_spacing_m(xyz: FloatArray) -> float:
+def mean_spacing_m(xyz: FloatArray) -> float:
     """Return the mean spacing of points (n, 3) within their bounding box in plan, metres."""
     low, high = bounds(xyz[:, :2])
     extent = high - low
     if extent.min() <= 0.0:
         return float(extent.max() / len(xyz))
     return float(np.sqrt(extent.prod() / len(xyz)))
-
-
-def spacing_m(xyz: FloatArray) -> float:
-    """Return the spacing of points (n, 3) in plan, within the area that they fill, metres.
-
-    That is the area of the squares with points, which are as large as to hold about three each.
-    """
-    low, high = bounds(xyz[:, :2])
-    side = max(np.sqrt(POINTS_PER_SQUARE) * _mean_spacing_m(xyz), 1e-9)
-    columns, rows = ((high - low) / side).astype(np.int64) + 1
-    taken = np.zeros(columns * rows, np.bool_)
-    for some in blocks(len(xyz)):
-        column, row = ((xyz[some, :2] - low) / side).astype(np.int64).T
-        taken[row * columns + column] = True
-    return float(side * np.sqrt(np.count_nonzero(taken) / len(xyz)))
 
 
 def near_in_plan(xy: FloatArray, other_xy: FloatArray, limit_m: float) -> BoolArray:

@@ -10,7 +10,6 @@ import numpy as np
 from pcfix.blocks import blocks, grouped, mapped
 from pcfix.errors import SettingError
 from pcfix.model import FloatArray
-from pcfix.options.steps import SIGMA_REFERENCE_M
 from pcfix.refract.tally import share_of_orders, within_orders
 from pcfix.sums import Figures
 
@@ -66,25 +65,6 @@ def distribution_of(
     return Figures(statistics=statistics_of(values), histogram=histogram, shares=shares)
 
 
-def own_of(s: Figures, of: str, stated_m: float | None, kind: str) -> Figures:
-    """Return errors, of the "bed" or of "all", without the noise of the reference, metres.
-
-    The bias stays as it is, and variances of independent errors add up. RMSE and 95 % bound, which
-    shrinks as the RMSE does, are None if the errors scatter no more than the reference, so that
-    nothing is known about the cloud's own share. The noise is `stated_m`, or the usual one of this
-    kind of reference.
-    """
-    sigma = SIGMA_REFERENCE_M[kind] if stated_m is None else stated_m
-    rmse = within = None
-    if not 0.0 < s.sd_m <= sigma:
-        rmse = math.sqrt(s.rmse_m**2 - min(sigma, s.sd_m) ** 2)
-        within = s.within_95_m * (rmse / s.rmse_m if s.rmse_m else 1.0)
-    return Figures(
-        of=of, sigma_reference_m=sigma, is_assumed=stated_m is None,
-        mean_m=s.mean_m, rmse_m=rmse, within_95_m=within,
-    )  # fmt: skip
-
-
 def tvu_of(error_m: FloatArray, depth_m: FloatArray) -> Figures:
     """Return the total vertical uncertainty at 95 %, as IHO S-44 defines it.
 
@@ -104,29 +84,24 @@ def fit_line(reference_depth_m: FloatArray, depth_m: FloatArray) -> Figures | No
     slope of about 1 / n. None if fewer than three depths, or only equal ones, leave the line
     undefined.
     """
-    if len(depth_m) < 3:
+    if len(depth_m) < 3 or np.ptp(reference_depth_m) <= 1e-9 * np.abs(reference_depth_m).max():
         return None
-    x_mean, y_mean = float(reference_depth_m.mean()), float(depth_m.mean())
-    x, y = reference_depth_m - x_mean, depth_m - y_mean
-    xx, yy, xy = float(x @ x), float(y @ y), float(x @ y)
-    scale = max(float(-reference_depth_m.min()), float(reference_depth_m.max()), 1e-9)
-    if xx <= len(depth_m) * (1e-9 * scale) ** 2:
-        return None
-    r2 = xy * xy / (xx * yy) if yy > 0.0 else 1.0
-    intercept = y_mean - xy / xx * x_mean
-    return Figures(slope=xy / xx, intercept_m=intercept, r2=r2, count=len(depth_m))
+    (xx, xy), (_, yy) = np.cov(reference_depth_m, depth_m, ddof=0).tolist()
+    slope, r2 = xy / xx, xy * xy / (xx * yy) if yy > 0.0 else 1.0
+    intercept = float(depth_m.mean() - slope * reference_depth_m.mean())
+    return Figures(slope=slope, intercept_m=intercept, r2=r2, count=len(depth_m))
 
 
 def binned(
-    by_m: FloatArray, after_m: FloatArray, before_m: FloatArray | None, width_m: float
+    depth_m: FloatArray, after_m: FloatArray, before_m: FloatArray | None, width_m: float
 ) -> list[Figures]:
-    """Return the statistics of bins of reference depth, or of distance, that hold points.
+    """Return the statistics of bins of reference depth that hold points.
 
-    Errors after and before the correction, shape (n,), metres, are sorted `by_m`; edges of bins are
-    multiples of the width. ``before`` is None if it is not known. Raises SettingError
+    Depths, and errors after and before the correction, have the shape (n,), metres; edges of bins
+    are multiples of the width. ``before`` is None if it is not known. Raises SettingError
     ``option.range`` if there are more than `MAX_BINS`.
     """
-    place = mapped(lambda some: np.floor(some / width_m), by_m)
+    place = mapped(lambda some: np.floor(some / width_m), depth_m)
     numbers = np.unique(np.hstack([np.unique(place[rows]) for rows in blocks(len(place))]))
     if len(numbers) > MAX_BINS:
         sentence = f"A bin width of {width_m:g} m makes {len(numbers):,} bins. Use a larger one."

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,10 @@ def calm_frames(
     check_summary(given)
     started = time.perf_counter()
     found = read_frames(frames, given.every)
+    interval = given.interval * given.every if given.interval else found.interval_s
+    if given.surface and interval is None:
+        sentence = "--surface needs the time between the frames. Give --interval."
+        raise SettingError("option.missing", sentence, option="interval")
     target, beside = check_calm(out, found, overwrite=given.overwrite)
     folder = target.with_name(f"{target.stem}_water")
     if given.surface and folder.exists() and not given.overwrite:
@@ -94,17 +99,13 @@ def calm_frames(
             homographies, scatter = _registered(found, count(found))
         median, spread, stack = _median(found, homographies, empty, count(found))
         notes, water = list[PcfixWarning](), None
-        if view is not None:
-            interval = given.interval * given.every if given.interval else found.interval_s
+        if view is not None and interval is not None:
             nodes = nodes_of(view, given.resolution)
             shifts, weights = displacements(median, view, nodes, count(stack))
             waters, water = _water(view, nodes, shifts, weights, interval)
             water.folder = str(folder)
             with temporary_output(folder, is_folder=True) as draft:
                 _write_waters(draft, found.names, view.level_m, nodes.lattice, waters, crs)
-            if interval is None:
-                words = "The times are unknown, so frames are fitted separately. Give --interval."
-                notes.append(PcfixWarning("frames.no_interval", words))
             if water.explained < LEAST_EXPLAINED:
                 words = (
                     f"Waves explain only {100 * water.explained:.0f} % of the slopes (a current,"
@@ -141,12 +142,11 @@ def _registered(frames: Frames, images: Iterable[Any]) -> tuple[FloatArray, Floa
     lost = np.flatnonzero(~np.isfinite(homographies).all(axis=(1, 2)))
     if len(lost):
         names = [frames.names[row] for row in lost]
-        raise InputError(
-            "frames.no_overlap",
+        sentence = (
             f"{frames.path}: {len(lost)} frames share fewer than {LEAST_CORNERS} corners with the"
-            f" first, such as {names[0]}. Remove them, or start with another frame.",
-            frames=names,
+            f" first, such as {names[0]}. Remove them, or start with another frame."
         )
+        raise InputError("frames.no_overlap", sentence, frames=names)
     return homographies, scatter
 
 
@@ -191,9 +191,7 @@ def _view(given: CalmOptions, frames: Frames) -> tuple[View, str | None]:
     rows = [row for row, label in enumerate(cameras.labels) if Path(label).stem == first]
     rows = [0] if len(cameras.labels) == 1 else rows
     if len(rows) != 1 or cameras.rotations is None or cameras.lenses is None:
-        sentence = (
-            f"has no single pose with angles and a lens for {first}. Give one row of that name."
-        )
+        sentence = f"has no single pose with angles and a lens for {first}. Give one such row."
         raise bad_file(given.cameras, "photos.no_pose", sentence, photograph=first)
     photo = photo_of(frames.path, cameras, rows[0], size)
     return View(photo, level, index, bed), crs or cameras.crs
@@ -202,19 +200,17 @@ def _view(given: CalmOptions, frames: Frames) -> tuple[View, str | None]:
 def _bed(given: CalmOptions) -> tuple[Callable[[FloatArray], FloatArray], str | None]:
     """Return the height of the true bed by place, and the CRS of its raster."""
     level = given.level
-    try:
+    depth = np.nan
+    with suppress(ValueError):
         depth = float(given.depth)
-    except ValueError:
-        depth = np.nan
     if np.isfinite(depth):
         if not depth > 0.0:
             sentence = f"depth {depth:g} is not positive. Give metres below the level."
             raise SettingError("option.range", sentence, option="depth", value=depth)
         return lambda xy: np.full(len(xy), level - depth), None
     with tempfile.TemporaryDirectory() as scratch:
-        height, (left, top, cell), crs, corrected = read_heights(
-            given.depth, given.resolution, Path(scratch), fill=True
-        )
+        found = read_heights(given.depth, given.resolution, Path(scratch))
+    height, (left, top, cell), crs, corrected = found
     if not corrected:
         index = index_of(given.index, given.index_formula)[0]
         height = np.where(height < level, level - index * (level - height), height)
@@ -223,10 +219,10 @@ def _bed(given: CalmOptions) -> tuple[Callable[[FloatArray], FloatArray], str | 
 
 
 def _water(
-    view: View, nodes: Nodes, shifts: FloatArray, weights: FloatArray, interval: float | None
+    view: View, nodes: Nodes, shifts: FloatArray, weights: FloatArray, interval_s: float
 ) -> tuple[list[tuple[FloatArray, FloatArray]], Figures]:
-    """Fit the water of each frame; return heights and standard errors, and a summary."""
-    times, seen = np.arange(len(shifts), dtype=np.float64) * (interval or 0.0), nodes.seen
+    """Fit the water of all frames; return heights and standard errors of each, and a summary."""
+    times, seen = np.arange(len(shifts), dtype=np.float64) * interval_s, nodes.seen
     depth = float(np.nanmedian(view.level_m - view.bed(nodes.xy[seen])))
     heights = np.full(shifts.shape[:2], view.level_m)
     for _ in range(PASSES):
@@ -235,25 +231,18 @@ def _water(
         weight = np.where(np.isfinite(slope.sum(axis=2)), weights, 0.0)
         slope = np.nan_to_num(slope)
         if not (weight > 0.0).any():
-            raise GeometryError(
-                "frames.no_water",
-                "No part of the image shows a bed under moving water. Check depth and level.",
-                depth_m=depth,
-            )
-        if interval is not None:  # time ties the frames together
-            waves = [fit_waves(nodes, slope, weight, times, depth)] * len(times)
-        else:
-            each = zip(slope[:, None], weight[:, None], times[:, None], strict=True)
-            waves = [fit_waves(nodes, *one, depth) for one in each]
-        found = [w.at(nodes, t) for w, t in zip(waves, times, strict=True)]
+            sentence = "No part of the image shows a bed under moving water. Check depth and level."
+            raise GeometryError("frames.no_water", sentence, depth_m=depth)
+        waves = fit_waves(nodes, slope, weight, times, depth)
+        found = [waves.at(nodes, time_s) for time_s in times]
         heights = view.level_m + np.stack([height for height, _ in found])
     energy = float((weight[..., None] * slope**2).sum() / (2.0 * weight.sum()))
     summary = Figures(
-        folder="", waves=max(len(one.number) for one in waves),
+        folder="", waves=len(waves.number),
         slope_deg=round(float(np.degrees(np.sqrt(energy))), 3),
         height_m=round(float(np.std([one[0][seen] for one in found])), 4),
         sigma_m=round(float(np.sqrt(np.mean([one[1][seen] ** 2 for one in found]))), 4),
-        explained=round(float(np.mean([one.explained for one in waves])), 3),
+        explained=round(waves.explained, 3),
     )  # fmt: skip
     return found, summary
 

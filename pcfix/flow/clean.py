@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from pcfix.blocks import empty, release
 from pcfix.clean.points import WEAK, Cloud, Reason, flag_neighbours
@@ -75,21 +74,16 @@ def find_noise(
     (n,), and a summary without files and time.
     """
     rules, not_run = options.part(CleanRules), list[str]()
-    tests = {
-        str(reason.name).lower().replace("_", " "): limit for reason, limit, _ in WEAK.values()
-    }
     if rules.weak and not has_rays:
         rules = replace(rules, weak=False)
-        not_run.append(f"{', '.join(tests)}: the cloud was corrected without cameras")
+        not_run.append("weak intersections: the cloud was corrected without cameras")
     water = None
     if options.water is not None:
         water = find_surface(options.water, WaterOptions(), view).surface
     n, has = view.points, {one for one in WEAK if {"RayCount", one} <= set(view.names)}
-    not_run += [
-        f"{test}: the cloud has no dimension {dimension if has else 'RayCount'}"
-        for (test, limit), dimension in zip(tests.items(), WEAK, strict=True)
-        if getattr(rules, limit) is not None and dimension not in has
-    ]
+    missing = ", ".join(one for one in WEAK if one not in has)
+    if rules.weak and missing:
+        not_run.append(f"weak intersections: the cloud has no dimension {missing}")
     if rules.below_or_floating and water is None and not has:
         not_run.append("below bed, floating: no --water, and no dimension RayCount")
     cloud = Cloud(empty((n, 3)), *(np.zeros(n, kind) for kind in (bool, bool, np.uint8)))
@@ -103,10 +97,7 @@ def find_noise(
         current().report(len(points.xyz))
     tested, submerged = int(cloud.used.sum()), int(cloud.submerged.sum())
     if not tested:
-        sentence = (
-            f"all {n:,} points are withheld or noise (class 7 or 18). There is nothing left to"
-            " clean."
-        )
+        sentence = f"all {n:,} points are withheld or noise (class 7 or 18). Nothing is left."
         raise bad_file(view.name, "cloud.all_withheld", sentence, points=n)
     if not rules.below_or_floating:
         submerged = 0
@@ -137,9 +128,9 @@ def find_noise(
 
 
 class CleanPlan(NamedTuple):
-    """The noise of a whole cloud, one bit per point, and the summary."""
+    """The noise of a whole cloud, and the summary."""
 
-    noise: npt.NDArray[np.uint8]
+    noise: BoolArray  # (n,)
     drop: bool
     summary: Figures
 
@@ -165,11 +156,9 @@ def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask)
     with scratch_arrays(near), running(report=count):
         noise, summary = find_noise(options, view, has_rays=has_rays)
     if options.drop and noise.all():
-        sentence = (
-            "every point exceeds these thresholds of noise. Use wider thresholds, or omit --drop."
-        )
+        sentence = "every point is noise by these thresholds. Use wider ones, or omit --drop."
         raise bad_file(cloud, "cloud.all_noise", sentence, points=view.points)
-    return CleanPlan(np.packbits(noise), options.drop, summary)
+    return CleanPlan(noise, options.drop, summary)
 
 
 def _finish(plan: CleanPlan, task: FileTask, count: int) -> Figures:
@@ -186,9 +175,7 @@ def _cleaning(plan: CleanPlan, source: LasSource) -> FileWork:
 
     def compute(points: Chunk, row: int) -> tuple[BoolArray, int]:
         """Return which points of a chunk are noise, and their number."""
-        end, byte = row + len(points), row // 8
-        bits = np.unpackbits(plan.noise[byte : (end + 7) // 8])
-        return bits[row - 8 * byte : end - 8 * byte].astype(np.bool_), len(points)
+        return plan.noise[row : row + len(points)], len(points)
 
     def apply(points: Chunk, noise: BoolArray) -> Chunk:
         """Flag or drop the noise."""

@@ -24,6 +24,8 @@ from pcfix.options.steps import CompareOptions, CompareRules
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+DEPTHS = "depth_bins.csv"
+
 
 def compare_clouds(
     cloud: Clouds, reference: Clouds, *, options: CompareOptions | None = None, **keywords: Any
@@ -89,9 +91,9 @@ def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
             raise SettingError("output.no_folder", sentence, path=folder)
         if not folder.exists():
             check_output(folder, overwrite=False)
-        names = ["compare.json", "depth_bins.csv", "shore_bins.csv"]
         if folder.is_dir():
-            for path in [*(folder / name for name in names), *folder.glob("section_*.csv")]:
+            ours = [*folder.glob("section_*.csv"), folder / "compare.json", folder / DEPTHS]
+            for path in ours:
                 check_output(path, overwrite=given.overwrite, inputs=inputs)
     check_summary(given, inputs)
 
@@ -102,9 +104,9 @@ def _write(result: Comparison, given: CompareOptions) -> None:
     folder = None if given.out_dir is None else Path(given.out_dir)
     with all_or_none(folder):
         if folder is not None:
-            tables = {"depth_bins.csv": result.depth_bins, "shore_bins.csv": result.shore_bins}
             files = {"compare.json": json_text(result.as_dict())}
-            files |= {name: bins_table(bins) for name, bins in tables.items() if bins}
+            if result.depth_bins:
+                files[DEPTHS] = bins_table(result.depth_bins)
             sections = enumerate(result.sections, start=1)
             files |= {f"section_{n:02d}.csv": s.table() for n, s in sections}
             for name, content in files.items():

@@ -44,17 +44,12 @@ from pcfix.model import (
     WaterDimension,
     WaterSurface,
 )
-from pcfix.options.correct import (
-    CorrectOptions,
-    LabelRules,
-    PointsOptions,
-    RefractionOptions,
-    ScienceOptions,
-)
+from pcfix.options.correct import CorrectOptions, PointsOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import File, taken
+from pcfix.options.shared import LandRules
 from pcfix.refract.regression import DepthRegression
 from pcfix.refract.tally import Tally
-from pcfix.report.summary import Summary
+from pcfix.report.text import Summary
 from pcfix.version import __version__
 from pcfix.water.auto import WaterProposal
 from pcfix.water.checks import as_surface, check_submerged, checked_points, refuse_under_water
@@ -371,7 +366,7 @@ def correct_points(
         FoundSurface(surface),
         offset,
         views,
-        Labelling(LabelRules()),
+        Labelling(LandRules()),
         regression,
     )
     plan = plan_correction(plan)

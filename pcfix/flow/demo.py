@@ -54,13 +54,9 @@ def _table(scene: Scene, corrected: FloatArray) -> str:
     """Return the errors of the bed without and with a correction, in centimetres and GSD."""
     level, n = scene.water_level_m, scene.refractive_index
     deep = scene.true_xyz[:, 2] < level - LEAST_DEPTH_M
-    times_n = scene.apparent_xyz.copy()
-    below = times_n[:, 2] < level
-    times_n[below, 2] = level - n * (level - times_n[below, 2])
     by_default = correct_points(scene.apparent_xyz, scene.cameras, scene.water, index=n)
     rows = {
         "uncorrected": scene.apparent_xyz,
-        f"depth times {n:g}": times_n,
         "default options": by_default.xyz,
         "with the view list": corrected,
     }

@@ -8,7 +8,6 @@ size of chunks, tiles and windows.
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -21,9 +20,8 @@ import numpy as np
 from pcfix.blocks import bounds, empty, release
 from pcfix.clean.neighbours import Tiles as PointTiles
 from pcfix.clean.neighbours import make_tiles
-from pcfix.errors import PcfixWarning, SettingError, bad_file
+from pcfix.errors import bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
-from pcfix.grid.colours import NO_LIGHT, hillshade
 from pcfix.grid.heights import fill_holes, grid_window, margin_cells
 from pcfix.grid.lattice import Lattice, lattice_over, round_resolution, spacing_m
 from pcfix.io import rasters
@@ -54,10 +52,8 @@ BIN_POINTS = 200_000
 TO_95 = 1.959964
 """Half-width of 95 % of a normal distribution, in standard deviations."""
 SIGMA_Z = "SigmaZ"
-FEWEST_A_CELL = 0.9
-"""Points per cell, on average where there are any; fewer give a warning."""
-DIMENSIONS = {"depth": "WaterDepth", "uncertainty": SIGMA_Z}
-"""Dimensions of these quantities; any other quantity is the dimension of its name."""
+DIMENSIONS = {"height": None, "depth": "WaterDepth", "uncertainty": SIGMA_Z}
+"""Where the values of a quantity are."""
 POINTS_A_SQUARE, MOST_SQUARES = 6.0, 4_000_000
 """Points of a square, if these fill the area, and squares to measure the spacing of points."""
 
@@ -72,12 +68,12 @@ def grid_dsm(
 ) -> Figures:
     """Grid a cloud to a GeoTIFF of heights or another quantity; what ``pcfix dsm`` runs.
 
-    The file has one band of float32, -9999 (nodata) if a cell has no value. Heights keep the
-    vertical datum of the cloud; other quantities have the horizontal CRS only, as programs would
-    take their values for heights. Depth is `WaterDepth`, and uncertainty the vertical one at 95 %,
-    of the bed (class 40), as `pcfix.correct_file` writes them. The uncertainty of a cell is not
-    divided by the square root of the number of its points: errors of level, index and tilt of the
-    water and of poses are common to them. To treat all errors as common is conservative.
+    The file is a cloud optimised GeoTIFF with one band of float32, -9999 (nodata) if a cell has no
+    value. Heights keep the vertical datum of the cloud; other quantities have the horizontal CRS
+    only, as programs would take their values for heights. Depth is `WaterDepth`, and uncertainty
+    the vertical one at 95 %, of the bed (class 40), as `pcfix.correct_file` writes them. The
+    uncertainty of a cell is not divided by the square root of the number of its points, because
+    their errors are mostly common.
 
     With `counts` a second file has two bands: count (points in the cell) and spread (population
     standard deviation of their values). A cell with a value and count 0 was interpolated.
@@ -91,20 +87,16 @@ def grid_dsm(
     options, progress
         See `pcfix.correct_file`. The bounds of the raster are
         multiples of the resolution (m), by default that of `pcfix.grid.lattice.round_resolution`; a
-        point on an edge belongs to the cell east or north of it. The method "idw" weights points
-        around the centre with 1 / distance squared; "tin" uses Delaunay triangles, and fill is the
-        diameter of the widest circle without a point, by default five times the spacing of the
-        points and at least three cells. Withheld points and noise (classes 7 and 18) are not used.
-        The hillshade is uint8: 1 dark to 255 bright, nodata 0.
+        point on an edge belongs to the cell east or north of it. The method "tin" uses Delaunay
+        triangles, and fill is the diameter of the widest circle without a point, by default five
+        times the spacing of the points and at least three cells. Withheld points and noise (classes
+        7 and 18) are not used.
     """
     given = taken(DsmOptions, options, keywords, "grid_dsm")
     rules, files = given.part(DsmRules), cloud_of(input)
-    named = {"hillshade": given.hillshade, "counts": given.counts}
-    more = {name: Path(path) for name, path in named.items() if path is not None}
-    task = file_task(
-        files, output, given,
-        more=more.values(), check=rasters.check_tif, progress=progress,
-    )  # fmt: skip
+    more = {} if given.counts is None else {"counts": Path(given.counts)}
+    how: dict[str, Any] = {"more": more.values(), "check": rasters.check_tif}
+    task = file_task(files, output, given, progress=progress, **how)
     style = task.target.with_suffix(".qml")
     if given.style:
         check_output(style, overwrite=given.overwrite, inputs=inputs_of(files))
@@ -114,10 +106,8 @@ def grid_dsm(
             progress(round(share * count), count)
 
     with ExitStack() as stack:
-        drafts = {
-            name: stack.enter_context(temporary_output(path))
-            for name, path in {"dsm": task.target, **more}.items()
-        }
+        outputs = {"dsm": task.target, **more}
+        drafts = {n: stack.enter_context(temporary_output(path)) for n, path in outputs.items()}
         folder = stack.enter_context(scratch_folder(task.target))
         stack.enter_context(scratch_arrays(task.target))
         with open_cloud(task.source) as source:
@@ -129,32 +119,20 @@ def grid_dsm(
                 rules = replace(rules, resolution=cell_m)
             apart_m = _spacing_m(source, used, rules.cell_m)
         lattice = lattice_over(*bounds(used[:, :2]), rules.cell_m, str(task.source))
-        if (density := (rules.cell_m / apart_m) ** 2 if apart_m else np.inf) < FEWEST_A_CELL:
-            sentence = (
-                f"The resolution {rules.cell_m:g} m is finer than the points allow: their spacing"
-                f" is {apart_m:.2g} m, or {density:.2g} points a cell. Use at least that spacing."
-            )
-            warnings.warn(PcfixWarning("dsm.fine", sentence, spacing_m=apart_m), stacklevel=2)
         tiles = make_tiles(used, points=BIN_POINTS)
         # the widest circle around a triangle
-        reach_m = max(
-            TIN_REACH_SPACINGS * apart_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
-        )
-        # a cloud optimised file is a copy, with overviews of its own
-        paths = {name: folder / f"{name}.tif" if given.cog else drafts[name] for name in drafts}
+        reach = TIN_REACH_SPACINGS * apart_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
+        reach_m = max(reach)
+        paths = {name: folder / f"{name}.tif" for name in drafts}
         tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
         counted = _write_rasters(tiles, lattice, reach_m, apart_m, rules, paths, crs, tags, report)
         for name, path in paths.items():
-            if given.cog:
-                rasters.copy_as_cog(path, drafts[name])
-            else:
-                rasters.add_overviews(path)
+            rasters.copy_as_cog(path, drafts[name])
     if given.style:
         write_text(style, raster_style(task.target, rules.what), overwrite=given.overwrite)
     result = Figures(
         input=str(task.source),
         output=str(task.target),
-        hillshade=None if given.hillshade is None else str(given.hillshade),
         counts=None if given.counts is None else str(given.counts),
         what=rules.what,
         pcfix=__version__,
@@ -171,7 +149,6 @@ def grid_dsm(
         hole_m=reach_m if rules.method == "tin" else rules.fill,  # widest hole that was bridged
         settings=asdict(rules),
         seconds=task.seconds,
-        resolution_is="given" if given.resolution else "chosen",
     )
     write_summary(given, result.as_dict())
     return result
@@ -188,16 +165,15 @@ def _write_rasters(
     tags: dict[str, Any],
     report: Callable[[float], None],
 ) -> dict[str, Any]:
-    """Write the raster, and hillshade and counts where they have a path.
+    """Write the raster, and the counts if they have a path.
 
     Returns the numbers of cells and the statistics of their values, by their names in the summary.
     """
     size_m, method = rules.cell_m, rules.method
     reach, spacing = reach_m / size_m, apart_m / size_m
     # the number of cells around a window whose points decide on it
-    beyond = {"tin": int(np.ceil(reach)) + 1, "idw": 1}.get(method, 0)
+    beyond = int(np.ceil(reach)) + 1 if method == "tin" else 0
     plan = None if crs is None else parts(crs)[0]
-    unit = METRE if rules.what == "height" or rules.what in DIMENSIONS else ""
     new = partial(rasters.new_raster, lattice=lattice, tags={"PCFIX": json.dumps(tags)})
     # the width of holes to fill, in cells; a TIN has filled its own
     widest = 0.0 if method == "tin" else (rules.fill or 0.0) / size_m
@@ -206,11 +182,11 @@ def _write_rasters(
     side = np.sqrt(WINDOW_POINTS) * spacing or BLOCK_CELLS
     cells, filled, known, count, total, low, high, done = 0, 0, 0, 0, 0.0, np.inf, -np.inf, 0
     with ExitStack() as files:
-        bands = {rules.what: unit}
+        bands: dict[str, str] = {rules.what: METRE}
         system = crs if rules.what == "height" else plan
         dsm = files.enter_context(new(paths["dsm"], crs=system, bands=bands))
         if "counts" in paths:
-            bands = {"count": "", "spread": unit}
+            bands = {"count": "", "spread": METRE}
             counts = files.enter_context(new(paths["counts"], crs=plan, bands=bands))
         for window in lattice.window.parts(int(np.clip(side, 4 * margin + 1, BLOCK_CELLS))):
             around = window.grown(margin).clipped(lattice.window)
@@ -234,15 +210,6 @@ def _write_rasters(
             low, high = values.min(initial=low), values.max(initial=high)
             done += height.size
             report(0.5 + 0.5 * done / (lattice.height * lattice.width))
-    if "hillshade" in paths:
-        shade = rasters.new_raster(
-            paths["hillshade"], lattice, plan, {"hillshade": ""}, dtype="uint8", nodata=NO_LIGHT
-        )
-        with rasters.open_raster(paths["dsm"]) as heights, shade as out:
-            for window in lattice.window.parts(BLOCK_CELLS):
-                height = rasters.read_within(heights, window.grown(1))
-                light = hillshade(height, size_m, rules.azimuth, rules.altitude)
-                rasters.write_part(out, light, window, 1)
     found = {"min": low, "mean": total / count, "max": high} if count else {}
     return {
         "cells": cells,  # with points
@@ -273,7 +240,13 @@ def _spacing_m(source: LasSource, xyz: FloatArray, finest_m: float = MIN_RESOLUT
 
 def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], None]) -> FloatArray:
     """Read the points to grid, shape (n, 3), the gridded values in the place of z."""
-    dimension = _dimension_of(source, rules.what)
+    dimension = DIMENSIONS[rules.what]
+    if dimension not in (None, *source.header.point_format.dimension_names):
+        sentence = (
+            f"has no dimension {dimension}, which --what {rules.what} needs. Correct the cloud"
+            " first, with --dimensions all."
+        )
+        raise bad_file(source.path, "cloud.no_dimension", sentence, dimension=dimension)
     result, count, done = empty((len(source), 3)), 0, 0
     for points in source.chunks():
         xyz = coordinates(points)
@@ -300,20 +273,3 @@ def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], Non
         sentence = "all points are noise (classes 7 and 18) or withheld. Classify it again."
         raise bad_file(source.path, "cloud.all_withheld", sentence)
     return result[:count]
-
-
-def _dimension_of(source: LasSource, what: str) -> str | None:
-    """Return the dimension whose values are gridded, None for heights."""
-    name = None if what == "height" else DIMENSIONS.get(what, what)
-    names = list(source.header.point_format.dimension_names)
-    if name is None or name in names:
-        return name
-    if what in DIMENSIONS:
-        sentence = (
-            f"has no dimension {name}, which --what {what} needs. Correct the cloud first, with"
-            " --dimensions all."
-        )
-        raise bad_file(source.path, "cloud.no_dimension", sentence, dimension=name)
-    known = ", ".join(("height", *DIMENSIONS, *names))
-    sentence = f"{source.path}: has no dimension {what}. --what is one of {known}."
-    raise SettingError("option.choice", sentence, option="what", value=what)

@@ -27,9 +27,8 @@ from pcfix.io.vectors import LAYER_MARK, read_water_polygons
 from pcfix.io.views import ViewList, read_views, track_views
 from pcfix.label.labelling import Labelling, WaterMask
 from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints
-from pcfix.options.correct import LabelRules
 from pcfix.options.declare import File, OptionSet, options_of
-from pcfix.options.shared import InputOptions, MaskOption
+from pcfix.options.shared import InputOptions, LandRules, MaskOption
 from pcfix.port.shapes import port_of
 from pcfix.water.surface import FoundSurface
 
@@ -289,7 +288,7 @@ def mask_of(path: File | None, cloud_crs: str | CRS | None) -> WaterMask | None:
 def labelling_of(options: Any, view: CloudView) -> Labelling:
     """Return the rules by which points count as submerged, with the mask in the cloud's CRS."""
     mask = mask_of(options.water_mask, view.crs)
-    return Labelling(options.part(LabelRules), mask)
+    return Labelling(options.part(LandRules), mask)
 
 
 def _warn(notes: Iterable[str | PcfixWarning]) -> None:

@@ -29,8 +29,9 @@ from pcfix.io.las.writing import output_header
 from pcfix.io.tiles import Clouds
 from pcfix.label.labelling import LabelCounts, Labelling, Part, WaterMask
 from pcfix.model import WaterPlane, WaterSurface
-from pcfix.options.correct import LabelOptions, LabelRules, StageLabelOptions
+from pcfix.options.correct import LabelOptions, StageLabelOptions
 from pcfix.options.declare import File, taken
+from pcfix.options.shared import LandRules
 from pcfix.sums import Figures
 from pcfix.version import __version__
 from pcfix.water.checks import (
@@ -52,7 +53,7 @@ def label_points(
     classes: npt.ArrayLike | None = None,
     water_mask: WaterMask | File | None = None,
     crs: str | None = None,
-    options: LabelRules | None = None,
+    options: LandRules | None = None,
     **keywords: Any,
 ) -> Classes:
     """Return the classes of points, 40 where they are submerged.
@@ -69,9 +70,8 @@ def label_points(
         See `label_file`.
     crs : str, optional
         CRS of the points, for a mask from a file.
-    options : LabelRules, optional
-        Or its attributes as keywords: surface_band, dead_band, connected, respect_classes and
-        others.
+    options : LandRules, optional
+        Or its attributes as keywords: connected, least_pool and respect_classes.
 
     Returns
     -------
@@ -83,7 +83,7 @@ def label_points(
     >>> label_points([[0, 0, 1.0], [5, 0, -1.0]], 0.0).tolist()
     [0, 40]
     """
-    rules = taken(LabelRules, options, keywords, "label_points")
+    rules = taken(LandRules, options, keywords, "label_points")
     points = checked_points(xyz)
     given = np.zeros(len(points), np.uint8)
     if classes is not None:
@@ -106,9 +106,6 @@ def label_file(
 ) -> Figures:
     """Set the submerged points of a LAS or LAZ cloud to class 40; what ``pcfix label`` runs.
 
-    With a band, points near the surface get class 41; with ``reset``, points of class 40 or 41 that
-    are neither get class 1. All other classes above the water stay, 42 to 45 too.
-
     Parameters
     ----------
     input, output : path
@@ -116,8 +113,7 @@ def label_file(
         see `pcfix.correct_file`. Of a GeoTIFF of heights the classes of its cells are a GeoTIFF
         too, with 255 for nodata.
     options, progress
-        See `pcfix.correct_file`. With a dead band or connectivity the cloud is read twice. A point
-        on the border of the mask is inside.
+        See `pcfix.correct_file`. With connectivity the cloud is read twice.
     """
     given = taken(LabelOptions, options, keywords, "label_file")
     run = command_for(output, given)
@@ -155,10 +151,9 @@ def label_chunk(plan: LabelPlan, points: Points) -> tuple[Classes, LabelCounts]:
 
 
 def check(plan: LabelPlan, counts: LabelCounts) -> None:
-    """Raise GeometryError if no point lies below the water, or inside the mask."""
-    below = counts.submerged + counts.water_surface
-    plan.labelling.check(plan.name, counts, below)
-    check_submerged(below, plan.name, plan.water)
+    """Raise GeometryError if no point is below the water, or inside the mask."""
+    plan.labelling.check(plan.name, counts)
+    check_submerged(counts.submerged, plan.name, plan.water)
 
 
 def _labelling(plan: LabelPlan, source: LasSource) -> FileWork:

@@ -16,9 +16,8 @@ from pcfix.flow.raster import write_cells
 from pcfix.flow.run_folder import SURFACE, RunFolder
 from pcfix.flow.runner import Progress
 from pcfix.flow.surfaces import file_points, view_of
-from pcfix.grid.colours import hillshade, relief_colours
-from pcfix.grid.lattice import round_resolution
-from pcfix.grid.maps import contours, depth_interval
+from pcfix.grid.lattice import Window, round_resolution
+from pcfix.grid.maps import contours, depth_interval, hillshade, relief_colours
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
@@ -38,7 +37,6 @@ BED, DEPTH, UNCERTAINTY = "bed.tif", "depth.tif", "uncertainty.tif"
 COUNTS, SHADED, CORRECTED = "surface_counts.tif", "shaded.tif", "corrected.tif"
 HOLE_CELLS = 3.0
 """Width of holes that are filled: of cells with random points, one in twenty is empty."""
-SUN_DEG = 315.0, 45.0
 MOST_CELLS = 4_000_000
 """Of the rasters for contours and outline."""
 SECTIONS = 3
@@ -70,7 +68,7 @@ def write_rasters(run: RunFolder, *, errors: bool, progress: Progress | None = N
             cell_m = cell_m or float(raster.res[0])
     if cell_m is None:
         cell_m = round_resolution(point_spacing_m(cloud, folder / SURFACE))
-    plain = DsmOptions(resolution=cell_m, cog=True, style=True, overwrite=True)
+    plain = DsmOptions(resolution=cell_m, style=True, overwrite=True)
     filled = replace(plain, fill=HOLE_CELLS * cell_m)
     asked = {
         SURFACE: replace(filled, counts=folder / COUNTS),
@@ -112,13 +110,14 @@ def _write_shaded(folder: Path) -> None:
             for window in lattice.window.parts(BLOCK_CELLS):
                 wide = window.grown(edge)
                 height = rasters.read_within(surface, wide)
-                deep = rasters.read_within(depth, wide.moved(down, right))
+                moved = Window(*np.add(wide, (down, down, right, right)).tolist())
+                deep = rasters.read_within(depth, moved)
                 level = minimum_filter(np.nan_to_num(height + deep, nan=np.inf), 2 * edge + 1)
                 is_wet = np.isnan(deep) & (height < level) & np.isfinite(level)
                 deep = np.where(is_wet, level - height, deep)[edge:-edge, edge:-edge]
                 around = height[edge - 1 : 1 - edge, edge - 1 : 1 - edge]
-                light = hillshade(around, lattice.resolution_m, *SUN_DEG)
-                colours = relief_colours(light, deep, high, flat=np.sin(np.radians(SUN_DEG[1])))
+                light = hillshade(around, lattice.resolution_m)
+                colours = relief_colours(light, deep, high)
                 for number, band in enumerate(colours, start=1):
                     rasters.write_part(out, band, window, number)
         rasters.copy_as_cog(plain, draft)

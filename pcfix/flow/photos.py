@@ -1,11 +1,11 @@
-"""Remove refraction from photographs, several at a time; an interrupted call is resumed."""
+"""Remove refraction from photographs, several at a time."""
 
 from __future__ import annotations
 
 import json
 import time
 import warnings
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,16 +18,9 @@ import numpy.typing as npt
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.runner import (
-    Progress,
-    check_folder,
-    check_summary,
-    json_text,
-    key_of,
-    write_summary,
-)
+from pcfix.flow.runner import Progress, check_folder, check_summary, write_summary
 from pcfix.io.clouds import is_cloud
-from pcfix.io.files import read_json, write_text
+from pcfix.io.files import check_output
 from pcfix.io.labels import match_labels
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
 from pcfix.io.rasters import filled_heights, open_raster
@@ -41,12 +34,9 @@ from pcfix.sums import Figures
 from pcfix.water.checks import check_above_water
 from pcfix.water.index import index_of
 
-RECORD = "pcfix-photos.json"
 LEAST_STEP_PX = 8
 COARSE_STEP_PX = 100
 """Between the rays that test whether an image sees any of the ground."""
-MOST_BLACK = 0.2
-"""Share of an image; more gives a warning."""
 LENS_TOLERANCE = 0.005
 """Of the shape of a frame in millimetres against that of the image."""
 
@@ -67,7 +57,7 @@ def map_photos(
         Folder of JPEG, TIFF or PNG files, named as in the camera file.
     out : path
         Folder, created if needed. Files keep their names, sizes, bands and metadata, so the camera
-        file needs no change. Images that an equal call has written are not written again.
+        file needs no change.
     options, progress
         See `pcfix.correct_file`; progress is in images. After an error finished images stay.
     """
@@ -81,74 +71,39 @@ def map_photos(
     with threads(given.jobs), TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))
         target.mkdir(parents=True, exist_ok=True)
-        results = () if given.overwrite else (target / path.name for path in block.paths)
-        old = {path.name: path for path in results if path.exists()}
-        open_record(target / RECORD, key_of("photos", given), old.values())
-        both = zip(block.paths, block.photos, strict=True)
-        todo = {path: photo for path, photo in both if path.name not in old}
+        for path in block.paths:
+            check_output(target / path.name, overwrite=given.overwrite, inputs=paths)
 
-        def write(path: Path, photo: Photo) -> tuple[str, int, int, float]:
-            """Write a photograph; return its name, pixels, black pixels, and largest shift."""
+        def write(path: Path, photo: Photo) -> tuple[int, int, float]:
+            """Write a photograph; return its pixels, black pixels, and largest shift."""
             with threads(1):  # each photograph has a thread
                 shifts = mapped(photo, block.scene_of(path), block.step_px)
             image, touched, black = resample(read_photograph(path), shifts)
             write_photograph(path, target / path.name, image, touched)
-            return path.name, touched.size, black, float(np.abs(shifts.shift_px).max())
+            return touched.size, black, float(np.abs(shifts.shift_px).max())
 
-        found: list[tuple[str, int, int, float]] = []
-        with ThreadPoolExecutor(max(1, min(current().threads, len(todo)))) as pool:
-            for one in pool.map(write, todo.keys(), todo.values()):
+        found = list[tuple[int, int, float]]()
+        with ThreadPoolExecutor(min(current().threads, len(block.paths))) as pool:
+            for one in pool.map(write, block.paths, block.photos):
                 found.append(one)
                 if progress is not None:
-                    progress(len(old) + len(found), len(block.paths))
-    notes = list(block.notes)
-    poor = [
-        (black / pixels, name) for name, pixels, black, _ in found if black > MOST_BLACK * pixels
-    ]
-    if poor:
-        worst, name = max(poor)
-        words = (
-            f"{given.dsm}: does not cover the frames of {len(poor)} photographs; more than"
-            f" {100 * MOST_BLACK:.0f} % of them is black ({name}: {100 * worst:.0f} %)."
-        )
-        notes.append(PcfixWarning("dsm.too_small", words, photographs=len(poor)))
-    pixels = sum(one[1] for one in found)
+                    progress(len(found), len(block.paths))
+    pixels, black, largest = zip(*found, strict=True)
     return finished(
         given,
         started,
-        notes,
+        block.notes,
         images=len(block.photos),
-        done_before=len(old),  # images that an earlier call wrote
-        megapixels=round(1e-6 * pixels, 1),
-        largest_shift_px=round(max((one[3] for one in found), default=0.0), 2),
+        megapixels=round(1e-6 * sum(pixels), 1),
+        largest_shift_px=round(max(largest), 2),
         # of the pixels: without ground, occluded, or outside the original image
-        black_share=round(sum(one[2] for one in found) / max(pixels, 1), 5),
+        black_share=round(sum(black) / sum(pixels), 5),
         mapping=given.mapping,
         dsm=str(given.dsm),
         water=str(block.scene.water),
         refractive_index=block.scene.refractive_index,
         spacing_px=block.step_px,
     )
-
-
-def open_record(place: Path, key: str, written: Collection[Path]) -> dict[str, Any]:
-    """Return the record of an equal call that wrote to a folder; without results, a new one.
-
-    `key` is that of `key_of`. `written` are the results in the folder, which another call must not
-    mix with its own.
-    """
-    record: dict[str, Any] = read_json(place) if place.exists() else {}
-    if not written:
-        record = {"key": key}
-        write_text(place, json_text(record), overwrite=True)
-    elif record.get("key") != key:
-        raise SettingError(
-            "output.exists",
-            f"{min(written)}: exists, from other options or inputs. Add --overwrite to"
-            " replace it, or give another folder.",
-            path=min(written),
-        )
-    return record
 
 
 def finished(given: Any, started: float, notes: Iterable[PcfixWarning], **figures: Any) -> Figures:
@@ -201,21 +156,14 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
     if given.resolution is not None and not is_cloud(Path(given.dsm)):
         sentence = "--resolution applies only to a cloud, but the DSM is a raster. Omit it."
         raise SettingError("option.no_use", sentence, option="resolution")
-    heights, origin, crs, corrected = read_heights(
-        given.dsm, given.resolution, scratch, fill=given.holes == "fill"
-    )
-    is_exact, notes = given.mapping == "exact", list[PcfixWarning]()
-    if corrected and not is_exact:
-        raise SettingError(
-            "dsm.corrected",
+    heights, origin, crs, corrected = read_heights(given.dsm, given.resolution, scratch)
+    if corrected and given.mapping == "paper":
+        sentence = (
             f"{given.dsm}: is of a corrected cloud, but --mapping paper needs the apparent bed."
-            " Give the DSM of the uncorrected cloud, or --mapping exact.",
-            path=given.dsm,
+            " Give the DSM of the uncorrected cloud, or --mapping exact."
         )
-    if not corrected:
-        bed = "the true bed, as from 'pcfix correct'" if is_exact else "the apparent bed"
-        words = f"{given.dsm}: does not state whether it was corrected; it is used as {bed}."
-        notes.append(PcfixWarning("dsm.origin_unknown", words, path=given.dsm))
+        raise SettingError("dsm.corrected", sentence, path=given.dsm)
+    notes = list[PcfixWarning]()
     cameras, _ = inputs.block(crs, read)
     row = match_labels([path.name for path in paths], cameras.labels, one_to_one=False)[0]
     lost = [path.name for path, one in zip(paths, row, strict=True) if one < 0]
@@ -246,30 +194,28 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
     low = float(np.nanmin(ground.height_m))
     sizes = [(photo.centre[2] - low) / photo.lens.focal for photo in photos]
     if not min(sizes) > 0.0:
-        raise GeometryError(
-            "cameras.below_ground",
+        sentence = (
             f"{name}: cameras are below the DSM, whose lowest height is {low:.1f} m. Check its CRS"
-            " and vertical datum.",
-            path=name, lowest_m=low,
-        )  # fmt: skip
+            " and vertical datum."
+        )
+        raise GeometryError("cameras.below_ground", sentence, path=name, lowest_m=low)
     scene = Scene(ground, surface, index_of(given.index, given.index_formula)[0])
     coarse = ((photo, nodes_of(photo.lens, COARSE_STEP_PX)[0]) for photo in photos)
     if not any(ground_seen(photo, scene, nodes)[2].any() for photo, nodes in coarse):
-        raise GeometryError(
-            "cameras.no_overlap",
+        sentence = (
             f"{given.dsm}: is in none of the {len(photos)} photographs. Check its CRS and that of"
-            f" {given.cameras} (--cameras-crs, --cameras-offset).",
-            path=given.dsm,
+            f" {given.cameras} (--cameras-crs, --cameras-offset)."
         )
+        raise GeometryError("cameras.no_overlap", sentence, path=given.dsm)
     gsd = float(np.median(sizes))
-    step = given.spacing or max(LEAST_STEP_PX, int(np.ceil(ground.cell_m / gsd)))
+    step = max(LEAST_STEP_PX, int(np.ceil(ground.cell_m / gsd)))
     return PhotoBlock(tuple(paths), tuple(photos), scene, step, tuple(notes), crs, gsd, waters)
 
 
 def read_heights(
-    dsm: File, resolution: float | None, scratch: Path, *, fill: bool
+    dsm: File, resolution: float | None, scratch: Path
 ) -> tuple[FloatArray, tuple[float, float, float], str | None, bool]:
-    """Read a DSM, or grid a cloud in a folder for temporary files.
+    """Read a DSM and fill its holes, or grid a cloud in a folder for temporary files.
 
     Returns the heights, shape (rows, columns); left, top and size of the cells; the CRS; and
     whether pcfix made it of a corrected cloud.
@@ -281,7 +227,7 @@ def read_heights(
     with open_raster(path) as source:
         t, tags = source.transform, source.tags()
         crs = None if source.crs is None else source.crs.to_wkt()
-        heights = filled_heights(source, fill=fill)
+        heights = filled_heights(source)
     if abs(t.a + t.e) >= 1e-6 * t.a or t.b or t.d:
         sentence = "its cells are rotated or not square. Warp it to north up first."
         raise bad_file(dsm, "raster.rotated", sentence)

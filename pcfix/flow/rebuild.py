@@ -11,7 +11,6 @@ from __future__ import annotations
 import shlex
 import shutil
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
@@ -21,13 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError
-from pcfix.flow.compare import compare_clouds
+from pcfix.errors import InputError, SettingError
 from pcfix.flow.dsm import grid_dsm
-from pcfix.flow.photos import PhotoBlock, block_of, finished, map_photos, open_record
+from pcfix.flow.photos import PhotoBlock, block_of, finished, map_photos
 from pcfix.flow.runner import Progress, check_summary, json_text, key_of
 from pcfix.io.clouds import is_cloud
-from pcfix.io.files import check_input, run_logged, write_text
+from pcfix.io.files import read_json, run_logged, write_text
 from pcfix.io.las.writing import write_points
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.io.rasters import open_raster, place_of, read_masked, write_dod
@@ -40,12 +38,10 @@ from pcfix.sums import Figures
 from pcfix.water.surface import surface_above
 
 RECORD = "pcfix-rebuild.json"
-PAPER_ROUNDS = 3
-"""Rounds after which the mapping by eq 12 is close to its fixed point, which is not the bed."""
 STEREO_CELL_PIXELS = 2.0
 STEREO_STEP_M = 0.001
 CACHED_PHOTOGRAPHS = 16
-COMMAND_ONLY = ("overwrite", "jobs", "summary", "rebuild", "until_gsd", "most_rounds", "reference")
+COMMAND_ONLY = ("overwrite", "jobs", "summary", "rebuild", "until_gsd", "most_rounds")
 """Options that a later call may change and still resume."""
 
 
@@ -74,11 +70,6 @@ def rebuild_rounds(
         Called with (photographs or pairs done, those in all).
     say : callable, optional
         Called with a line for each round.
-
-    Raises
-    ------
-    PcfixError
-        Finished rounds stay.
     """
     started = time.perf_counter()
     given = taken(PhotosOptions, options, keywords, "rebuild_rounds")
@@ -87,74 +78,51 @@ def rebuild_rounds(
         raise SettingError("option.missing", sentence, option="rebuild")
     paths, target = photographs_in(Path(images)), Path(out)
     check_summary(given)
-    if given.reference is not None:
-        check_input(given.reference)
     target.mkdir(parents=True, exist_ok=True)
     folders = list(target.glob("round[0-9]*"))
     while given.overwrite and folders:
         shutil.rmtree(folders.pop())
-    record = open_record(target / RECORD, key_of("rebuild", given, ignored=COMMAND_ONLY), folders)
-    record.setdefault("rounds", [])
-    start = str(given.dsm) if is_cloud(Path(given.dsm)) else None
-    if start is not None:  # a cloud is gridded to the folder
+    place, key = target / RECORD, key_of("rebuild", given, ignored=COMMAND_ONLY)
+    if folders and place.exists() and read_json(place) != {"key": key}:
+        sentence = (
+            f"{target}: has rounds of other options or inputs. Add --overwrite to replace them."
+        )
+        raise SettingError("output.exists", sentence, path=target)
+    write_text(place, json_text({"key": key}), overwrite=True)
+    if is_cloud(Path(given.dsm)):  # it is gridded to the folder
         raster = target / "dsm.tif"
-        fresh = raster.exists() and raster.stat().st_mtime_ns > Path(start).stat().st_mtime_ns
-        if given.overwrite or not fresh:
-            grid_dsm(start, raster, resolution=given.resolution, overwrite=True)
+        if not (folders and raster.exists()):
+            grid_dsm(given.dsm, raster, resolution=given.resolution, overwrite=True)
         given = replace(given, dsm=raster, resolution=None)
     with threads(given.jobs), TemporaryDirectory() as scratch:
         block = block_of(given, paths, Path(scratch))
     threshold_m = round(given.until_gsd * block.gsd_m, 5)
     rounds, done_before = list[Figures](), 0
-    notes: list[PcfixWarning] = []
+    # each round starts from the original images
+    how = replace(given, resolution=None, summary=None, **RebuildOptions().as_dict())
     while len(rounds) < given.most_rounds and not (rounds and abs(rounds[-1].mean_m) < threshold_m):
         number, before = len(rounds) + 1, Path(rounds[-1].dsm if rounds else given.dsm)
         folder = target / f"round{number}"
         cloud, dsm = folder / "cloud.laz", folder / "dsm.tif"
-        if number <= len(record["rounds"]) and cloud.exists() and dsm.exists():
+        if dsm.exists():
             done_before += 1
         else:
-            how = replace(
-                given, dsm=before, resolution=None, summary=None, **RebuildOptions().as_dict()
-            )
-            with warnings.catch_warnings():
-                if number > 1:  # the DSM is pcfix's own
-                    warnings.filterwarnings("ignore", ".*does not state whether", PcfixWarning)
-                map_photos(images, folder / "images", options=how, progress=progress)
+            how = replace(how, dsm=before, overwrite=True)
+            map_photos(images, folder / "images", options=how, progress=progress)
             with threads(given.jobs):
                 _reconstruct(given, block, number, folder / "images", cloud, progress)
-            grid_dsm(cloud, dsm, resolution=block.scene.ground.cell_m, overwrite=True)
-            record["rounds"][number - 1 :] = [_difference(block, cloud, dsm, before)]
-            write_text(target / RECORD, json_text(record), overwrite=True)
-        one = Figures(**record["rounds"][number - 1])
+            grid_dsm(cloud, dsm, resolution=block.scene.ground.cell_m)
+        one = _difference(block, cloud, dsm, before)
         rounds.append(one)
         if say is not None:
             say(
                 f"Round {number}: the bed moved by {one.mean_m:+.3f} m (standard deviation"
                 f" {one.sd_m:.3f} m), {100 * one.within_gsd:.0f} % of it by at most one pixel"
             )
-        if number == PAPER_ROUNDS and given.mapping == "paper":
-            n = block.scene.refractive_index
-            excess = 1.0 / (n * (2.0 - n)) - 1.0  # near nadir the depth tends to h0 / (2 - n)
-            words = (
-                "--mapping paper converges to the apparent depth / (2 - n), here up to"
-                f" {100 * excess:.0f} % too deep. Correct the cloud and use --mapping exact."
-            )
-            notes.append(PcfixWarning("photos.paper_limit", words, excess=excess))
-    compared = None
-    if given.reference is not None:
-        # Figs 16, 18 and 20 of the paper; with the first cloud also 15 and 17
-        also = {} if start is None else {"round0": start}
-        also |= {f"round{k}": one.cloud for k, one in enumerate(rounds[:-1], start=1)}
-        compared = str(target / "compare")
-        compare_clouds(
-            rounds[-1].cloud, given.reference, water=given.water, submerged=True, out_dir=compared,
-            also=also, overwrite=True,
-        )  # fmt: skip
     return finished(
         given,
         started,
-        notes,
+        [],
         rounds=rounds,
         done_before=done_before,  # rounds that an earlier call finished
         settled=abs(rounds[-1].mean_m) < threshold_m,
@@ -162,7 +130,6 @@ def rebuild_rounds(
         threshold_m=threshold_m,
         mapping=given.mapping,
         rebuild=str(given.rebuild),
-        compared=compared,  # folder, where a reference was given
     )
 
 
@@ -189,9 +156,8 @@ def _reconstruct(
         write_points(cloud, xyz, (block.crs, STEREO_STEP_M))
         return
     cloud.unlink(missing_ok=True)
-    places = {"images": images, "cameras": given.cameras, "cloud": cloud}
     words = shlex.split(given.rebuild or "")
-    for name, place in places.items():
+    for name, place in ("images", images), ("cameras", given.cameras), ("cloud", cloud):
         words = [word.replace(f"{{{name}}}", str(Path(place).resolve())) for word in words]
     log = cloud.with_name("rebuild.log")
     code, last = run_logged(words, log)
@@ -205,26 +171,23 @@ def _reconstruct(
         )  # fmt: skip
 
 
-def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> dict[str, Any]:
+def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> Figures:
     """Return by how much the DSM of a round differs from that before, under water."""
     raster = dsm.with_name("difference.tif")
-    write_dod(dsm, before, raster, overwrite=True)
+    write_dod(dsm, before, raster, overwrite=True)  # an error if they do not overlap
     with open_raster(raster) as source, open_raster(dsm) as heights:
         change, z, transform = read_masked(source), read_masked(heights), source.transform
     row, column = np.nonzero(np.isfinite(change))
-    if not len(row):
-        sentence = f"{cloud}: does not overlap the DSM of the round before. Check its CRS."
-        raise GeometryError("cloud.no_overlap", sentence, path=cloud)
     moved, z = change[row, column], z[row, column]
     x, y = place_of(transform, column + 0.5, row + 0.5)
     wet = surface_above(block.scene.water, np.column_stack([x, y, z])).height_m > z
     moved = moved[wet] if wet.any() else moved
-    return {
-        "cloud": str(cloud),
-        "dsm": str(dsm),
+    return Figures(
+        cloud=str(cloud),
+        dsm=str(dsm),
         # its DSM minus the one before, over submerged cells
-        "cells": len(moved),
-        "mean_m": round(float(moved.mean()), 5),
-        "sd_m": round(float(moved.std()), 5),
-        "within_gsd": round(float((np.abs(moved) <= block.gsd_m).mean()), 5),
-    }
+        cells=len(moved),
+        mean_m=round(float(moved.mean()), 5),
+        sd_m=round(float(moved.std()), 5),
+        within_gsd=round(float((np.abs(moved) <= block.gsd_m).mean()), 5),
+    )

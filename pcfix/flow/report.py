@@ -23,8 +23,7 @@ from pcfix.report.adjustment import adjustment_sentence
 from pcfix.report.comparison import evaluation
 from pcfix.report.page import Report, Table, extent_of, render
 from pcfix.report.run import RunMaps, run_report
-from pcfix.report.summary import Summary
-from pcfix.report.text import Plain
+from pcfix.report.text import Plain, Summary
 
 DIFFERENCE = "compare/dod.tif"
 MOST_CELLS = 300_000
@@ -43,7 +42,6 @@ RESULTS = {
     "run.json": "options and results of the run",
     "compare/compare.json": "all figures of the comparison",
     "compare/depth_bins.csv": "errors by depth",
-    "compare/shore_bins.csv": "errors by distance from the shore",
     DIFFERENCE: "cloud minus reference",
     "compare/reference_dsm.tif": "heights of the reference",
     "adjusted/report.html": "the adjustment of the cameras",
@@ -78,12 +76,11 @@ def report_run(
         run.folder, summary, run.cameras, maps, inputs,
         project=options.project or "", date=options.date or "", **more,
     )  # fmt: skip
-    shown = [
-        f"{tile.title}{f', {tile.tag}' if tile.tag else ''}: "
-        + ", ".join(f"{name} {value}" for name, value in tile.figures)
+    shown = (
+        f"{tile.title} {tile.tag}: " + ", ".join(f"{name} {value}" for name, value in tile.figures)
         for tile in page.tiles
         if tile.figures
-    ]
+    )
     return {"in_short": "; ".join(shown)}
 
 

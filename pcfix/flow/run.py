@@ -41,7 +41,7 @@ from pcfix.options.correct import AdjustOptions, CorrectOptions, RunOptions
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import CleanOptions, DistanceOptions
 from pcfix.report.adjustment import adjustment_sentence, all_notes
-from pcfix.report.summary import Summary
+from pcfix.report.text import Summary
 from pcfix.running import threads
 from pcfix.water.index import with_index
 
@@ -401,7 +401,7 @@ class RunResults:
     def tables(self) -> dict[str, DataFrame]:
         """Tables of the comparison by name, metres; empty where there was no reference.
 
-        ``depth_bins`` and ``shore_bins``, errors by depth and by distance from the shore;
+        ``depth_bins``, errors by depth;
         ``section_01`` and so on, heights along a line.
         """
         files = sorted((self.folder / COMPARED).glob("*.csv")) if self.compared else []

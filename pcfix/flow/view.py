@@ -15,14 +15,13 @@ from pcfix.compare.match import gap_m, heights_at, near_in_plan
 from pcfix.errors import InputError, SettingError
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.surfaces import find_surface, view_of
-from pcfix.grid import colours
+from pcfix.grid.maps import DEPTH, DIFFERENCE, HEIGHT, UNCERTAINTY
 from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.files import check_input, check_output, write_bytes
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
-from pcfix.lens.imaging import unproject
 from pcfix.libraries import load_open3d
-from pcfix.model import Cameras, FloatArray, WaterDimension, WaterSurface
+from pcfix.model import FloatArray, WaterDimension, WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import CompareRules, ViewerOptions
 from pcfix.refract.tally import COVERAGE_95
@@ -33,8 +32,8 @@ if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
-FRUSTUM_SHARE = 0.06
-"""Length of a frustum, as a share of the height of its camera above the clouds."""
+AXIS_SHARE = 0.06
+"""Length of the line along the axis of a camera, as a share of its height above the clouds."""
 WATER_CELLS = 40
 SHOWN = ("WaterDepth", "SigmaZ", *SHIFTS)
 LINE_COLOURS = {"water": (0.65, 0.82, 0.89), "cameras": (0.04, 0.37, 0.54)}
@@ -45,15 +44,15 @@ GREY = 0.72
 """Of points without a value, such as land where depths are shown."""
 MOST_PERCENT = 98.0
 COLOURS = {
-    "depth": (colours.DEPTH, "Depth below the water (m)", "WaterDepth", 1.0,
+    "depth": (DEPTH, "Depth below the water (m)", "WaterDepth", 1.0,
               "Give --water, or a cloud from 'pcfix correct'."),
-    "shift": (colours.HEIGHT, "Lowered by the correction (m)", "ShiftZ", -1.0,
+    "shift": (HEIGHT, "Lowered by the correction (m)", "ShiftZ", -1.0,
               "Give a cloud from 'pcfix correct'."),
-    "error": (colours.DIFFERENCE, "Height above the reference (m)", "", 1.0,
+    "error": (DIFFERENCE, "Height above the reference (m)", "", 1.0,
               "Cloud and reference do not overlap."),
-    "uncertainty": (colours.UNCERTAINTY, "Uncertainty of Z at 95 % (m)", "SigmaZ", COVERAGE_95,
+    "uncertainty": (UNCERTAINTY, "Uncertainty of Z at 95 % (m)", "SigmaZ", COVERAGE_95,
                     "Give a cloud from 'pcfix correct --dimensions all'."),
-    "height": (colours.HEIGHT, "Height (m)", "", 1.0, "Its heights are not numbers."),
+    "height": (HEIGHT, "Height (m)", "", 1.0, "Its heights are not numbers."),
 }  # fmt: skip
 """Ramp, name, dimension and factor of the values, and what to do where no cloud has any."""
 
@@ -69,7 +68,7 @@ class _Layer(NamedTuple):
 class Scene3d(NamedTuple):
     """Named clouds with their colours, and the lines of cameras and water, metres from an origin.
 
-    `lines`, "cameras" and "water", have the shape (k, 2, 3): frusta, and a grid.
+    `lines`, "cameras" and "water", have the shape (k, 2, 3): optical axes, and a grid.
     """
 
     names: list[str]
@@ -130,7 +129,11 @@ def view_clouds(
     lines = {"water": _grid(surface, low, high)}
     if given.cameras is not None:
         inputs = replace(given, water=0.0 if given.water is None else given.water).part(Inputs)
-        lines["cameras"] = _frusta(inputs.block(first.crs)[0], float(high[2]))
+        cameras = inputs.block(first.crs)[0]
+        length = AXIS_SHARE * max(float(np.median(cameras.centres[:, 2])) - high[2], 1.0)
+        down = np.array([0.0, 0.0, -1.0])
+        axes = down if cameras.rotations is None else cameras.rotations[:, 2]
+        lines["cameras"] = np.stack([cameras.centres, cameras.centres + length * axes], axis=1)
     # coordinates relative to the common centre
     ends = np.vstack([low, high, *(one.reshape(-1, 3) for one in lines.values())])
     origin = (ends.min(axis=0) + ends.max(axis=0)) / 2.0
@@ -189,22 +192,6 @@ def _values(
     if colour == "depth" and surface is not None and not isinstance(surface, WaterDimension):
         found = surface_above(surface, xyz).height_m - xyz[:, 2]
     return np.where(found > 0.0, found, np.nan)
-
-
-def _frusta(cameras: Cameras, ground_m: float) -> FloatArray:
-    """Return the edges of each camera's frustum, or a line down where it has no frame."""
-    length = FRUSTUM_SHARE * max(float(np.median(cameras.centres[:, 2])) - ground_m, 1.0)
-    if cameras.rotations is None or cameras.lenses is None:
-        return np.stack([cameras.centres, cameras.centres - [0.0, 0.0, length]], axis=1)
-    corners = [
-        unproject(one, np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * [one.width, one.height])
-        for one in cameras.lenses
-    ]
-    centre = np.repeat(cameras.centres[:, None], 4, axis=1)
-    corner = centre + length * np.array(corners) @ cameras.rotations
-    rays, rim = np.stack([centre, corner], axis=2), np.stack([corner, np.roll(corner, -1, 1)], 2)
-    found = np.concatenate([rays, rim], axis=1).reshape(-1, 2, 3)
-    return np.asarray(found[np.isfinite(found).all(axis=(1, 2))])
 
 
 def _grid(surface: WaterSurface | None, low: FloatArray, high: FloatArray) -> FloatArray:

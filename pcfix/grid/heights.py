@@ -1,4 +1,4 @@
-"""Heights of cells: statistics of their points, inverse distances, and Delaunay triangles.
+"""Heights of cells: statistics of their points, and Delaunay triangles.
 
 A triangle is Delaunay's if no point is inside the circle through its corners. If circles wider than
 a limit are ignored, only points within that limit of a cell decide on it: a part of the raster,
@@ -32,18 +32,14 @@ def grid_window(
     TIN, and `spacing` of the points (see `pcfix.grid.lattice.spacing_m`) are in cells. The bands
     have the shape of the window, NaN if unknown.
     """
-    cell, position = lattice.cells(points), lattice.positions(points)
+    cell = lattice.cells(points)
     inner, shape = window.holds(cell), (window.height, window.width)
     code = (cell[inner, 1] - window.row) * window.width + cell[inner, 0] - window.column
     cells = cell_statistics(code, points[inner, 2], window.height * window.width)
-    match method:
-        case "tin":
-            height = triangulated(position, points[:, 2], window, reach, spacing)
-        case "idw":
-            height = inverse_distance(position, cell, points[:, 2], window)
-            height[cells["points"] == 0] = np.nan
-        case _:
-            height = cells[method]
+    if method == "tin":
+        height = triangulated(lattice.positions(points), points[:, 2], window, reach, spacing)
+    else:
+        height = cells[method]
     counts, spread = cells["points"].reshape(shape), cells["spread"].reshape(shape)
     return height.reshape(shape), counts, spread
 
@@ -70,35 +66,6 @@ def cell_statistics(cell: IntArray, z: FloatArray, size: int) -> dict[str, Any]:
     whole[:, filled] = low + offset, median, low, z[first + n - 1], scatter
     names = ("mean", "median", "min", "max", "spread")
     return {"points": count, **dict(zip(names, whole, strict=True))}
-
-
-REACH_CELLS = 2.0**0.5
-"""Points up to this distance from a centre count; they lie in its cell and the eight around it."""
-NEAREST_CELLS = 1e-4
-"""Least distance of a point from a centre for its weight."""
-
-
-def inverse_distance(
-    position: FloatArray, cell: IntArray, z: FloatArray, window: Window
-) -> FloatArray:
-    """Return the mean of the heights around each centre, weighted with 1 / distance squared.
-
-    Points farther than `REACH_CELLS` do not count; they cover the window with a margin of a cell.
-    """
-    order = np.lexsort((z, cell[:, 0], cell[:, 1]))  # sums that do not depend on their order
-    position, cell, z = position[order], cell[order], z[order]
-    cells = window.height * window.width
-    weights, total = np.zeros(cells), np.zeros(cells)
-    for down in (-1, 0, 1):
-        for right in (-1, 0, 1):  # each point counts for its cell and those around it
-            near = cell + np.array([right, down])
-            square = ((near + 0.5 - position) ** 2).sum(axis=1)
-            rows = window.holds(near) & (square <= REACH_CELLS * REACH_CELLS)
-            to = (near[rows, 1] - window.row) * window.width + near[rows, 0] - window.column
-            weight = 1.0 / np.maximum(square[rows], NEAREST_CELLS * NEAREST_CELLS)
-            weights += np.bincount(to, weight, cells)
-            total += np.bincount(to, weight * z[rows], cells)
-    return np.asarray(total / np.where(weights > 0.0, weights, 1.0))
 
 
 MOVED = 1e-4

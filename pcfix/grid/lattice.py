@@ -43,13 +43,6 @@ class Window(NamedTuple):
             self.row - cells, self.row_stop + cells, self.column - cells, self.column_stop + cells
         )
 
-    def moved(self, rows: int, columns: int) -> Window:
-        """Return the window shifted by rows and columns."""
-        return Window(
-            self.row + rows, self.row_stop + rows, self.column + columns,
-            self.column_stop + columns,
-        )  # fmt: skip
-
     def holds(self, cell: IntArray) -> BoolArray:
         """Return whether columns and rows, shape (n, 2), are in the window."""
         column, row = cell.T
@@ -154,10 +147,9 @@ def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float, name: s
         return np.asarray(last - first + 1.0)
 
     if size(resolution_m).prod() > MAX_CELLS:
-        finest = MIN_RESOLUTION_M  # rounded up to three digits
+        finest = resolution_m
         while size(finest).prod() > MAX_CELLS:
-            step = 10.0 ** (math.floor(math.log10(finest * 1.0000001)) - 2)
-            finest = round(finest / step + 1.0) * step
+            finest = float(f"{1.05 * finest:.2g}")
         columns, rows = size(resolution_m)
         sentence = (
             f"{name}: a resolution of {resolution_m:g} m makes {columns:,.0f} x {rows:,.0f} cells,"

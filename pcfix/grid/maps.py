@@ -1,13 +1,94 @@
-"""Contours of rasters, and their interval."""
+"""Maps: a colour ramp for each quantity in pictures, pages and GIS styles, shades, and contours.
+
+All ramps are of matplotlib and keep their order for colour-blind readers and in print: shallow
+water is light, and positive differences are red.
+"""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from pcfix.model import FloatArray
 from pcfix.sums import nice_step
+
+DEPTH = "YlGnBu"
+HEIGHT = "cividis"
+UNCERTAINTY = "OrRd"
+RAYS = "Purples"
+DIFFERENCE = "RdBu_r"
+
+
+def stops_of(ramp: str, steps: int = 9) -> list[tuple[float, tuple[int, ...]]]:
+    """Return positions along a ramp, 0 to 1, and their colours (red, green, blue; 0 to 255)."""
+    from matplotlib import colormaps
+
+    shares = [step / (steps - 1) for step in range(steps)]
+    colours = colormaps[ramp](shares)[:, :3]
+    return [
+        (share, tuple(round(255 * part) for part in colour))
+        for share, colour in zip(shares, colours.tolist(), strict=True)
+    ]
+
+
+LAND = (214, 205, 188)
+DARKEST = 0.35
+"""Share of the colour without light."""
+SUN = np.array([-0.5, 0.5, 0.5**0.5])
+"""Direction of the sun, east, north and up: in the north-west, 45 degrees above the horizon."""
+NO_LIGHT = 0
+"""Value of cells without a height."""
+
+
+def relief_colours(
+    light: npt.NDArray[np.uint8], depth_m: FloatArray, deepest_m: float
+) -> npt.NDArray[np.uint8]:
+    """Return red, green, blue and alpha, shape (4, rows, columns), of a shaded bed and its land.
+
+    `light`, shape (rows, columns), is that of `hillshade`; level ground keeps its colour. Depths
+    are NaN on land; `deepest_m` has the last colour of the ramp.
+    """
+    stops = stops_of(DEPTH, 33)
+    at = np.array([share for share, _ in stops]) * deepest_m
+    lit = DARKEST + (1.0 - DARKEST) * (light - 1.0) / 254.0 / SUN[2]
+    colours = [
+        np.where(np.isnan(depth_m), land, np.interp(np.nan_to_num(depth_m), at, ramp))
+        for land, ramp in zip(LAND, np.array([colour for _, colour in stops]).T, strict=True)
+    ]
+    alpha = np.where(light == NO_LIGHT, 0, 255)
+    bands = [np.clip(np.rint(band * lit), 0, 255) for band in colours]
+    return np.where(alpha > 0, [*bands, alpha], 0).astype(np.uint8)
+
+
+def hillshade(height: FloatArray, resolution_m: float) -> npt.NDArray[np.uint8]:
+    """Return the brightness of each cell, 1 (dark) to 255; `NO_LIGHT` without a height.
+
+    The slope of a cell comes from its eight neighbours, the four nearest counting twice (B. K. P.
+    Horn, Hill shading and the reflectance map, 1981); the light is the cosine of the angle between
+    the normal and `SUN`. A neighbour without a height gets the cell's own.
+
+    Heights have the shape (rows + 2, columns + 2), metres, NaN if unknown, with a margin of one
+    cell; the first row is the northernmost. The result has the shape (rows, columns).
+    """
+    rows, columns = height.shape[0] - 2, height.shape[1] - 2
+    own = height[1:-1, 1:-1]
+
+    def near(down: int, right: int) -> FloatArray:
+        there = height[1 + down : 1 + down + rows, 1 + right : 1 + right + columns]
+        return np.where(np.isnan(there), own, there)
+
+    east = near(-1, 1) + 2.0 * near(0, 1) + near(1, 1)
+    west = near(-1, -1) + 2.0 * near(0, -1) + near(1, -1)
+    north = near(-1, -1) + 2.0 * near(-1, 0) + near(-1, 1)
+    south = near(1, -1) + 2.0 * near(1, 0) + near(1, 1)
+    slope_x, slope_y = (east - west) / (8.0 * resolution_m), (north - south) / (8.0 * resolution_m)
+    cosine = SUN[2] - SUN[0] * slope_x - SUN[1] * slope_y
+    cosine /= np.sqrt(1.0 + slope_x**2 + slope_y**2)
+    light = np.rint(1.0 + 254.0 * np.clip(cosine, 0.0, 1.0))
+    return np.where(np.isnan(own), NO_LIGHT, light).astype(np.uint8)
+
 
 Extent = tuple[float, float, float, float]
 """West, east, south and north, metres."""

@@ -94,15 +94,15 @@ def read_onto(path: Path, lattice: Lattice) -> FloatArray:
         return read_masked(same)
 
 
-def filled_heights(source: DatasetReader, *, fill: bool) -> FloatArray:
-    """Return the first band, NaN for no value; with `fill` its holes are interpolated."""
+def filled_heights(source: DatasetReader) -> FloatArray:
+    """Return the first band with its holes interpolated."""
     from rasterio.fill import fillnodata
 
     height = read_masked(source)
     known = np.isfinite(height)
     if not known.any():
         raise bad_file(source.name, "raster.empty", "has no heights in its first band. Give a DSM.")
-    if not fill or known.all():
+    if known.all():
         return height
     reach = float(max(height.shape))
     return np.asarray(fillnodata(np.where(known, height, 0.0), known, max_search_distance=reach))

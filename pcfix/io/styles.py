@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.grid.colours import DEPTH, HEIGHT, RAYS, UNCERTAINTY, stops_of
+from pcfix.grid.maps import DEPTH, HEIGHT, RAYS, UNCERTAINTY, stops_of
 from pcfix.io.rasters import preview
 from pcfix.model import FloatArray
 

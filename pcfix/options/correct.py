@@ -188,33 +188,7 @@ class CorrectOptions(
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
 
 
-class LabelRules(LandRules, panel=Panel.WATER):
-    """The rules of a labelling; see `pcfix.label`."""
-
-    surface_band: float = option(0.0, least=0)
-    """Points up to this distance from the surface, above or below, become class 41. [m] [default:
-    no class 41]"""
-    dead_band: float = option(0.0, least=0)
-    """Points up to this distance from the surface get the label of their surroundings. [m]
-    [default: none]"""
-    reset: bool = option(False)
-    """Set points of class 40 or 41 to class 1 if they are no longer in either class."""
-
-    def check(self) -> None:
-        """Check that the dead band is wider than the surface band."""
-        if 0.0 < self.dead_band <= self.surface_band:
-            raise SettingError(
-                "option.range",
-                f"dead-band {self.dead_band:g} must be more than surface-band"
-                f" {self.surface_band:g}, where all points are class 41. Give a wider one, or 0"
-                " for none.",
-                option="dead_band",
-                value=self.dead_band,
-                above=self.surface_band,
-            )
-
-
-class StageLabelOptions(LabelRules, MaskOption, NeededOptions):
+class StageLabelOptions(LandRules, MaskOption, NeededOptions):
     """The options of the PDAL stage ``label``, which writes no files."""
 
 

@@ -60,10 +60,6 @@ class SceneWaterOptions(IndexOptions, panel=Panel.WATER):
 
     water: float = option(0.37, basic=True)
     """Water level in the middle of the area. [m]"""
-    wave_slope_deg: float = option(0.0, least=0, most=10)
-    """Standard deviation of the slope of waves, along an axis."""
-    wave_length_m: float = option(1.0, least=0.01, most=1000)
-    """Length of waves."""
     tilt_percent: float | None = option(None, least=0, most=20)
     """Slope of the water. [default: 0, for a river 0.3]"""
     tilt_heading_deg: float = option(90.0, least=-360, most=360)

@@ -32,7 +32,7 @@ MIN_RESOLUTION_M = 1e-4
 LEAST_PLANE_POINTS, PLANE_POINTS = 6, 8
 """Reference points of each plane of a comparison: the fewest allowed, and the default."""
 
-DsmMethod = Literal["mean", "median", "min", "max", "idw", "tin"]
+DsmMethod = Literal["mean", "median", "min", "max", "tin"]
 SurfaceChoice = Literal["all", "bed"]
 
 
@@ -114,19 +114,15 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
 
     resolution: float | None = option(None, basic=True, least=MIN_RESOLUTION_M)
     """Cell size. [m] [default: 2 to 4 points a cell]"""
-    what: str = option("height", metavar="height|depth|uncertainty|DIMENSION")
-    """Value of a cell: height; depth (of the bed below the water); uncertainty (vertical, of the
-    bed, at 95 %); or the name of a dimension."""
+    what: Literal["height", "depth", "uncertainty"] = option("height")
+    """Value of a cell: height; depth (of the bed below the water); or uncertainty (vertical, of the
+    bed, at 95 %)."""
     method: DsmMethod = option("mean", basic=True)
     """Gridding method."""
     surface: SurfaceChoice = option("all", basic=True)
     """Grid land and bed without noise, or only the bed (class 40)."""
     fill: float | None = option(None, above=0)
     """Fill holes up to this width; they get count 0. [m]"""
-    azimuth: float = option(315.0)
-    """Azimuth of the sun in the hillshade, clockwise from north. [deg]"""
-    altitude: float = option(45.0, above=0, most=90)
-    """Altitude of the sun in the hillshade, above the horizon. [deg]"""
 
     @property
     def cell_m(self) -> float:
@@ -163,23 +159,15 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
 class DsmOptions(BandOption, OverwriteOption, SummaryOption, DsmRules, panel=Panel.OUTPUT):
     """The options of ``pcfix dsm``."""
 
-    hillshade: File | None = option(None, writes=True)
-    """GeoTIFF for a hillshade."""
     counts: File | None = option(None, writes=True)
     """GeoTIFF for the number of points in each cell, and their spread."""
     style: bool = option(False)
     """Also write a QGIS style (.qml)."""
-    cog: bool = option(False)
-    """Write a cloud optimised GeoTIFF."""
 
 
 LAYERS = ("water", "apparent", "corrected", "reference")
 """Names of the lines of a cross-section; other clouds must have other names."""
 _NAME = re.compile(r"[\w .+-]*\w[\w .+-]*")
-
-
-SIGMA_REFERENCE_M = {"cloud": 0.03, "raster": 0.03, "table of check points": 0.02}
-"""Assumed standard deviation of a height by kind of reference: LiDAR on hard ground, RTK."""
 
 
 def _bands(given: Any) -> tuple[tuple[float, ...], ...]:
@@ -233,17 +221,12 @@ class DistanceOptions(OptionSet, panel=Panel.FIGURES):
     )
     """C2C from each point of the cloud to the nearest of the reference, the other way round, or
     both. [default: to-reference; from each check point]"""
-    classes: int | None = option(None, least=2, most=100_000, needs="reference")
-    """Number of classes of the C2C histograms. [default: square root of the number of distances]"""
     share: tuple[Any, ...] = option((), then=_bands, needs="reference", metavar="LOW,HIGH")
     """Report the share of the C2C distances from LOW to HIGH metres; may be repeated."""
     also: tuple[Any, ...] = option(
         (), basic=True, then=_named_clouds, needs="reference", metavar="NAME=CLOUD"
     )
     """Another cloud for the C2C table and the cross-sections; may be repeated."""
-    sigma_reference: float | None = option(None, least=0, needs="reference")
-    """Standard deviation of a height of the reference, which is removed from the errors of the
-    cloud. [m] [default: 0.03 of a cloud, 0.03 of a raster, 0.02 of a table of check points]"""
 
     @property
     def from_reference(self) -> bool:
@@ -262,8 +245,6 @@ class CompareRules(DistanceOptions, panel=Panel.FIGURES):
     """Number of reference points in each fitted plane."""
     bin_width: float = option(1.0, above=0)
     """Bin width of the table by depth. [m]"""
-    shore_bin_width: float = option(10.0, above=0)
-    """Bin width of the table by distance from shore. [m]"""
     max_gap: float | None = option(None, above=0)
     """Points up to this distance outside the reference are compared. [m] [default: 5 point
     spacings, at least 1]"""
@@ -348,8 +329,6 @@ class RebuildOptions(OptionSet, panel=Panel.ROUNDS):
     """Stop if the mean change of the bed is less than this many ground pixels."""
     most_rounds: int = option(4, least=1)
     """Maximum number of rounds."""
-    reference: File | None = option(None, basic=True, needs="rebuild")
-    """Reference to compare the clouds of all rounds with, in OUT/compare; see 'pcfix compare'."""
 
 
 class PhotosOptions(
@@ -365,12 +344,7 @@ class PhotosOptions(
     """Cell size to which a cloud is gridded. [m] [default: 2 to 4 points a cell]"""
     mapping: Literal["exact", "paper"] = option("exact", basic=True, panel=Panel.METHOD)
     """exact: trace the light back from the true bed; paper: eq 12 of Skarlatos & Agrafiotis 2018 on
-    the apparent bed, one round of their iteration."""
-    spacing: int | None = option(None, least=1, most=512, panel=Panel.METHOD)
-    """Spacing of the grid nodes over the photograph. [px] [default: a cell of the DSM, at least 8
-    px]"""
-    holes: Literal["fill", "black"] = option("fill", panel=Panel.METHOD)
-    """Interpolate holes of the DSM, or make them black."""
+    the apparent bed, one round of their iteration, which ends at too large depths."""
 
 
 class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions, panel=Panel.WATER):
@@ -390,8 +364,7 @@ class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions, pa
     gsd: float | None = option(None, basic=True, above=0, needs="surface")
     """With --surface, instead of --cameras, for a nadir view: pixel size at the bed. [m]"""
     interval: float | None = option(None, above=0, needs="surface")
-    """With --surface: time between frames, before --every; without it frames are independent. [s]
-    [default: as stated in the video]"""
+    """With --surface: time between frames, before --every. [s] [default: as stated in the video]"""
     resolution: float | None = option(None, basic=True, above=0)
     """Cell size of the rasters of the water. [m] [default: so that there are 2,000 cells]"""
     every: int = option(1, least=1, most=100_000, panel=Panel.METHOD)

@@ -13,6 +13,7 @@ land decides where there is some, and elsewhere many corners, each about its mea
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ import numpy.typing as npt
 
 from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray
+from pcfix.photos.mapping import by_bands
 
 FOLLOWED_PX = 2048
 """Longer side of the images in which corners are tracked; larger ones are reduced."""
@@ -162,15 +164,9 @@ def _fitted(one: FloatArray, other: FloatArray, weight: FloatArray) -> FloatArra
 def laid(frame: npt.NDArray[Any], way: FloatArray) -> npt.NDArray[Any]:
     """Resample a frame, shape (rows, columns, bands), by a homography; bicubic."""
     cv2 = photo_library("cv2")
-    rows, columns, bands = frame.shape
-    out = np.empty_like(frame)
-    for first in range(0, bands, 4):
-        part = np.ascontiguousarray(frame[..., first : first + 4])
-        found = cv2.warpPerspective(
-            part, way, (columns, rows), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
-        )
-        out[..., first : first + 4] = found.reshape(part.shape)
-    return out
+    how: Any = {"flags": cv2.INTER_CUBIC, "borderMode": cv2.BORDER_REPLICATE}
+    size = frame.shape[1], frame.shape[0]
+    return by_bands(partial(cv2.warpPerspective, M=way, dsize=size, **how), frame)
 
 
 def covered(way: FloatArray, shape: tuple[int, int], top: int, bottom: int) -> BoolArray:

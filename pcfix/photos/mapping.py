@@ -17,7 +17,9 @@ against 1.34 for n = 1.34). Each step is n - 1 = 0.34 of the one before, as in t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,7 +40,7 @@ INVERSION_STEPS = 6
 """Of the mapping of the paper; each leaves a tenth of the error, 0.01 px of 50 in the end."""
 STRIP_ROWS = 512
 """Rows resampled at once, so that the places stay in the processor's cache."""
-CHANNELS_AT_ONCE = 4
+BANDS_AT_ONCE = 4
 """OpenCV's limit."""
 
 
@@ -78,10 +80,9 @@ class Ground:
             [np.column_stack([one, below, beside]), np.column_stack([beside, below, below + 1])]
         )
         tensor = load_open3d("open3d.core").Tensor.from_numpy
+        triangles = tensor(corners.astype(np.float32)), tensor(faces.astype(np.uint32))
         self._scene = load_open3d("open3d.t.geometry").RaycastingScene()
-        self._scene.add_triangles(
-            tensor(corners.astype(np.float32)), tensor(faces.astype(np.uint32))
-        )
+        self._scene.add_triangles(*triangles)
 
     def hit(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
         """Return the distance along rays to the ground, metres; infinite where they miss it.
@@ -235,6 +236,15 @@ def hidden(ground: Ground, start: FloatArray, end: FloatArray) -> BoolArray:
     return found
 
 
+def by_bands(
+    function: Callable[[npt.NDArray[Any]], npt.NDArray[Any]], image: npt.NDArray[Any]
+) -> npt.NDArray[Any]:
+    """Apply a function of OpenCV to an image, (rows, columns, bands), a few bands at a time."""
+    groups = range(0, image.shape[2], BANDS_AT_ONCE)
+    some = (np.ascontiguousarray(image[..., k : k + BANDS_AT_ONCE]) for k in groups)
+    return np.dstack([function(one) for one in some])
+
+
 def resample(image: npt.NDArray[Any], shifts: Shifts) -> tuple[npt.NDArray[Any], BoolArray, int]:
     """Resample an image, shape (rows, columns, bands), by bicubic interpolation.
 
@@ -242,12 +252,9 @@ def resample(image: npt.NDArray[Any], shifts: Shifts) -> tuple[npt.NDArray[Any],
     Returns the image, the pixels that changed, shape (rows, columns), and how many are black.
     """
     cv2 = photo_library("cv2")
-    rows, columns, bands = image.shape
-    groups = [slice(k, min(k + CHANNELS_AT_ONCE, bands)) for k in range(0, bands, CHANNELS_AT_ONCE)]
-    sources = [np.ascontiguousarray(image[..., some]) for some in groups]
-    out = image.copy()
-    touched = np.empty((rows, columns), bool)
-    black = 0
+    rows, columns, _ = image.shape
+    out, touched, black = image.copy(), np.empty((rows, columns), bool), 0
+    how: Any = {"interpolation": cv2.INTER_CUBIC, "borderMode": cv2.BORDER_REPLICATE}
     for top in range(0, rows, STRIP_ROWS):
         bottom = min(top + STRIP_ROWS, rows)
         shift, lost = _strip(shifts, top, bottom, columns)
@@ -256,13 +263,8 @@ def resample(image: npt.NDArray[Any], shifts: Shifts) -> tuple[npt.NDArray[Any],
         if moved.any():
             u = np.arange(columns, dtype=np.float32)[None, :] + shift[..., 0]
             v = np.arange(top, bottom, dtype=np.float32)[:, None] + shift[..., 1]
-            for some, source in zip(groups, sources, strict=True):
-                found = cv2.remap(
-                    source, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
-                )  # fmt: skip
-                # many times as fast as a mask of numpy
-                mask, target = moved.view(np.uint8), np.ascontiguousarray(part[..., some])
-                part[..., some] = cv2.copyTo(found, mask, target).reshape(target.shape)
+            found = by_bands(partial(cv2.remap, map1=u, map2=v, **how), image)
+            np.copyto(part, found, where=moved[..., np.newaxis])
             lost |= (u < -0.5) | (u > columns - 0.5) | (v < -0.5) | (v > rows - 0.5)
         if lost.any():
             part[lost] = 0

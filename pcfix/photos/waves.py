@@ -23,8 +23,7 @@ of the first solution.
 which has no curl, needs no border condition, and ties the frames together by the dispersion
 relation (no current, no surface tension, mean depth). The waves with most energy on the dispersion
 shell of the spectrum are chosen, some at a time, and fitted by least squares to the slopes of all
-frames, weighted by the texture of the bed, with a prior of the slopes' own variance. Where the time
-between frames is not known, each frame is fitted separately.
+frames, weighted by the texture of the bed, with a prior of the slopes' own variance.
 
 The median over few frames keeps about the mean of each wave over them, and the slopes lack it. So
 each wave is fitted less its mean over the frames.
@@ -115,11 +114,8 @@ def nodes_of(view: View, cell_m: float | None) -> Nodes:
     edge = np.array([[a, b] for a in u for b in v if a in u[[0, -1]] or b in v[[0, -1]]])
     outline = on_level(view, edge)[:, :2]
     if not np.isfinite(outline).all():
-        raise GeometryError(
-            "cameras.pose",
-            "Part of the image does not show the water. Check pose and level.",
-            level=view.level_m,
-        )
+        sentence = "Part of the image does not show the water. Check pose and level."
+        raise GeometryError("cameras.pose", sentence, level=view.level_m)
     cell = cell_m or float(np.sqrt(np.ptp(outline, axis=0).prod() / CELLS))
     depth = float(np.nanmedian(view.level_m - view.bed(outline)))
     low, high = outline.min(axis=0), outline.max(axis=0)
@@ -214,10 +210,7 @@ class Waves(NamedTuple):
 def fit_waves(
     nodes: Nodes, slope: FloatArray, weight: FloatArray, time_s: FloatArray, depth_m: float
 ) -> Waves:
-    """Fit plane waves to slopes, (f, n, 2), with weights, (f, n), at the times of f frames.
-
-    With one frame, time has no effect.
-    """
+    """Fit plane waves to slopes, (f, n, 2), with weights, (f, n), at the times of f frames."""
     shell, chosen, residual = _Shell(nodes, weight, time_s, depth_m), np.empty(0, np.int64), slope
     found, covariance = np.empty(0), np.empty((0, 0))
     left = float((weight[..., None] * slope**2).sum())
@@ -260,8 +253,6 @@ class _Shell:
         longest = cell_m * max(rows, columns)
         least, most = 2.0 * np.pi / longest, 2.0 * np.pi / (SHORTEST_CELLS * cell_m)
         may = (size >= least) & (size <= most)
-        if len(time_s) == 1:  # a wave and its opposite look the same
-            may &= (every[:, 0] > 0.0) | ((every[:, 0] == 0.0) & (every[:, 1] > 0.0))
         self._rows, self._shape = np.flatnonzero(may), (rows, columns)
         self.number, self._size = every[may], size[may]
         self.frequency = np.sqrt(GRAVITY * self._size * np.tanh(self._size * depth_m))
@@ -285,10 +276,9 @@ class _Shell:
     def height_rms(self, residual: FloatArray) -> float:
         """Integrate residual slopes to heights, rms, by the method of Frankot & Chellappa."""
         known = (self._weight > 0.0).astype(np.float64)
-        half = 2.0 if len(known) == 1 else 1.0
         squares = np.abs(self._transformed(residual, known) / self._size) ** 2
         cells = np.prod(self._shape) * max(float(known.sum()), 1.0)
-        return float(np.sqrt(half * squares.sum() / cells))
+        return float(np.sqrt(squares.sum() / cells))
 
     def _bases(self, rows: IntArray, chosen: IntArray) -> Iterator[FloatArray]:
         """Yield the slopes along unit waves, cosines then sines, at some nodes of each frame.
@@ -297,8 +287,7 @@ class _Shell:
         """
         place = np.exp(1j * (self._local[rows] @ self.number[chosen].T))
         turn = np.exp(-1j * self._time_s[:, None] * self.frequency[chosen])
-        if len(turn) > 1:
-            turn -= turn.mean(axis=0)
+        turn -= turn.mean(axis=0)
         for one in turn:
             wave = place * one
             yield np.hstack([-wave.imag, wave.real])

@@ -54,12 +54,9 @@ def words_of(command: dict[str, Any], values: dict[str, Any]) -> list[str]:
 
 
 def run(
-    program: str,
-    words: list[str],
-    is_cancelled: Callable[[], bool],
-    percent: Callable[[float], None],
-    say: Callable[[str], None],
-) -> None:
+    program: str, words: list[str], is_cancelled: Callable[[], bool],
+    percent: Callable[[float], None], say: Callable[[str], None],
+) -> None:  # fmt: skip
     """Run pcfix to its end and pass on what it prints.
 
     Raises CommandError, with the last line that it printed, if it fails or was cancelled.
@@ -85,9 +82,8 @@ def run(
     if is_cancelled():
         raise CommandError("Cancelled; unfinished output was removed.")
     if process.returncode:
-        raise CommandError(
-            last.removeprefix("pcfix: ") or f"Exit code {process.returncode}. {HELP}"
-        )
+        why = last.removeprefix("pcfix: ")
+        raise CommandError(why or f"Exit code {process.returncode}. {HELP}")
 
 
 def _watch(process: subprocess.Popen[str], is_cancelled: Callable[[], bool]) -> None:
@@ -95,10 +91,7 @@ def _watch(process: subprocess.Popen[str], is_cancelled: Callable[[], bool]) -> 
     while process.poll() is None:
         time.sleep(_WAIT_S)
         if is_cancelled():
-            if os.name == "nt":
-                process.terminate()
-            else:
-                process.send_signal(signal.SIGINT)
+            process.send_signal(signal.SIGTERM if os.name == "nt" else signal.SIGINT)
             try:
                 process.wait(_PATIENCE_S)
             except subprocess.TimeoutExpired:

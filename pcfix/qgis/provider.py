@@ -14,6 +14,7 @@ from .command import CommandError, program_of, run, words_of
 PROGRAM = "PCFIX_PROGRAM"
 SAID = "said"
 CLOUDS = "Point clouds and DSMs (*.las *.laz *.tif *.tiff *.vrt);;All files (*.*)"
+OUTPUTS = "LAZ (*.laz);;LAS (*.las);;GeoTIFF (*.tif)"
 LAYER = "raster_layer"
 """A field for a raster layer of the project, which replaces the file of a cloud."""
 
@@ -114,10 +115,10 @@ class Algorithm(core.QgsProcessingAlgorithm):
         values = {one["name"]: self._value(one, parameters, context) for one in self.fields}
         layer = self.parameterAsRasterLayer(parameters, LAYER, context)
         for one in self.fields:
-            if one["kind"] == "cloud":
-                values[one["name"]] = layer.source() if layer else values[one["name"]]
-                if not values[one["name"]]:
-                    raise core.QgsProcessingException("Give a cloud, or a raster layer.")
+            if one["kind"] == "cloud" and layer:
+                values[one["name"]] = layer.source()
+            if one["kind"] == "cloud" and not values[one["name"]]:
+                raise core.QgsProcessingException("Give a cloud, or a raster layer.")
         said: list[str] = []
 
         def say(line: str) -> None:
@@ -131,11 +132,8 @@ class Algorithm(core.QgsProcessingAlgorithm):
             run(program, words, feedback.isCanceled, feedback.setProgress, say)
         except CommandError as error:
             raise core.QgsProcessingException(str(error)) from error
-        written = {
-            one["name"]: values[one["name"]]
-            for one in self.fields
-            if one["kind"] in ("written", "folder written") and values[one["name"]]
-        }
+        outputs = (one["name"] for one in self.fields if one["kind"].endswith("written"))
+        written = {name: values[name] for name in outputs if values[name]}
         for path in written.values():
             _load(Path(path), context)
         return {**written, SAID: "\n".join(said)}
@@ -145,13 +143,10 @@ class Algorithm(core.QgsProcessingAlgorithm):
         if parameters.get(name) is None and not one["needed"]:
             return None
         read: Any = {
-            "bool": self.parameterAsBool,
-            "int": self.parameterAsInt,
-            "float": self.parameterAsDouble,
-            "choice": self.parameterAsEnumString,
-            "written": self.parameterAsFileOutput,
-            "folder written": self.parameterAsFileOutput,
-        }
+            "bool": self.parameterAsBool, "int": self.parameterAsInt,
+            "float": self.parameterAsDouble, "choice": self.parameterAsEnumString,
+            "written": self.parameterAsFileOutput, "folder written": self.parameterAsFileOutput,
+        }  # fmt: skip
         return read.get(kind, self.parameterAsString)(parameters, name, context)
 
 
@@ -167,24 +162,18 @@ def _parameter(one: dict[str, Any]) -> Any:
         type_ = number.Integer if kind == "int" else number.Double
         return number(name, label, type_, default, optional)
     if kind == "choice":
-        return core.QgsProcessingParameterEnum(
-            name, label, one["choices"], False, default, optional, usesStaticStrings=True
-        )
+        choices = one["choices"], False, default, optional
+        return core.QgsProcessingParameterEnum(name, label, *choices, usesStaticStrings=True)
     if kind in ("file", "cloud", "folder"):
         behaviour = file.Folder if kind == "folder" else file.File
         clouds = {"fileFilter": CLOUDS} if kind == "cloud" else {}
         return file(name, label, behaviour, optional=optional, **clouds)
+    made = None, optional, not optional
     if kind == "folder written":
-        return core.QgsProcessingParameterFolderDestination(
-            name, label, None, optional, not optional
-        )
+        return core.QgsProcessingParameterFolderDestination(name, label, *made)
     if kind == "written":
-        filters = (
-            "LAZ (*.laz);;LAS (*.las);;GeoTIFF (*.tif)" if one["needed"] else "All files (*.*)"
-        )
-        return core.QgsProcessingParameterFileDestination(
-            name, label, filters, None, optional, not optional
-        )
+        filters = OUTPUTS if one["needed"] else "All files (*.*)"
+        return core.QgsProcessingParameterFileDestination(name, label, filters, *made)
     return core.QgsProcessingParameterString(name, label, default, False, optional)
 
 
@@ -196,10 +185,9 @@ def _load(path: Path, context: Any) -> None:
             if layer.isValid():
                 layer.loadDefaultStyle()
                 context.temporaryLayerStore().addMapLayer(layer)
-                details = core.QgsProcessingContext.LayerDetails(
-                    layer.name(), context.project(), ""
-                )
-                context.addLayerToLoadOnCompletion(layer.id(), details)
+                details = core.QgsProcessingContext.LayerDetails
+                shown = details(layer.name(), context.project(), "")
+                context.addLayerToLoadOnCompletion(layer.id(), shown)
 
 
 def _layers(path: Path) -> list[Any]:

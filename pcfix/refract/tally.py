@@ -177,7 +177,7 @@ class Tally(Sums):
         return {text: int(self.outcomes[reason]) for reason, text in REASONS.items()}
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the counts and figures by the names of `pcfix.report.summary.Summary`."""
+        """Return the counts and figures by the names of `pcfix.report.text.Summary`."""
         return {
             "points": self.points,
             "submerged": self.submerged,

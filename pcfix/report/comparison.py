@@ -6,25 +6,15 @@ earlier one measured. The terminal and the page show the same tables.
 
 from __future__ import annotations
 
+from itertools import cycle
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.grid.colours import DIFFERENCE
-from pcfix.grid.maps import Extent
+from pcfix.grid.maps import DIFFERENCE, Extent
 from pcfix.model import FloatArray
 from pcfix.options.steps import LAYERS
-from pcfix.report.page import (
-    AFTER,
-    BEFORE,
-    REFERENCE,
-    WATER,
-    Picture,
-    Table,
-    map_figure,
-    name_of,
-    new_figure,
-)
+from pcfix.report.page import AFTER, BEFORE, WATER, Picture, Table, map_figure, name_of, new_figure
 from pcfix.report.text import Plain, aligned, share, wrapped
 
 if TYPE_CHECKING:
@@ -33,6 +23,7 @@ if TYPE_CHECKING:
     from pcfix.compare.figures import Comparison
 
 TIMES = (("before", "uncorrected", BEFORE), ("after", "corrected", AFTER))
+NAMES = {"apparent": "uncorrected"}
 FURTHER = ("#6a3d9a", "#33804d", "#c51b7d", "#8c6d1f", "#5f6b73")
 """Colours of further clouds, in turn."""
 KINDS = {
@@ -47,16 +38,6 @@ KINDS = {
 MOMENTS = {
     "mean": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m", "median": "median_m",
 }  # fmt: skip
-BINS = {
-    "depth_bins": ("By depth (m)", "Error against depth", "Reference depth (m)"),
-    "shore_bins": (
-        "By distance from shore (m)", "Error against distance from shore",
-        "Distance from the shore (m)",
-    ),
-}  # fmt: skip
-"""Their titles as a table and as a picture, and the label of the axis."""
-SHOWN = 0.995
-"""The share of the distances of each histogram of C2C up to which the axis reaches at least."""
 
 
 class Errors(NamedTuple):
@@ -89,9 +70,9 @@ def errors_of(compared: Plain, *kinds: str) -> list[Errors]:
     return rows
 
 
-def raw_of(compared: Plain) -> Plain:
-    """Return the statistics that the cloud's own errors were taken from, before and after."""
-    if compared["own"]["of"] == "bed":
+def measured_of(compared: Plain) -> Plain:
+    """Return the statistics of the vertical errors of the bed, or else of all, before and after."""
+    if compared["bed"] is not None:
         return dict(compared["bed"])
     return {when: of and of["statistics"] for when, of in compared["vertical"].items()}
 
@@ -114,11 +95,6 @@ def comparison_text(c: Comparison) -> str:
     if n.reference_compared:
         of = share(n.reference_compared, in_reference)
         rows.append(("C2C from", f"{n.reference_compared:,} points of the reference ({of})"))
-    if (own := plain["own"]) is not None:
-        noise = noise_sentence(own, raw_of(plain)["after"])
-        if own["rmse_m"] is not None:
-            noise = f"RMSE {own['rmse_m']:.3f} m, 95 % within {own['within_95_m']:.3f} m; {noise}"
-        rows.append(("Bed" if own["of"] == "bed" else "Cloud", noise))
     if c.m3c2 is not None:
         m = c.m3c2.after
         rows.append(("M3C2", f"{m.statistics.count:,} of {m.core_points:,} core points, normals"
@@ -129,16 +105,6 @@ def comparison_text(c: Comparison) -> str:
     tables = [line for table in _tables(plain) for line in ("", *table.lines())]
     notes = [wrapped("", f"Note: {note}") for note in c.notes]
     return "\n".join([aligned(head, rows), *tables, *notes])
-
-
-def noise_sentence(own: Plain, raw: Plain) -> str:
-    """Return how the noise of the reference changes the errors of the cloud."""
-    source = "assumed" if own["is_assumed"] else "stated"
-    noise = f"the noise of the reference ({own['sigma_reference_m']:.3f} m, {source})"
-    if own["rmse_m"] is None:
-        return f"the differences scatter no more than {noise}, so the cloud's error is not known."
-    with_it = f"RMSE {raw['rmse_m']:.3f} m, 95 % within {raw['within_95_m']:.3f} m"
-    return f"{noise} is subtracted; with it {with_it}."
 
 
 def signed(value_m: float) -> str:
@@ -161,15 +127,14 @@ def _tables(compared: Plain) -> list[Table]:
     title = f"Against {name_of(compared['reference'])} (m)"
     tables = [Table(title, ["", "points", *MOMENTS, "5 %", "95 %", "max"], rows)]
 
-    header, rows = [], []
+    header, rows = [""], []
     for one in errors_of(compared, "c2c", "c2c_from_reference"):
         s, bands = one.found["statistics"], one.found["shares"]
-        header = [f"{band['low_m']:g} to {band['high_m']:g} m" for band in bands]
-        shares = [f"{100 * band['share']:.1f} %" for band in bands]
+        header = ["", "mean (m)", "std.dev. (m)", "classes"]
+        header += [f"{band['low_m']:g} to {band['high_m']:g} m" for band in bands]
         classes = str(len(one.found["histogram"]["counts"]))
-        figures = [f"{s['mean_m']:.6f}", f"{s['sd_m']:.6f}", classes]
-        rows.append([f"{one.title}, {one.cloud}", *figures, *shares])
-    header = ["", "mean (m)", "std.dev. (m)", "classes", *header]
+        row = [f"{one.title}, {one.cloud}", f"{s['mean_m']:.6f}", f"{s['sd_m']:.6f}", classes]
+        rows.append([*row, *(f"{100 * band['share']:.1f} %" for band in bands)])
     tables.append(Table("C2C, normal distribution", header, rows))
 
     rows = [
@@ -180,20 +145,16 @@ def _tables(compared: Plain) -> list[Table]:
     header = ["", "slope", "intercept (m)", "r²"]
     tables.append(Table("Depth against reference depth", header, rows))
 
-    # of each class of depth or of distance from the shore
-    figures_of = {"bias": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m"}
-    first, *others = figures_of
-    header = ["", "points"]
-    header += [one for _, name, _ in TIMES for one in (f"{name}: {first}", *others)]
-    for key, (title, _, _) in BINS.items():
-        rows = []
-        for one in compared[key]:
-            row = [f"{one['from_m']:g} to {one['to_m']:g}", f"{one['after']['count']:,}"]
-            for when, _, _ in TIMES:
-                s = one[when]
-                row += ["" if s is None else f"{s[key]:z.3f}" for key in figures_of.values()]
-            rows.append(row)
-        tables.append(Table(title, header, rows))
+    header, rows = ["", "points"], []
+    for _, name, _ in TIMES:
+        header += [f"{name}: bias", "sd", "RMSE", "NMAD"]
+    for one in compared["depth_bins"]:
+        row = [f"{one['from_m']:g} to {one['to_m']:g}", f"{one['after']['count']:,}"]
+        for when, _, _ in TIMES:
+            keys, s = ("mean_m", "sd_m", "rmse_m", "nmad_m"), one[when]
+            row += ["" if s is None else f"{s[key]:z.3f}" for key in keys]
+        rows.append(row)
+    tables.append(Table("By depth (m)", header, rows))
     return [table for table in tables if table.rows]
 
 
@@ -228,30 +189,25 @@ def evaluation(
         look: dict[str, Any] = {"cmap": DIFFERENCE, "vmin": -reach, "vmax": reach}
         figure = map_figure(difference_m, extent_m, "Cloud minus reference (m)", **look)
         pictures.append(Picture("dod", "Difference of the surfaces (DoD)", alt, figure))
-    for key, (_, title, label) in BINS.items():
-        if bins := compared[key]:
-            alt = (
-                f"{title}: mean and standard deviation of the vertical error in {len(bins)}"
-                " classes, before and after the correction."
-            )
-            pictures.append(Picture(key, title, alt, _errors_figure(bins, label)))
+    if bins := compared["depth_bins"]:
+        alt = (
+            f"Error against depth: mean and standard deviation of the vertical error in {len(bins)}"
+            " classes, before and after the correction."
+        )
+        figure = _depth_figure(bins)
+        pictures.append(Picture("depth_bins", "Error against depth", alt, figure))
     pictures += [_section(number, one) for number, one in enumerate(sections, start=1)]
     return pictures, _tables(compared)
 
 
 def c2c_figure(compared: Plain) -> Figure:
     """Draw the histograms of all C2C: a column a direction, a row a cloud, one axis."""
-    columns = [errors_of(compared, kind) for kind in ("c2c", "c2c_from_reference")]
-    columns = [one for one in columns if one]
+    both = (errors_of(compared, kind) for kind in ("c2c", "c2c_from_reference"))
+    columns = [one for one in both if one]
     figure = _histograms(columns, "Distance to the nearest point (m)", sharex=True)
-    reach = 0.0
-    for column in columns:
-        for one in column:
-            # the upper edge of the class in which the last of the distances shown lies
-            up_to = np.cumsum(one.found["histogram"]["counts"])
-            last = int(np.searchsorted(up_to, SHOWN * up_to[-1]))
-            reach = max(reach, one.found["histogram"]["edges_m"][1 + last])
-    figure.axes[0].set_xlim(0.0, reach)
+    # nearly all distances, but not the outliers
+    ends = [one.found["statistics"]["percentiles_m"]["p95"] for some in columns for one in some]
+    figure.axes[0].set_xlim(0.0, 1.25 * max(*ends, 1e-6))
     return figure
 
 
@@ -261,9 +217,8 @@ def _histograms(columns: list[list[Errors]], label: str, *, sharex: bool) -> Fig
 
     rows = len(columns[0])  # each direction has the same clouds
     size = 7.5 * len(columns) + 0.5, 2.4 * rows + 0.4
-    figure, panels = new_figure(
-        *size, nrows=rows, ncols=len(columns), sharex=sharex, squeeze=False
-    )  # fmt: skip
+    grid: dict[str, Any] = {"nrows": rows, "ncols": len(columns), "squeeze": False}
+    figure, panels = new_figure(*size, sharex=sharex, **grid)
     for axes, one in zip(panels.T.flat, (one for some in columns for one in some), strict=True):
         s, histogram = one.found["statistics"], one.found["histogram"]
         edges, counts, mean, sd = histogram["edges_m"], histogram["counts"], s["mean_m"], s["sd_m"]
@@ -282,8 +237,8 @@ def _histograms(columns: list[list[Errors]], label: str, *, sharex: bool) -> Fig
     return figure
 
 
-def _errors_figure(bins: list[Plain], label: str) -> Figure:
-    """Draw the mean error of each class, with its standard deviation."""
+def _depth_figure(bins: list[Plain]) -> Figure:
+    """Draw the mean error of each class of depth, with its standard deviation."""
     figure, axes = new_figure()
     axes.axhline(0.0, color="0.5", linewidth=0.8)
     for when, name, colour in TIMES:
@@ -292,7 +247,7 @@ def _errors_figure(bins: list[Plain], label: str) -> Figure:
             middle = [(b["from_m"] + b["to_m"]) / 2.0 for b in known]
             mean, sd = ([b[when][key] for b in known] for key in ("mean_m", "sd_m"))
             axes.errorbar(middle, mean, sd, fmt="o-", color=colour, capsize=3, label=name)
-    axes.set(xlabel=label, ylabel="Cloud minus reference, Z (m)")
+    axes.set(xlabel="Reference depth (m)", ylabel="Cloud minus reference, Z (m)")
     axes.legend(loc="best")
     return figure
 
@@ -301,18 +256,13 @@ def _section(number: int, section: Plain) -> Picture:
     """Draw the heights along a line."""
     figure, axes = new_figure(8.0, 4.0)
     heights, further = section["heights_m"], [n for n in section["heights_m"] if n not in LAYERS]
-    looks: dict[str, dict[str, Any]] = {
-        "water": {"color": WATER, "linewidth": 1.2},
-        "reference": {"color": REFERENCE, "linewidth": 2.5, "alpha": 0.45},
-        "apparent": {"color": BEFORE, "linestyle": "--", "label": "uncorrected"},
-        "corrected": {"color": AFTER},
-    }
-    for place, name in enumerate(further):
-        looks[name] = {"color": FURTHER[place % len(FURTHER)], "linewidth": 1.0}
-    for name, look in looks.items():
+    colours = {"water": WATER, "reference": "0.65", "apparent": BEFORE, "corrected": AFTER}
+    colours |= dict(zip(further, cycle(FURTHER), strict=False))
+    for name, colour in colours.items():
         if name in heights:
-            line = np.array(heights[name], float)
-            axes.plot(section["distance_m"], line, **{"label": name} | look)
+            line, label = np.array(heights[name], float), NAMES.get(name, name)
+            width = 2.5 if name == "reference" else 1.2  # it lies under the others
+            axes.plot(section["distance_m"], line, color=colour, linewidth=width, label=label)
     axes.set(xlabel="Distance along the line (m)", ylabel="Height (m)")
     axes.legend(loc="best")
     alt = (

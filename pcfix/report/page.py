@@ -19,9 +19,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.grid.colours import DEPTH, HEIGHT, NO_LIGHT, hillshade, stops_of
 from pcfix.grid.lattice import Lattice
-from pcfix.grid.maps import Extent, contours, depth_interval, smoothed
+from pcfix.grid.maps import (
+    DEPTH,
+    HEIGHT,
+    NO_LIGHT,
+    Extent,
+    contours,
+    depth_interval,
+    hillshade,
+    smoothed,
+    stops_of,
+)
 from pcfix.model import FloatArray
 from pcfix.sums import nice_step
 
@@ -174,7 +183,7 @@ class Layer:
     name: str
     unit: str
     values: FloatArray
-    ramp: str = HEIGHT  # of `pcfix.grid.colours`
+    ramp: str = HEIGHT  # of `pcfix.grid.maps`
     plus_minus: str = ""  # name of the layer with the uncertainty of this one at 95 %
     is_centred: bool = False  # whether its colours are centred on zero
     has_contours: bool = False
@@ -233,8 +242,8 @@ def render(report: Report) -> str:
 _NO_DATA = -32768
 _STEPS = 32_000
 """Of the 16 bits in which the page holds the values of its map."""
-_SMALLEST_STEP = {"m": 0.001, "px": 0.001}
-"""By unit; finer ones would only be noise that does not pack."""
+_SMALLEST_STEP = 0.001
+"""In metres or pixels; finer steps would only be noise that does not pack."""
 _COLOURS = 64
 _TICKS = 7
 SMOOTH_CELLS = 1.5
@@ -280,7 +289,7 @@ def map_json(lattice: Lattice, height_m: FloatArray, layers: Sequence[Layer]) ->
 def relief(height_m: FloatArray, cell_m: float) -> FloatArray:
     """Return the shade of a surface lit from the north-west, 45 degrees up, 0 to 1."""
     smooth = np.pad(smoothed(height_m, SMOOTH_CELLS), 1, constant_values=np.nan)
-    light = hillshade(smooth, cell_m, 315.0, 45.0)
+    light = hillshade(smooth, cell_m)
     return np.where(light == NO_LIGHT, np.nan, (light - 1.0) / 254.0)
 
 
@@ -288,7 +297,7 @@ def _of_layer(layer: Layer) -> dict[str, Any]:
     """Return a layer; the range of its colours is round, and leaves out a percent at each end."""
     known = layer.values[np.isfinite(layer.values)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-    step = max((high - low) / _STEPS, _SMALLEST_STEP.get(layer.unit, 0.01))
+    step = max((high - low) / _STEPS, _SMALLEST_STEP)
     shown = np.percentile(known, [1.0, 99.0]) if known.size else np.array([0.0, 1.0])
     if layer.is_centred:
         shown = np.abs(shown).max() * np.array([-1.0, 1.0])

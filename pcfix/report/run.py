@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.grid.colours import DEPTH, DIFFERENCE, UNCERTAINTY
 from pcfix.grid.lattice import Lattice
-from pcfix.grid.maps import contours, depth_interval
+from pcfix.grid.maps import DEPTH, DIFFERENCE, UNCERTAINTY, contours, depth_interval
 from pcfix.model import Cameras, FloatArray
 from pcfix.refract.tally import ORDERS, largest_tvu_m
-from pcfix.report.comparison import noise_sentence, raw_of, signed
+from pcfix.report.comparison import measured_of, signed
 from pcfix.report.page import (
     AFTER,
     BEFORE,
@@ -33,23 +32,20 @@ from pcfix.report.page import (
     new_figure,
     relief,
 )
-from pcfix.report.summary import Summary
-from pcfix.report.text import FEWEST, formal_words, summary_rows
+from pcfix.report.text import Summary, formal_words, summary_rows
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Plain = dict[str, Any]
-Pair = tuple[str, str]
 FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras")
 """Those that are shown where they are there, the first four of them."""
 SHOWN_NOTES = 3
-CONTRADICTS = 1.5
-"""Measured and predicted errors that differ by a larger factor contradict each other."""
+REFERENCE_M = 0.03
+"""Noise of a reference such as LiDAR on hard ground; a smaller bias is no cause for a warning."""
 BESIDE_MAP = ("Submerged", "Cameras", "Water", "")
 """Labels of the rows that are also shown beside the map."""
-UNKNOWN_DATUM = "vertical datum not known"
 
 
 class RunMaps(NamedTuple):
@@ -76,7 +72,7 @@ def run_report(
     pictures: Sequence[Picture] = (),
     tables: Sequence[Table] = (),
     inputs: Sequence[Table] = (),
-    files: Sequence[Pair] = (),
+    files: Sequence[tuple[str, str]] = (),
 ) -> Report:
     """Return the page of a run.
 
@@ -95,14 +91,11 @@ def run_report(
     head = [
         ["Images", date or "date not stated"],
         ["CRS", maps.crs or "not stated by the cloud"],
-        ["Heights", maps.heights or f"{UNKNOWN_DATUM}: the cloud states none"],
+        ["Heights", maps.heights or "vertical datum not stated by the cloud"],
         ["Points", f"{s.points:,}"],
         *([label, words] for label, words in rows if label in BESIDE_MAP),
     ]
-    depths = [
-        ("range", f"{depth['min']:.2f} to {depth['max']:.2f} m"),
-        ("mean", f"{depth['mean']:.2f} m"),
-    ]
+    depths = f"{depth['min']:.2f} to {depth['max']:.2f} m", f"{depth['mean']:.2f} m"
     # the rows of the terminal, and why the method was chosen
     facts = [("Input cloud", name_of(s.input)), ("Points", f"{s.points:,}"), *rows]
     facts += [("Reconstruction", s.reconstruction["because"])] if s.reconstruction else []
@@ -111,8 +104,8 @@ def run_report(
         for name, value in s.settings.items()
         if value not in (None, "", {}, [])
     ]
-    versions = [["pcfix", __version__], ["Python", platform.python_version()]]
-    versions += [[name, version(name)] for name in ("numpy", "scipy", "numba", "laspy", "lazrs")]
+    libraries = [[name, version(name)] for name in ("numpy", "scipy", "numba", "laspy", "lazrs")]
+    versions = [["pcfix", __version__], ["Python", platform.python_version()], *libraries]
     order = {name: place for place, name in enumerate(FIRST_FIGURES)}
     pictures = [*_pictures(s, cameras, maps, compared), *pictures]
     return Report(
@@ -120,7 +113,7 @@ def run_report(
         lead=lead + verdict,
         head=Table("The project", [], head),
         tiles=[
-            Tile("Depth", figures=depths),
+            Tile("Depth", figures=list(zip(("range", "mean"), depths, strict=True))),
             accuracy_tile(s, compared),
             Tile("Warnings", notes=notes[:SHOWN_NOTES] or ["None."]),
         ],
@@ -178,22 +171,16 @@ def _pictures(s: Summary, cameras: Cameras, maps: RunMaps, compared: Plain) -> l
     )
     pictures = [Picture("depth", "Depth", alt, figure)]
     if s.cameras:
-        alt = (
-            f"Projection centres over the cloud; {s.cameras_used} of {s.cameras} see corrected"
-            " points."
-        )
+        alt = f"Projection centres over the cloud; {s.cameras_used} of {s.cameras} were used."
         figure = cameras_figure(maps, cameras, s.cameras_unused)
         pictures.append(Picture("cameras", "Cameras", alt, figure))
     known = np.isfinite(maps.depth_m) & np.isfinite(maps.uncertainty_m)
     if s.uncertainty is not None and known.any():
         bins = compared["depth_bins"] if compared.get("tvu") else []
-        dots = (
-            " Dots: 95 % of the differences from the reference are smaller, noise of the"
-            " reference included."
-        )
+        dots = " Dots: 95 % of the differences from the reference are smaller." if bins else ""
         alt = (
             "Total vertical uncertainty at 95 % (1.96 standard errors of Z) over depth, and the"
-            f" limits of the orders of IHO S-44. {formal_words(s)}.{dots if bins else ''}"
+            f" limits of the orders of IHO S-44. {formal_words(s)}.{dots}"
             " S-44 has requirements other than the TVU: position, features and coverage."
         )
         figure = tvu_figure(maps.depth_m[known], maps.uncertainty_m[known], bins)
@@ -220,41 +207,30 @@ def cameras_figure(maps: RunMaps, cameras: Cameras, unused: Sequence[str]) -> Fi
 
 
 def tvu_figure(depth_m: FloatArray, tvu_m: FloatArray, measured: Sequence[Plain]) -> Figure:
-    """Draw TVU at 95 % over depth, and the limits of the orders of IHO S-44 up to one above it.
+    """Draw TVU at 95 % of cells over depth, (n,), metres, and the limits of the orders of S-44.
 
-    Both have the shape (n,), metres. `measured` are the `Comparison.depth_bins` of a reference, in
-    plain values.
+    `measured` are the `Comparison.depth_bins` of a reference, in plain values.
     """
     figure, axes = new_figure()
-    deepest = float(max(depth_m.max(), 1e-3))
-    edges = np.linspace(0.0, deepest * (1.0 + 1e-9), 31)
-    slot = np.clip(np.digitize(depth_m, edges) - 1, 0, 29)
-    used = np.unique(slot)
-    low, middle, high = np.array([np.percentile(tvu_m[slot == i], [5, 50, 95]) for i in used]).T
-    centres = 0.5 * (edges[:-1] + edges[1:])[used]
-    axes.fill_between(
-        centres, low, high, color=WATER, alpha=0.6, linewidth=0.0, label="predicted, 90 %"
-    )
-    axes.plot(centres, middle, color=AFTER, label="predicted, median")
+    axes.plot(depth_m, tvu_m, ".", markersize=1, color=WATER, label="predicted, each cell")
     within = [one["after"]["within_95_m"] for one in measured]
     if measured:
         at = [0.5 * (one["from_m"] + one["to_m"]) for one in measured]
         axes.plot(at, within, "o", color=REFERENCE, label="measured")
-    depths = np.linspace(0.0, deepest, 100)
+    deepest = max(float(depth_m.max()), 1e-3)
+    depths, most = np.linspace(0.0, deepest, 100), 1.3 * max(np.percentile(tvu_m, 99), *within, 0.2)
     for order, style in zip(ORDERS, ("-", "--", "-.", ":"), strict=True):
         largest = largest_tvu_m(order, depths)
-        name = order.name if order.name[0].isalpha() else f"order {order.name}"
-        axes.plot(depths, largest, style, color=BEFORE, label=f"IHO S-44 {name}")
-        if largest[0] > max(high.max(), *within, 0.0):
-            break  # laxer limits would only press the points down
-    axes.set(xlim=(0.0, deepest), ylim=(0.0, None), xlabel="Depth (m)", ylabel="TVU at 95 % (m)")
+        if largest[0] < most:
+            axes.plot(depths, largest, style, color=BEFORE, label=f"IHO S-44 {order.name}")
+    axes.set(xlim=(0.0, deepest), ylim=(0.0, most), xlabel="Depth (m)", ylabel="TVU at 95 % (m)")
     axes.legend(loc="best")
     return figure
 
 
 def accuracy_tile(s: Summary, compared: Plain) -> Tile:
     """Return the accuracy of the bed: measured where there is a reference, else predicted."""
-    if not compared.get("own"):
+    if not compared:
         title, unknown = "Accuracy of the bed", "not known"
         if s.uncertainty is None:
             why = "There is no reference, and the points have no standard errors."
@@ -264,53 +240,33 @@ def accuracy_tile(s: Summary, compared: Plain) -> Tile:
             ("standard error", f"{sigma:.3f} m"), ("95 % within", f"{tvu:.3f} m"),
             ("bias", unknown),
         ]  # fmt: skip
-        why = (
-            "No reference was given. The prediction follows from assumed errors without a common"
-            " bias."
-        )
+        why = "No reference was given. The prediction follows from assumed errors without a bias."
         return Tile(title, "predicted", figures, [why])
-    own, pair = compared["own"], raw_of(compared)
-    raw, before = pair["after"], pair["before"]
-    known = raw if own["rmse_m"] is None else own
-    noise = noise_sentence(own, raw)
+    after, before = measured_of(compared)["after"], measured_of(compared)["before"]
     notes = [
-        f"At {raw['count']:,} points against {name_of(compared['reference'])}"
-        + (f"; before the correction, RMSE {before['rmse_m']:.3f} m." if before else "."),
-        noise[:1].upper() + noise[1:],
+        f"At {after['count']:,} points against {name_of(compared['reference'])}, whose noise is"
+        " included"
+        + (f"; before the correction, RMSE {before['rmse_m']:.3f} m." if before else ".")
     ]
-    if own["of"] == "bed" and compared["land"]:
+    if compared["land"]:
         land = compared["land"]["after"]
-        notes.append(
-            f"Land: bias {signed(land['mean_m'])}, RMSE {land['rmse_m']:.3f} m, reference included."
-        )
+        notes.append(f"Land: bias {signed(land['mean_m'])}, RMSE {land['rmse_m']:.3f} m.")
     figures = [
-        ("bias", signed(own["mean_m"])), ("RMSE", f"{known['rmse_m']:.3f} m"),
-        ("95 % within", f"{known['within_95_m']:.3f} m"),
+        ("bias", signed(after["mean_m"])), ("RMSE", f"{after['rmse_m']:.3f} m"),
+        ("95 % within", f"{after['within_95_m']:.3f} m"),
     ]  # fmt: skip
-    of = "bed" if own["of"] == "bed" else "cloud (bed and land are not separated)"
+    of = "bed" if compared["bed"] else "cloud (bed and land are not separated)"
     return Tile(f"Accuracy of the {of}", "measured", figures, notes)
 
 
 def notes_of(s: Summary, heights: str, compared: Plain) -> list[str]:
     """Return what to check, the most important first; `heights` is the vertical datum."""
     notes = []
-    if not compared.get("own"):
+    if not compared:
         notes.append("No reference: the accuracy is predicted. Check points on the bed measure it.")
-    elif compared.get("bed"):
-        after, noise = compared["bed"]["after"], compared["own"]["sigma_reference_m"]
-        if s.uncertainty is not None and after["count"] >= FEWEST:
-            sigma, measured = s.uncertainty["sigma_z_m"]["mean"], after["rmse_m"]
-            expected = (sigma**2 + noise**2) ** 0.5
-            if not 1.0 / CONTRADICTS <= measured / expected <= CONTRADICTS:
-                is_larger = measured > expected
-                notes.append(
-                    f"The measured errors of the bed are {'larger' if is_larger else 'smaller'}"
-                    f" than the predicted ones (RMSE {measured:.3f} m, predicted {expected:.3f} m"
-                    " with the noise of the reference):"
-                    f" {'use the measured ones' if is_larger else 'the prediction is cautious'}."
-                )
-        bias = after["mean_m"]
-        if abs(bias) > max(after["sd_m"], noise):
+    elif compared["bed"]:
+        bias, sd = (compared["bed"]["after"][key] for key in ("mean_m", "sd_m"))
+        if abs(bias) > max(sd, REFERENCE_M):
             notes.append(
                 f"The bed is too {'high' if bias > 0.0 else 'low'} by {abs(bias):.3f} m on average,"
                 " more than it scatters. Check water level, refractive index, vertical datum and"

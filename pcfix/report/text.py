@@ -12,20 +12,16 @@ report page use the same rows.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator
 from string import Formatter
 from textwrap import fill
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pcfix.options.correct import LEVEL_M
 from pcfix.refract.tally import ORDERS
-from pcfix.report.summary import Summary
-
-if TYPE_CHECKING:
-    from pcfix.sums import Figures
+from pcfix.sums import Figures
 
 Plain = dict[str, Any]
 Rows = list[tuple[str, str]]
@@ -33,13 +29,9 @@ RowTable = tuple[tuple[str, str, str], ...]
 
 FEWEST = 59
 """Differences of which all keep an order before 95 % of all are likely to: 0.95^59 is 0.05."""
-SHOWN_NAMES = 5
 WIDTH = 100
 """Columns of a printed line."""
-UNIT = re.compile(r"(?<=\d) (?=(?:m|cm|px|deg|%)(?:\W|$))")
-"""The space between a number and its unit."""
 
-_PART: RowTable = ()
 _NO_SURFACE = ("No surface", "{water_unknown:,} points have no water surface", "water_unknown")
 _LABELLING: RowTable = (
     ("Mask", "{labelling[outside_mask]:,} points below the surface are outside of it and count as"
@@ -51,7 +43,6 @@ _LABELLING: RowTable = (
     ("Pools", "no pool is separate from the water", "!labelling[separate][pools]"),
 )  # fmt: skip
 _CORRECTED: RowTable = (
-    *_PART,
     ("Transferred", "{transfer[points]:,} points ({transfer[land]:,} on land) to the adjusted"
      " poses: {transfer[shift_m][rms]:.3f} m rms, mean Z"
      " {transfer[shift_m][mean_z]:+.3f} m", "transfer"),
@@ -69,7 +60,6 @@ _CORRECTED: RowTable = (
     ("Cameras", "{cameras_used} of {cameras} used, {rays_per_point:.1f} rays per point, incidence"
      " angles up to {incidence_deg:.0f} deg", "cameras"),
     ("Cameras", "none; ray counts of 1 and incidence angles of 0 are placeholders", "!cameras"),
-    ("Unused", "{unused_count} cameras without corrected points: {unused}", "unused"),
     ("Water", "{water}, refractive index {settings[index]:.6g}", ""),
     ("", "fitted {water_fit[model]}, standard error {water_fit[sigma_level_m]:.3f} m",
      "water_fit"),
@@ -87,12 +77,8 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
     "correct": ("Corrected {input} -> {output}      {points:,} points in {seconds:.1f} s",
                 _CORRECTED),
     "label": ("Labelled {input} -> {output}      {points:,} points in {seconds:.1f} s", (
-        *_PART,
-        ("Class 40", "{submerged:,} points ({submerged:of points})", ""),
-        ("Class 41", "{water_surface:,} points within {settings[surface_band]:g} m of the surface",
-         "settings[surface_band]"),
-        ("Formerly", "{stale:,} points of class 40 or 41 are in neither class now:"
-         " {settings[reset]:?class 1 now|unchanged; --reset sets class 1}", "stale"),
+            ("Class 40", "{submerged:,} points ({submerged:of points})", ""),
+        ("Formerly", "{stale:,} points of class 40 are not submerged; their class stays", "stale"),
         _NO_SURFACE,
         *_LABELLING,
         ("Water", "{water}", ""),
@@ -109,9 +95,8 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
     )),
     "dsm": ("Gridded {input} -> {output}      {points_used:,} of {points:,} points"
             " ({is_bed:?bed, class 40|land and bed}) in {seconds:.1f} s", (
-        *_PART,
-        ("Raster", "{width:,} x {height:,} cells of {settings[resolution]:g} m"
-         "{is_chosen:?, chosen for 2 to 4 points each|}, {settings[method]}", ""),
+            ("Raster", "{width:,} x {height:,} cells of {settings[resolution]:g} m"
+         " ({settings[method]})", ""),
         ("Values", "{what} {values[min]:.4g} to {values[max]:.4g}, mean {values[mean]:.4g}"
          "{is_tvu:? m at 95 % (predicted)|}", "values"),
         ("Bounds", "x {bounds_m[0]:.10g} to {bounds_m[2]:.10g}, y {bounds_m[1]:.10g} to"
@@ -121,7 +106,6 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
         ("", "{filled:,} interpolated ({filled:of all}), across holes up to {hole_m:.3g} m",
          "hole_m"),
         ("", "{empty:,} empty ({empty:of all})", ""),
-        ("Hillshade", "{hillshade}", "hillshade"),
         ("Counts", "{counts}", "counts"),
     )),
     "calm": ("Combined {input} -> {output}      {frames} frames of {columns:,} x {rows:,} pixels in"
@@ -135,13 +119,12 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
         ("", "heights {water[height_m]:.1f cm} rms, standard error {water[sigma_m]:.1f cm}:"
          " {water[folder]}", "water"),
     )),
-    "photos": ("Mapped {mapped:,} images in {seconds:.1f} s", (
+    "photos": ("Mapped {images:,} images in {seconds:.1f} s", (
         ("Pixels", "{megapixels:.1f} million", "megapixels"),
         ("Mapping", "{mapping}, nodes every {spacing_px} px, largest shift"
          " {largest_shift_px:.1f} px", ""),
         ("Black", "{black_share:.1f %} of the pixels: no ground, occluded, or outside the image",
          ""),
-        ("Skipped", "{done_before:,} images, already done", "done_before"),
         ("Ground", "{dsm}", ""),
         ("Water", "{water}, refractive index {refractive_index:g}", ""),
     )),
@@ -149,7 +132,6 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
         ("Result", "{settled:?settled|not settled}: the last round moved the bed by"
          " {settled:?less|more} than {threshold_m:.3f} m on average", ""),
         ("Cloud", "{last[cloud]}", ""),
-        ("Compared", "{compared}", "compared"),
     )),
     "ortho": ("Orthophoto {output} in {seconds:.1f} s", (
         ("Raster", "{width:,} x {height:,} cells of {resolution_m:g} m", ""),
@@ -159,6 +141,42 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
     )),
 }  # fmt: skip
 """By command: the line that says what was done, and the rows below it."""
+
+
+class Summary(Figures):
+    """The results of a correction by name; `as_dict` is what ``--summary`` writes."""
+
+    @property
+    def absorbed(self) -> bool | None:
+        """Whether the poses have absorbed the refraction; None if that is unknown."""
+        return None if self.poses is None else self.poses["absorbed"]
+
+    @property
+    def why_no_order(self) -> str:
+        """Why no order of S-44 is claimed, as the whole bed may be off; empty if one is."""
+        found = self.reconstruction or {}
+        if self.settings["method"] == "regression":  # measured depths hold the bed
+            return ""
+        is_sure = found.get("sure", bool(found.get("views_are")))
+        if found.get("method") != "consistent" or not is_sure:
+            return "the reconstruction type is uncertain, or the method assumes another one"
+        return {
+            True: "the poses have absorbed the refraction",
+            None: "the poses were not checked for absorbed refraction",
+            False: "",
+        }[self.absorbed]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON; optional parts only if there are any."""
+        optional = ("labelling", "transfer", "poses", "fit")
+        values = {
+            name: value for name, value in vars(self).items()
+            if name != "notes" and not (name in optional and value is None)
+        }  # fmt: skip
+        if self.uncertainty is not None and self.why_no_order:
+            no_order = {"s44": None, "why_no_order": self.why_no_order}
+            values["uncertainty"] = {**self.uncertainty, **no_order}
+        return values
 
 
 class _Words(Formatter):
@@ -231,12 +249,10 @@ def wrapped(start: str, text: str) -> str:
     """Return a text in lines of `WIDTH` with a hanging indent, unless it has a command."""
     if "pcfix " in text:
         return start + text
-    text = UNIT.sub("\xa0", text)  # a number and its unit stay together
-    lines = fill(
+    return fill(
         text, WIDTH, initial_indent=start, subsequent_indent=" " * len(start),
         break_long_words=False, break_on_hyphens=False,
     )  # fmt: skip
-    return lines.replace("\xa0", " ")
 
 
 def share(part: int, whole: int) -> str:
@@ -247,6 +263,12 @@ def share(part: int, whole: int) -> str:
     return f"{percent:.0f} %" if percent >= 10 or percent == 0 else f"{percent:.1f} %"
 
 
+def summary_text(summary: Summary) -> str:
+    """Return the summary of a correction."""
+    head = _Words(vars(summary)).written(_TABLES["correct"][0], {})
+    return aligned(head, summary_rows(summary), summary.notes)
+
+
 def text_of(command: str, found: Figures) -> str:
     """Return the summary of a command as text."""
     if isinstance(found, Summary):
@@ -255,12 +277,10 @@ def text_of(command: str, found: Figures) -> str:
     if command == "dsm":
         s |= {
             "all": s["width"] * s["height"], "is_bed": s["settings"]["surface"] == "bed",
-            "is_chosen": s["resolution_is"] == "chosen", "is_tvu": s["what"] == "uncertainty",
+            "is_tvu": s["what"] == "uncertainty",
             "crs_name": s["crs"] or "the cloud states none",
             "heights_name": s["heights"] or "the cloud states no vertical datum",
         }  # fmt: skip
-    elif command == "photos":
-        s["mapped"] = s["images"] - s["done_before"]
     elif command == "rebuild":
         s |= {"count": len(s["rounds"]), "last": s["rounds"][-1]}
     elif command == "ortho":
@@ -269,18 +289,12 @@ def text_of(command: str, found: Figures) -> str:
     return aligned(_Words(s).written(head, {}), filled(rows, s))
 
 
-def summary_text(summary: Summary) -> str:
-    """Return the summary of a correction."""
-    head = _Words(vars(summary)).written(_TABLES["correct"][0], {})
-    return aligned(head, summary_rows(summary), summary.notes)
-
-
 def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
     """Return the facts of a correction, for the terminal and the report page.
 
     `measured` is the vertical uncertainty against a reference, `Comparison.tvu` in plain values.
     """
-    detected, unused, check = s.reconstruction, s.cameras_unused, ""
+    detected, check = s.reconstruction, ""
     method = str(s.settings["method"])
     if detected is not None and detected.get("type", "") not in ("", method):
         sure = f"detected, confidence {100.0 * detected['confidence']:.0f} %"
@@ -298,8 +312,6 @@ def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
         "corrected_words": "all corrected" if s.corrected == s.submerged else corrected,
         "method": method,
         "rays_per_point": s.rays / max(s.corrected, 1),
-        "unused_count": len(unused),
-        "unused": ", ".join([*unused[:SHOWN_NAMES], *(["..."] if unused[SHOWN_NAMES:] else [])]),
         "no_uncertainty": s.uncertainty is None and s.settings["dimensions"] == "all"
         and not s.cameras,
         "measured": measured,
@@ -308,14 +320,8 @@ def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
     })  # fmt: skip
 
 
-_BUDGET: RowTable = (
-    ("image", "{sigma_image:g} px", ""),
-    ("level", "{level:.3f} m{source}", ""),
-    ("index", "{sigma_index:g}", ""),
-    ("waves", "{sigma_waves:g} deg", "sigma_waves"),
-    ("camera positions", "{sigma_centre:g} m", "sigma_centre"),
-    ("attitude", "{sigma_attitude:g} deg", "sigma_attitude"),
-)
+_UNITS = {"image": " px", "index": "", "waves": " deg", "centre": " m", "attitude": " deg"}
+"""Of the standard deviations of a budget."""
 
 
 def formal_words(s: Summary) -> str:
@@ -330,8 +336,10 @@ def formal_words(s: Summary) -> str:
         fitted = (s.water_fit or {}).get("sigma_level_m")
         is_fitted = fitted is not None and np.isfinite(fitted)
         level, source = (fitted, " (fitted)") if is_fitted else (LEVEL_M, " (assumed)")
-    budget = filled(_BUDGET, s.settings | {"level": level, "source": source})
-    words = "Assumed standard deviations: " + ", ".join(f"{name} {text}" for name, text in budget)
+    words = f"Assumed standard deviations: level {level:.3f} m{source}"
+    for name, unit in _UNITS.items():
+        if value := s.settings[f"sigma_{name}"]:
+            words += f", {name} {value:g}{unit}"
     known = s.uncertainty or {}
     if (found := known.get("of_cloud")) is not None:
         words += (

@@ -14,7 +14,7 @@ from pcfix.options.declare import taken
 from pcfix.options.scenes import SceneOptions
 from pcfix.simulate.settings import Optics, SceneSettings
 from pcfix.simulate.terrain import Terrain
-from pcfix.simulate.tracing import Water, Waves, project, rotations_of, triangulate
+from pcfix.simulate.tracing import Water, project, rotations_of, triangulate
 
 ORIGIN_M = np.array([410_200.0, 4_650_300.0, 0.0])  # in UTM zone 33 north
 EPSG = 32633
@@ -26,9 +26,8 @@ PAIRS_AT_ONCE = 2_000_000
 class Scene:
     """A simulated scene; metres, UTM.
 
-    A point in fewer than three images has no views and is not moved. The cloud is
-    intersected with `cameras`; the images were taken with `true_cameras`, the same object without
-    pose noise.
+    A point in fewer than three images has no views and is not moved. The cloud is intersected with
+    `cameras`; the images were taken with `true_cameras`, the same object without pose noise.
     """
 
     apparent_xyz: FloatArray  # (n, 3), the cloud of the SfM software
@@ -63,13 +62,10 @@ class Scene:
     def description(self) -> str:
         """One line about the scene."""
         per_point = len(self.views.camera) / len(self.true_xyz)
-        tilt = 100.0 * float(np.hypot(self.water.b, self.water.c))
-        tilted = f" in the middle, tilted by {tilt:.3g} %" if tilt else ""
-        gsd = f"{100.0 * self.gsd_m:.1f} cm" if self.gsd_m >= 0.005 else f"{self.gsd_m:.2g} m"
         return (
             f"{len(self.true_xyz):,} points seen by {per_point:.0f} of {len(self.cameras)} cameras"
-            f" each, GSD {gsd}, water level {self.water_level_m:g} m{tilted},"
-            f" refractive index {self.refractive_index:g}"
+            f" each, GSD {self.gsd_m:.2g} m, water level {self.water_level_m:g} m, refractive index"
+            f" {self.refractive_index:g}"
         )
 
 
@@ -107,8 +103,7 @@ def simulate_scene(
     chosen = taken(SceneOptions, options, keywords, "simulate_scene").part(SceneSettings)
     site = lay_out(chosen)
     truth = points_on(site.terrain, chosen.points, site.rng)
-    parts = []
-    at_once = max(1, PAIRS_AT_ONCE // len(site.true))
+    parts, at_once = [], max(1, PAIRS_AT_ONCE // len(site.true))
     for first in range(0, len(truth), at_once):
         sight = see(truth[first : first + at_once], site, site.luck)
         apparent = sight.intersected(site.observed(sight.ideal, site.rng))
@@ -149,9 +144,9 @@ def scene_of(
 
 def lay_out(chosen: SceneSettings) -> Site:
     """Return ground and block of a scene, in local coordinates."""
-    # poses, waves and detection have their own random numbers, as they can be switched on
+    # poses and detection have their own random numbers, as they can be switched on
     rng, extent = np.random.default_rng(chosen.seed), chosen.area_m
-    of_poses, of_waves, luck = (np.random.default_rng([chosen.seed, i]) for i in (1, 2, 3))
+    of_poses, luck = (np.random.default_rng([chosen.seed, i]) for i in (1, 3))
     if chosen.cameras is not None:  # the area that about this number of nadir images covers
         (length, width), (base, spacing) = extent, chosen.base_and_spacing_m
         side = float(np.sqrt(chosen.cameras * base * spacing * length / width))
@@ -161,13 +156,10 @@ def lay_out(chosen: SceneSettings) -> Site:
     terrain = Terrain.random(chosen.bed, extent, plane, chosen.depth_m, rng)
     true, true_angles = fly_block(extent, chosen, rng)
     given, given_angles = misplaced(true, true_angles, chosen, of_poses)
-    waves = None
-    if chosen.wave_slope_deg > 0.0:
-        waves = Waves.random(len(true), chosen.wave_slope_deg, chosen.wave_length_m, of_waves)
     fall_m = chosen.water_tilt * float(np.hypot(*extent)) / 2.0
     return Site(
         terrain, true, true_angles, given, given_angles, chosen.optics,
-        Water(plane, chosen.refractive_index, waves), chosen.water - chosen.depth_m - fall_m,
+        Water(plane, chosen.refractive_index), chosen.water - chosen.depth_m - fall_m,
         chosen.image_noise, chosen.detection, rng, luck,
     )  # fmt: skip
 
@@ -329,17 +321,11 @@ class Sight:
 
         Shape (n, 3); a point without pairs stays where it is.
         """
-        paired, apparent = self.paired, self.truth.copy()
+        paired, apparent, site = self.paired, self.truth.copy(), self.site
         if paired.any():
-            starts = np.concatenate([self.start[:-1][paired], self.start[-1:]])
-            apparent[paired] = triangulate(
-                pixels,
-                self.site.given,
-                self.camera,
-                starts,
-                self.site.optics.lens,
-                apparent[paired],
-            )
+            begin = np.concatenate([self.start[:-1][paired], self.start[-1:]])
+            rays = pixels, site.given, self.camera, begin, site.optics.lens
+            apparent[paired] = triangulate(*rays, apparent[paired])
         return apparent
 
 
@@ -356,7 +342,7 @@ def see(truth: FloatArray, site: Site, rng: np.random.Generator) -> Sight:
     reach = (cameras.centres[:, 2] - site.lowest_m) * np.tan(widest)
     across = truth[:, None, 0] - cameras.centres[:, 0], truth[:, None, 1] - cameras.centres[:, 1]
     point, camera = np.nonzero(np.hypot(*across) < reach)
-    surface = site.water.piercing_points(truth[point], cameras.centres[camera], camera)
+    surface = site.water.piercing_points(truth[point], cameras.centres[camera])
     ideal, z = project(surface, cameras, camera, site.optics.lens)
     inside = (z > 0) & site.optics.frames(site.optics.to_image(ideal))
     point, camera, ideal = point[inside], camera[inside], ideal[inside]
@@ -367,6 +353,5 @@ def see(truth: FloatArray, site: Site, rng: np.random.Generator) -> Sight:
         rank[np.lexsort((luck, point))] = np.arange(len(point)) - np.searchsorted(point, point)
         taken &= (luck < site.detection) | (rank < LEAST_VIEWS)
     point, camera, ideal = point[taken], camera[taken], ideal[taken]
-    return Sight(
-        site, truth, starts(np.bincount(point, minlength=len(truth))), point, camera, ideal
-    )
+    begin = starts(np.bincount(point, minlength=len(truth)))
+    return Sight(site, truth, begin, point, camera, ideal)

@@ -16,8 +16,6 @@ from pcfix.simulate.terrain import BEDS
 from pcfix.water.index import index_of
 
 RIVER_TILT_PERCENT = 0.3
-MARGIN = 1.02
-"""Of the frame, in which a lens must not fold."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,14 +28,9 @@ class Optics:
     lens: Lens
     reach: float
 
-    @property
-    def is_ideal(self) -> bool:
-        """Whether there is no distortion."""
-        return not (any(self.lens.radial) or any(self.lens.tangential))
-
     def to_image(self, ideal: FloatArray) -> FloatArray:
         """Return image pixels of ideal pixels, shape (m, 2); NaN beyond the fold of the lens."""
-        if self.is_ideal:
+        if not self.lens.radial:
             return ideal
         principal = [self.lens.principal_x, self.lens.principal_y]
         plane = (ideal - principal) / self.lens.focal
@@ -45,7 +38,7 @@ class Optics:
 
     def to_ideal(self, image: FloatArray) -> FloatArray:
         """Return ideal pixels of image pixels, shape (m, 2)."""
-        if self.is_ideal:
+        if not self.lens.radial:
             return image
         rays = unproject(self.lens, image)
         principal = [self.lens.principal_x, self.lens.principal_y]
@@ -68,29 +61,21 @@ class SceneSettings(SceneOptions):
         """Check what options say together."""
         object.__setattr__(self, "index", index_of(self.index, self.index_formula)[0])
         pitch = [mm / px for mm, px in zip(self.sensor_mm, self.sensor_px, strict=True)]
-        rise = self.water_tilt * float(np.hypot(*self.area_m))
         if not 0.98 < pitch[0] / pitch[1] < 1.02:
-            raise SettingError(
-                "scene.pixels",
+            um = [1000 * side for side in pitch]
+            sentence = (
                 f"sensor_mm {self.sensor_mm} and sensor_px {self.sensor_px} make pixels of"
-                f" {1000 * pitch[0]:.3g} x {1000 * pitch[1]:.3g} um. Give square pixels.",
-                pixel_um=[1000 * side for side in pitch],
+                f" {um[0]:.3g} x {um[1]:.3g} um. Give square pixels."
             )
-        if self.flying_height_m <= 0.5 * self.depth_m:
-            heights = {"flying_height_m": self.flying_height_m, "depth_m": self.depth_m}
-            raise SettingError(
-                "scene.too_low",
-                f"Flying height {self.flying_height_m:g} m is not more than half the greatest depth"
-                f" {self.depth_m:g} m. Fly higher or give a smaller greatest depth.",
-                **heights,
+            raise SettingError("scene.pixels", sentence, pixel_um=um)
+        # above the highest water of the area
+        height = self.flying_height_m - self.water_tilt * float(np.hypot(*self.area_m)) / 2.0
+        if height <= 0.5 * self.depth_m:
+            sentence = (
+                f"Flying height {height:.4g} m above the highest water is not more than half the"
+                f" greatest depth {self.depth_m:g} m. Fly higher or give a smaller depth or tilt."
             )
-        if rise > 0.25 * self.flying_height_m:
-            raise SettingError(
-                "scene.tilt",
-                f"Tilt {100 * self.water_tilt:g} % makes the water fall {rise:.3g} m over the area,"
-                f" too much for a flight at {self.flying_height_m:g} m. Give a smaller one.",
-                tilt_percent=100 * self.water_tilt,
-            )
+            raise SettingError("scene.too_low", sentence, height_m=height, depth_m=self.depth_m)
         if self.oblique_share is not None and not self.has_obliques:
             sentence = f"oblique share {self.oblique_share:g} needs obliques. Give their angle."
             raise SettingError("option.no_use", sentence, option="oblique_share")
@@ -115,26 +100,17 @@ class SceneSettings(SceneOptions):
 
     @cached_property
     def optics(self) -> Optics:
-        """The camera's; a lens that folds the image inside the frame is refused."""
+        """The lens of the camera; where it folds the image, nothing is seen."""
         width, height = self.sensor_px
         middle = np.array([width / 2.0, height / 2.0])
         lens = Lens(self.focal_mm / self.sensor_mm[0] * width, width, height, *middle.tolist())
-        if not any(self.distortion):
-            return Optics(lens, float(np.hypot(*self.sensor_mm) / 2.0 / self.focal_mm))
-        lens = replace(lens, radial=self.distortion[:3], tangential=self.distortion[3:])
+        if any(self.distortion):
+            lens = replace(lens, radial=self.distortion[:3], tangential=self.distortion[3:])
         along = np.linspace(-1.0, 1.0, 41)
         side = np.ones_like(along)
         edges = [(along, side), (along, -side), (side, along), (-side, along)]
-        border = np.hstack(edges).T * middle
-        rays, wider = (unproject(lens, border * margin + middle) for margin in (1.0, MARGIN))
-        if not np.isfinite(wider).all():
-            raise SettingError(
-                "scene.distortion",
-                f"The distortion {', '.join(f'{v:g}' for v in self.distortion)} folds the image"
-                " inside the frame. Give smaller values.",
-                distortion=self.distortion,
-            )
-        return Optics(lens, float(np.hypot(*(rays[:, :2] / rays[:, 2:]).T).max()))
+        rays = unproject(lens, np.hstack(edges).T * middle + middle)
+        return Optics(lens, float(np.nanmax(np.hypot(*(rays[:, :2] / rays[:, 2:]).T))))
 
     @property
     def base_and_spacing_m(self) -> tuple[float, float]:

@@ -36,13 +36,9 @@ class Terrain:
 
     @classmethod
     def random(
-        cls,
-        kind: BedKind,
-        extent_m: tuple[float, float],
-        water: WaterPlane,
-        greatest_depth_m: float,
-        rng: np.random.Generator,
-    ) -> Terrain:
+        cls, kind: BedKind, extent_m: tuple[float, float], water: WaterPlane,
+        greatest_depth_m: float, rng: np.random.Generator,
+    ) -> Terrain:  # fmt: skip
         """Make a terrain; a shore gets random rocks."""
         rocks = np.zeros((0, 4))
         if kind == "shore":

@@ -4,11 +4,7 @@ The piercing point follows from Fermat's principle: it is the root of Snell's la
 between the feet of object and camera, found by a safeguarded Newton iteration. Nothing here is
 shared with the correction, which traces in the other direction by other mathematics.
 
-The surface is a plane, level or tilted, with waves that differ from image to image. A wave is a
-tilt of the tangent plane where the light would pass the mean plane; the light takes the least
-optical path through the tangent plane, so Snell's law holds exactly there. The height of the waves
-and their curvature within the few centimetres of this shift are neglected, so there are no
-caustics.
+The surface is a plane, level or tilted.
 
 Arrays are flat over the m (point, camera) pairs, sorted by point: metres, shape (m, 3), unless
 stated otherwise.
@@ -27,12 +23,9 @@ _CONVERGED_M = 1e-11
 
 
 def piercing_points_of_planes(
-    points: FloatArray,
-    centres: FloatArray,
-    anchors: FloatArray,
-    normals: FloatArray,
+    points: FloatArray, centres: FloatArray, anchors: FloatArray, normals: FloatArray,
     refractive_index: float,
-) -> FloatArray:
+) -> FloatArray:  # fmt: skip
     """Return where the light from each point to its camera passes a plane, (m, 3).
 
     `anchors` and `normals` are a point of each pair's plane and its unit normal, away from the
@@ -92,13 +85,9 @@ def project(
 
 
 def triangulate(
-    pixels: FloatArray,
-    cameras: Cameras,
-    camera: IntArray,
-    start: IntArray,
-    lens: Lens,
+    pixels: FloatArray, cameras: Cameras, camera: IntArray, start: IntArray, lens: Lens,
     guess: FloatArray,
-) -> FloatArray:
+) -> FloatArray:  # fmt: skip
     """Intersect straight rays through image points: least squared reprojection errors.
 
     Gauss-Newton from a guess, shape (n, 3). Point i has the pairs from ``start[i]`` to
@@ -123,86 +112,21 @@ def triangulate(
     return points
 
 
-_COMPONENTS = 8
-"""Sinusoids of a field: enough that slopes are nearly normally distributed."""
-
-
-@dataclass(frozen=True, eq=False)
-class Waves:
-    """A field of slopes for each of k images, the sum of c sinusoids of one wavelength.
-
-    `wave_numbers`, shape (k, c, 2), are in radians per metre along the axes of the mean plane;
-    `steepness` is the amplitude of the slope of each sinusoid.
-    """
-
-    wave_numbers: FloatArray
-    phases: FloatArray
-    steepness: float
-
-    @classmethod
-    def random(
-        cls, cameras: int, slope_deg: float, wavelength_m: float, rng: np.random.Generator
-    ) -> Waves:
-        """Draw fields whose slope along any axis has the given standard deviation.
-
-        Directions are evenly spread over the half circle, so the variance along either axis is
-        ``components * steepness^2 / 4``.
-        """
-        first = rng.uniform(0.0, 1.0, (cameras, 1))
-        angle = np.pi * (first + np.arange(_COMPONENTS)) / _COMPONENTS
-        phases = rng.uniform(0.0, 2.0 * np.pi, (cameras, _COMPONENTS))
-        number = 2.0 * np.pi / wavelength_m
-        towards = np.stack([np.cos(angle), np.sin(angle)], axis=2)
-        steepness = 2.0 * np.tan(np.radians(slope_deg)) / np.sqrt(_COMPONENTS)
-        return cls(number * towards, phases, float(steepness))
-
-    def slopes(self, camera: IntArray, at: FloatArray) -> FloatArray:
-        """Return the slopes along both axes, shape (m, 2), at places of the plane, (m, 2)."""
-        slopes = np.zeros(at.shape)
-        for i in range(_COMPONENTS):
-            number = self.wave_numbers[camera, i]
-            phase = (number * at).sum(axis=1) + self.phases[camera, i]
-            size = self.steepness / np.hypot(*number.T)
-            slopes -= (size * np.sin(phase))[:, None] * number
-        return slopes
-
-
 @dataclass(frozen=True, eq=False)
 class Water:
-    """The surface that light is traced through: its mean, in the frame of the points, and waves."""
+    """The surface that light is traced through: a plane in the frame of the points."""
 
     plane: WaterPlane
     refractive_index: float
-    waves: Waves | None = None
 
-    def piercing_points(
-        self, points: FloatArray, centres: FloatArray, camera: IntArray
-    ) -> FloatArray:
-        """Return where the light from each point to its camera passes the surface, (m, 3)."""
-        anchors, normals = self.tangent_planes(points, centres, camera)
-        return piercing_points_of_planes(points, centres, anchors, normals, self.refractive_index)
-
-    def tangent_planes(
-        self, points: FloatArray, centres: FloatArray, camera: IntArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return a point and the unit normal of the plane that the light of each pair passes.
-
-        Both have the shape (m, 3); `camera`, shape (m,), selects the waves.
-        """
-        shape = points.shape
-        anchor = np.array([0.0, 0.0, self.plane.a])
-        up = np.array([-self.plane.b, -self.plane.c, 1.0])  # normal of the mean surface
+    def planes(self, count: int) -> tuple[FloatArray, FloatArray]:
+        """Return a point of the plane and its unit normal, each of shape (count, 3)."""
+        up = np.array([-self.plane.b, -self.plane.c, 1.0])
         up /= np.linalg.norm(up)
-        anchors, normals = np.broadcast_to(anchor, shape), np.broadcast_to(up, shape)
-        if self.waves is None:
-            return anchors, normals
-        at = piercing_points_of_planes(points, centres, anchors, normals, self.refractive_index)
-        wet = (points - anchor) @ up < 0.0
-        east = np.array([1.0, 0.0, self.plane.b])
-        east /= np.linalg.norm(east)
-        north = np.cross(up, east)
-        places = (at - anchor) @ np.column_stack([east, north])
-        slopes = self.waves.slopes(camera, places)
-        rough = up - slopes[:, :1] * east - slopes[:, 1:] * north
-        rough /= np.linalg.norm(rough, axis=1)[:, None]
-        return np.where(wet[:, None], at, anchors), np.where(wet[:, None], rough, normals)
+        anchor = np.array([0.0, 0.0, self.plane.a])
+        return np.broadcast_to(anchor, (count, 3)), np.broadcast_to(up, (count, 3))
+
+    def piercing_points(self, points: FloatArray, centres: FloatArray) -> FloatArray:
+        """Return where the light from each point to its camera passes the surface, (m, 3)."""
+        planes = self.planes(len(points))
+        return piercing_points_of_planes(points, centres, *planes, self.refractive_index)

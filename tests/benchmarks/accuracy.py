@@ -287,7 +287,6 @@ RANDOM = (
     ("image", "1 px", {"image_noise": 1.0}, {"sigma_image": 1.0}),
     ("centres", "3 cm", {"position_noise_m": 0.03}, {"sigma_centre": 0.03}),
     ("attitude", "0.01 deg", {"attitude_noise_deg": 0.01}, {"sigma_attitude": 0.01}),
-    ("waves", "1 deg", {"wave_slope_deg": 1.0}, {"sigma_waves": 1.0}),
 )
 """Name, size, settings of the scene, and options of the budget."""
 

@@ -158,14 +158,13 @@ OF_CLEAN = {
     "nothing": "--no-statistical --no-weak --no-below --no-floating",
 }
 OF_DSM = {
-    **{m: f"--method {m}" for m in ("mean", "median", "min", "max", "idw", "tin")},
-    "bed": "--surface bed --fill 3 --cog",
-    "hillshade": "--hillshade shade.tif --azimuth 200 --altitude 30",
+    **{m: f"--method {m}" for m in ("mean", "median", "min", "max", "tin")},
+    "bed": "--surface bed --fill 3",
 }
 SECTION = "--section 410200,4650340,410320,4650340 --sections 2 --corridor 2"
 OF_COMPARE = {
     "cloud": "{samples}/scene/lidar.laz",
-    "submerged": "{samples}/scene/lidar.laz --submerged --bin-width 2 --shore-bin-width 5",
+    "submerged": "{samples}/scene/lidar.laz --submerged --bin-width 2",
     "c2c": "{samples}/scene/lidar.laz --c2c-only",
     "sections": f"{{samples}}/scene/lidar.laz {SECTION} --neighbours 12 --max-gap 2",
     "m3c2": "{samples}/scene/lidar.laz --m3c2 --water 0.37",
@@ -175,7 +174,6 @@ OF_COMPARE = {
 }
 OF_LABEL = {
     "default": "--water 0.37",
-    "band": "--water 0.37 --surface-band 0.2 --dead-band 0.1 --reset",
     "connected": "--water plane:0.37,0,0 --connected --least-pool 20",
     "auto": "--water auto",
 }
@@ -294,8 +292,8 @@ def table() -> dict[str, str]:
     compare = "compare {scene.snell/out.laz} --out-dir out --summary summary.json"
     add("compare", compare, OF_COMPARE)
     add("label", "label {samples}/scene/cloud.laz out.laz --summary summary.json", OF_LABEL)
-    labelled = "{label.band/out.laz} out.las --water 0.37 --cameras {samples}/scene/cameras.csv"
-    commands["label.respected"] = f"correct {labelled} --respect-classes 41 --summary summary.json"
+    labelled = "{label.default/out.laz} out.las --water 0.37 --cameras {samples}/scene/cameras.csv"
+    commands["label.respected"] = f"correct {labelled} --respect-classes 2 --summary summary.json"
     commands["restore"] = "restore {clean.default/out.laz} out.laz"
     commands["restore.river"] = "restore {river.sigmas/out.laz} out.las"
     commands["restore.minimal"] = "restore {river.minimal/out.laz} out.las"
@@ -329,7 +327,7 @@ def table() -> dict[str, str]:
     commands["qgis-plugin"] = "qgis-plugin out.zip"
     flight = "--block oblique --detection 0.9 --position-noise-m 0.03"
     kinds = {"tracks": "", "river": "--bed river", "oblique": flight}
-    kinds["waves"] = "--wave-slope-deg 1 --tilt-percent 0.2 --bed steps --seed 3 --lidar-per-m2 1"
+    kinds["tilted"] = "--tilt-percent 0.2 --bed steps --seed 3 --lidar-per-m2 1"
     add("simulate", SIMULATE, kinds)
     reference = f"{RUN} --reference {{samples}}/scene/lidar.laz --resolution 2"
     commands["run.reference"] = reference

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pcfix.clean.neighbours import Neighbours, height_quartiles, make_tiles
+from pcfix.clean.neighbours import Neighbours, make_tiles
 from pcfix.clean.points import Reason, clean_points
 from pcfix.libraries import load_open3d
 from pcfix.options.steps import CleanRules
@@ -22,14 +22,7 @@ def _clustered(n: int = 500) -> np.ndarray:
     which = rng.integers(0, 9, n)
     xyz = centres[which] + rng.normal(size=(n, 3)) * spread[which] + (410_200.0, 4_650_300.0, 0.0)
     xyz[n // 2] = 0.0
-    return np.round(xyz, 3)
-
-
-def _lattice() -> np.ndarray:
-    """A raster: every neighbourhood has ties, some points coincide; heights differ."""
-    x, y = (grid.ravel() for grid in np.mgrid[:30, :30])
-    xyz = np.column_stack([x, y, np.random.default_rng(3).normal(size=900)]).astype(float)
-    return np.vstack([xyz, xyz[:40], xyz[:40]])
+    return np.asarray(xyz)
 
 
 def _pairs(xyz: np.ndarray, axes: int) -> np.ndarray:
@@ -38,32 +31,19 @@ def _pairs(xyz: np.ndarray, axes: int) -> np.ndarray:
     return np.sqrt((apart**2).sum(axis=-1))
 
 
-def _statistics(xyz: np.ndarray, points: int) -> np.ndarray:
-    """Mean distance in space, lower and upper quartile of heights, of every point."""
-    cut = make_tiles(xyz, points=points)
-    near, plan, out = Neighbours(cut, 3), Neighbours(cut, 2), np.empty((len(xyz), 3))
-    for piece in cut.pieces(100):
-        some = cut.xyz[piece]
-        out[cut.row[piece], 0] = near.nearest(some, K)[0].mean(axis=1)
-        out[cut.row[piece], 1:] = height_quartiles(plan, some, K)
-    return out
-
-
-@pytest.mark.parametrize("make", mostly_nightly([_clustered, _lattice]))
-def test_statistics_of_all_pairs(make) -> None:
-    xyz = make()
-    twin_mean = np.sort(_pairs(xyz, 3), axis=1)[:, :K].mean(axis=1)
-    plan = _pairs(xyz, 2)
-    far = np.sort(plan, axis=1)[:, K - 1]
-    twin_quartiles = np.array(
-        [np.percentile(xyz[plan[i] <= far[i] * (1 + 1e-9), 2], (25, 75)) for i in range(len(xyz))]
-    )
-    whole = _statistics(xyz, 1_000_000)
-    # rounding of sums of a dozen distances
-    np.testing.assert_allclose(whole[:, 0], twin_mean, rtol=1e-13)
-    np.testing.assert_allclose(whole[:, 1:], twin_quartiles, rtol=0, atol=1e-12)
-    for points in (2, 20, 90, 400):
-        assert np.array_equal(_statistics(xyz, points), whole)
+def test_neighbours_of_all_pairs() -> None:
+    xyz = _clustered()
+    for axes in (2, 3):
+        twin = np.sort(_pairs(xyz, axes), axis=1)[:, :K]
+        for points in (2, 20, 90, 400, 1_000_000):
+            cut = make_tiles(xyz, points=points)
+            near, found = Neighbours(cut, axes), np.empty(twin.shape)
+            for piece in cut.pieces(100):
+                found[cut.row[piece]], place = near.nearest(cut.xyz[piece], K)
+                apart = cut.xyz[place][..., :axes] - cut.xyz[piece][:, None, :axes]
+                far = np.linalg.norm(apart, axis=2)
+                np.testing.assert_allclose(far, found[cut.row[piece]], rtol=1e-12)
+            np.testing.assert_allclose(found, twin, rtol=1e-12)
 
 
 @pytest.mark.parametrize("points", mostly_nightly([100, 1000, 5000], 100))
@@ -72,7 +52,7 @@ def test_tiles_do_not_matter(points: int, monkeypatch: pytest.MonkeyPatch) -> No
     settings = CleanRules(deviations=2.0, radius=1.0)
     whole = clean_points(s.xyz, water=s.water_level_m, settings=settings)
     monkeypatch.setattr("pcfix.clean.neighbours.POINTS_PER_TILE", points)
-    cut = clean_points(s.xyz, water=s.water_level_m, settings=settings, jobs=1)
+    cut = clean_points(s.xyz, water=s.water_level_m, settings=settings)
     assert np.array_equal(cut, whole)
     for reason in (Reason.STATISTICAL, Reason.RADIUS, Reason.BELOW_BED, Reason.FLOATING):
         assert (whole & reason).any()

@@ -5,7 +5,6 @@ import pytest
 
 from pcfix.clean.points import Reason, clean_points
 from pcfix.errors import SettingError
-from pcfix.model import WaterPlane
 from pcfix.options.steps import CleanRules
 from tests.clean.scenes import spoilt_scene
 
@@ -37,21 +36,6 @@ def test_outliers_found() -> None:
     assert (reasons[s.good] > 0).mean() < 1e-3
 
 
-def test_clean_scene() -> None:
-    """Without outliers the deviation is that of the good points; what is beyond four are edges."""
-    s = spoilt_scene()
-    reasons = clean_points(s.xyz[s.good], water=s.water_level_m)
-    assert (reasons > 0).mean() < 3e-3
-    assert (reasons & (Reason.BELOW_BED | Reason.FLOATING) > 0).mean() < 1e-4
-
-
-def test_side_of_bed() -> None:
-    s, reasons = spoilt_scene(), _scene_reasons(CleanRules(deviations=None))
-    assert not (reasons[s.below] & Reason.FLOATING).any()
-    assert not (reasons[s.floating] & Reason.BELOW_BED).any()
-    assert not reasons[s.air].any()
-
-
 def test_wall_and_rock_spared() -> None:
     """A step of 3 m, with points on its face, and a rock of 1.5 m: breaks of the bed, not noise."""
     rng = np.random.default_rng(8)
@@ -74,21 +58,6 @@ def test_land_spared() -> None:
     bed = rng.uniform((40, 0, -2.1), (70, 30, -2.0), (9000, 3))
     xyz = np.vstack([canopy, ground, bed])
     assert not clean_points(xyz, water=0.0, settings=CleanRules(deviations=None)).any()
-
-
-@pytest.mark.parametrize("how", ["level", "plane", "heights", "rays"])
-def test_kinds_of_water(how: str) -> None:
-    s = spoilt_scene(20_000, 100)
-    level, rays = s.water_level_m, s.ray_count
-    water = {
-        "level": level,
-        "plane": WaterPlane(level),
-        "heights": np.full(len(rays), level),
-        "rays": None,
-    }[how]
-    settings = CleanRules(min_rays=None, max_ray_miss=None, max_incidence=None)
-    found = clean_points(s.xyz, water=water, ray_count=rays, settings=settings)
-    assert np.array_equal(found, clean_points(s.xyz, water=level, settings=settings))
 
 
 def test_weak_intersections() -> None:

@@ -22,7 +22,6 @@ from tests.utils.codes import refused
 def in_small_tiles(monkeypatch, points, rows=1_000_000, large=2_000_000):
     """Have tiles of so many points, blocks of so many rows, and larger arrays on disk."""
     monkeypatch.setattr(neighbours, "POINTS_PER_TILE", points)
-    monkeypatch.setattr(m3c2, "TILE_POINTS", points)
     monkeypatch.setattr(blocks, "ROWS", rows)
     monkeypatch.setattr(blocks, "LARGE", large)
 
@@ -57,12 +56,12 @@ def lattice(seed):
 def test_distances(make, monkeypatch):
     cloud, reference = make(1), make(2)
     expected = least_distances(cloud, reference)
-    whole = nearest_distance(cloud, reference, 3)
+    whole = nearest_distance(cloud, reference)
     np.testing.assert_array_equal(whole, expected)
     for points, jobs in ((60, None), (200, 1), (700, 2)):
         in_small_tiles(monkeypatch, points, rows=350)
         with threads(jobs):
-            np.testing.assert_array_equal(nearest_distance(cloud, reference, 3), expected)
+            np.testing.assert_array_equal(nearest_distance(cloud, reference), expected)
 
 
 def figures(folder, name):
@@ -135,10 +134,8 @@ def m3c2_twin(cloud, reference, core, normal_m, cylinder_m, reach_m):
 
 
 @py4dgeo
-@pytest.mark.parametrize("points", [10_000, 800, 300])
-def test_m3c2(points, monkeypatch):
+def test_m3c2():
     """Were the core point on the border of two pieces of the cylinder, one in two would be off."""
-    in_small_tiles(monkeypatch, points)
     cloud, reference = bed(1200, 1, 0.05), bed(900, 2)
     found = m3c2.m3c2_distances(cloud, reference, 1.84)
     radii = found.normal_radius_m, found.cylinder_radius_m, found.max_distance_m

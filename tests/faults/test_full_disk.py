@@ -59,9 +59,8 @@ COMMANDS = {
     "label": ("label", "cloud.laz", "DISK/l.laz", "--water", "0.37", "--summary", "DISK/l.json"),
     "restore": ("restore", "corrected.laz", "DISK/r.laz"),
     "clean": ("clean", "corrected.laz", "DISK/n.laz", "--summary", "DISK/n.json"),
-    "dsm": ("dsm", "corrected.laz", "DISK/d.tif", "--resolution", "0.25", "--hillshade",
-            "DISK/h.tif", "--counts", "DISK/k.tif", "--style", "--summary", "DISK/d.json"),
-    "dsm, COG": ("dsm", "corrected.laz", "DISK/d.tif", "--cog"),
+    "dsm": ("dsm", "corrected.laz", "DISK/d.tif", "--resolution", "0.25", "--counts",
+            "DISK/k.tif", "--style", "--summary", "DISK/d.json"),
     "compare": (*COMPARE, "--out-dir", "DISK/of", "--plot", "DISK/p.png", "--summary", "DISK/s"),
 }  # fmt: skip
 """By what does not find its place, sizes of the disk, kB."""

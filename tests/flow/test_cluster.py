@@ -112,7 +112,7 @@ def test_killed_worker(scheduler, workers, cloud, tmp_path):
 def on_cluster(cloud, folder, scheduler):
     """Label, clean and run on the cluster; return the folder of each cloud."""
     given = {"scheduler": scheduler[1]}
-    pcfix.label_file(cloud, folder / "labelled", water=0.37, surface_band=0.05, **given)
+    pcfix.label_file(cloud, folder / "labelled", water=0.37, **given)
     pcfix.clean_file(cloud, folder / "clean", **given)
     pcfix.run(cloud, folder / "run", **given, **GIVEN)
     return [folder / "labelled", folder / "clean", folder / "run/corrected", folder / "run/cleaned"]
@@ -122,7 +122,7 @@ def on_cluster(cloud, folder, scheduler):
 def test_other_commands(scheduler, cloud, tmp_path, monkeypatch):
     merged = tmp_path / "merged"
     merged.mkdir()
-    pcfix.label_file(cloud[1], merged / "labelled.las", water=0.37, surface_band=0.05)
+    pcfix.label_file(cloud[1], merged / "labelled.las", water=0.37)
     pcfix.clean_file(cloud[1], merged / "clean.las")
     pcfix.run(cloud[1], merged / "run", **GIVEN)
     monkeypatch.setattr("pcfix.flow.runner.in_processes", None)  # nothing is done on this machine

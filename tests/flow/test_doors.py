@@ -133,7 +133,7 @@ def test_demo(tmp_path):
     assert done.returncode == 0, done.stderr
     rows = {}
     for line in done.stdout.splitlines():
-        for name in ("uncorrected", "depth times 1.34", "default options", "with the view list"):
+        for name in ("uncorrected", "default options", "with the view list"):
             if line.startswith(name):
                 rows.setdefault(name, []).append(float(line[30:].split()[6]))
     before, factor, snell, consistent = (np.array(r) for r in rows.values())

@@ -90,7 +90,7 @@ def test_corrected_and_restored(path, tmp_path):
         pcfix.restore_file(tmp_path / "labelled.las", tmp_path / "no.las")
     given = {"cameras": block(), "water": WATER_M}
     pcfix.correct_file(tmp_path / "labelled.las", tmp_path / "corrected.las", **given)
-    label_file(tmp_path / "corrected.las", tmp_path / "twice.las", water=WATER_M, dead_band=0.1)
+    label_file(tmp_path / "corrected.las", tmp_path / "twice.las", water=WATER_M)
     pcfix.restore_file(tmp_path / "twice.las", tmp_path / "back.las")
     first, last = laspy.read(tmp_path / "labelled.las"), laspy.read(tmp_path / "back.las")
     np.testing.assert_array_equal(first.xyz, last.xyz)
@@ -100,9 +100,8 @@ def test_corrected_and_restored(path, tmp_path):
 
 CHOICES = [
     {},
-    {"dead_band": 0.5, "reset": True},
     {"connected": True, "least_pool": 300.0},
-    {"surface_band": 0.2, "dead_band": 0.6, "connected": True, "respect_classes": "2,5,6,7,8,9"},
+    {"connected": True, "respect_classes": "2,5,6,7,8,9"},
 ]
 
 
@@ -129,16 +128,14 @@ def test_label_doors(path, tmp_path, mask, choices, monkeypatch):
     np.testing.assert_array_equal(found, outs["Classification"])
     written = json.loads(summary.read_text())
     assert report["children"][0]["value"] == written["submerged"]
-    assert (
-        written["submerged"] + written["water_surface"] <= (found == 40).sum() + (found == 41).sum()
-    )
+    assert written["submerged"] <= (found == 40).sum()
     assert written["labelling"]["outside_mask"] > 0
     monkeypatch.setattr("pcfix.io.las.source.CHUNK_POINTS", 333)
     label_file(path, tmp_path / "b.las", water=WATER_M, water_mask=mask, **choices)
     assert (tmp_path / "a.las").read_bytes() == (tmp_path / "b.las").read_bytes()
 
 
-@pytest.mark.parametrize("choices", [{}, *CHOICES[2:3], {"respect_classes": "1,2,3,4"}])
+@pytest.mark.parametrize("choices", [{}, CHOICES[1], {"respect_classes": "1,2,3,4"}])
 def test_corrects_what_is_labelled(path, tmp_path, mask, choices):
     cameras = cameras_csv(tmp_path / "cameras.csv", block())
     las = laspy.read(path)

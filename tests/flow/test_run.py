@@ -21,8 +21,7 @@ from pcfix.flow.run_folder import STEPS, Record, RunFolder
 from pcfix.io import vectors
 from pcfix.io.rasters import values_at
 from pcfix.options.correct import RunOptions
-from pcfix.report.summary import Summary
-from pcfix.report.text import tvu_sentence
+from pcfix.report.text import Summary, tvu_sentence
 from tests.utils.program import run_pcfix
 from tests.utils.shared import SCENE
 from tests.utils.tiles import finished as finished_in
@@ -215,7 +214,7 @@ def test_other_request(copied):
     ("more", "first"),
     [
         (["--project", "Lake <2>", "--date", "2024-06-01"], "report"),
-        pytest.param(["--sigma-reference", "0.05"], "compare", marks=pytest.mark.nightly),
+        pytest.param(["--share", "0,0.5"], "compare", marks=pytest.mark.nightly),
         (["--resolution", "2"], "dsm"),
     ],
 )
@@ -300,7 +299,7 @@ def tiled(tmp_path_factory):
 
 def without_names(value):
     """Return plain values without those of a call, and words without the names of files."""
-    own = ("seconds", "input", "output", "hillshade", "counts")
+    own = ("seconds", "input", "output", "counts")
     own += ("cloud", "reference")
     if isinstance(value, dict):
         return {name: without_names(one) for name, one in value.items() if name not in own}

@@ -95,7 +95,7 @@ def test_restored(cloud, corrected, tmp_path):
 
 
 def test_labels(cloud, tmp_path):
-    given = {"water": 0.37, "connected": True, "dead_band": 0.3, "surface_band": 0.05}
+    given = {"water": 0.37, "connected": True}
     one = pcfix.label_file(cloud[1], tmp_path / "merged.las", **given)
     many = pcfix.label_file(cloud[0], tmp_path / "out", **given)
     assert np.array_equal(records(*tiles_in(tmp_path / "out")), records(tmp_path / "merged.las"))

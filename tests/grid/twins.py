@@ -35,20 +35,9 @@ def slow_raster(x, y, z, resolution, method, widest=0.0):
         spread[cell] = pstdev(own) if own else np.nan
         if method == "tin":
             height[cell] = slow_tin(u, v, heights, cell[1] + 0.5, cell[0] + 0.5, widest)
-        elif own and method == "idw":
-            height[cell] = slow_idw(u, v, heights, cell[1] + 0.5, cell[0] + 0.5)
         elif own:
             height[cell] = {"mean": fmean, "median": median, "min": min, "max": max}[method](own)
     return left, top, height, count, spread
-
-
-def slow_idw(u, v, z, x, y):
-    """Weigh all points within a diagonal of a cell."""
-    weights = []
-    for a, b in zip(u, v, strict=True):
-        distance = math.hypot(a - x, b - y)
-        weights.append(max(distance, 1e-4) ** -2 if distance <= math.sqrt(2.0) else 0.0)
-    return sum(w * h for w, h in zip(weights, z, strict=True)) / sum(weights)
 
 
 def slow_tin(u, v, z, x, y, widest):

@@ -1,6 +1,5 @@
-"""Dead band, connectivity, class 41 and respected classes on shores with a known waterline."""
+"""Connectivity and respected classes on shores with a known waterline."""
 
-from collections import defaultdict
 from functools import reduce
 from operator import add
 from types import SimpleNamespace
@@ -10,7 +9,7 @@ import pytest
 
 from pcfix.errors import SettingError
 from pcfix.label.labelling import Labelling, Part, WaterMask
-from pcfix.options.correct import LabelRules
+from pcfix.options.shared import LandRules
 from pcfix.water.surface import SurfaceAbove
 from tests.utils.codes import refused
 
@@ -33,12 +32,11 @@ def labelled(part, mask=None, pieces=1, corners=None, **choices):
             yield Part(part.xyz[r], above, part.classes[r])
 
     low, high = part.xyz[:, :2].min(axis=0), part.xyz[:, :2].max(axis=0)
-    labelling = Labelling(LabelRules(**choices), mask).scanned(parts(), *(corners or (low, high)))
+    labelling = Labelling(LandRules(**choices), mask).scanned(parts(), *(corners or (low, high)))
     labels = [labelling.labels(p) for p in parts()]
     counts = reduce(add, [one for _, one in labels])
     counted = SimpleNamespace(
-        report=lambda: labelling.report(counts),
-        check=lambda name, submerged=None: labelling.check(name, counts, submerged),
+        report=lambda: labelling.report(counts), check=lambda name: labelling.check(name, counts)
     )
     return np.concatenate([classes for classes, _ in labels]), counted
 
@@ -56,13 +54,6 @@ def beach(count=60_000, noise_m=0.03, seed=1):
     return x, y, height, np.column_stack([EAST + x, NORTH + y, z])
 
 
-def changes(x, y, wet):
-    """Return how often the label changes on the way from sea to land, a strip of 1 m on average."""
-    strips = [np.flatnonzero(np.floor(y) == k) for k in range(40)]
-    ordered = [wet[s[np.argsort(x[s])]] for s in strips]
-    return np.mean([(along[1:] != along[:-1]).sum() for along in ordered])
-
-
 def test_surface_only():
     *_, xyz = beach(5000)
     level = np.full(5000, WATER_M)
@@ -71,41 +62,6 @@ def test_surface_only():
     found, labelling = labelled(part_of(xyz, classes, level))
     np.testing.assert_array_equal(found, np.where(xyz[:, 2] < level, 40, classes))
     assert labelling.report() is None
-
-
-def test_dead_band():
-    x, y, height, xyz = beach()
-    near = x < 58.0
-    plain = labelled(part_of(xyz))[0] == 40
-    quiet, labelling = labelled(part_of(xyz), dead_band=0.1)
-    quiet = quiet == 40
-    before, after = (changes(x[near], y[near], wet[near]) for wet in (plain, quiet))
-    assert before > 20.0
-    # a strip of 1 m has a few cells side by side, whose edges need not be in line
-    assert after < 4.0
-    truly = height < 0.0
-    assert (quiet != truly)[near].sum() < 0.1 * (plain != truly)[near].sum()
-    # the line itself: as many points beyond it as short of it, to half a cell
-    assert np.abs(quiet[near].sum() - truly[near].sum()) / (15.0 * 40.0) < (
-        labelling.report()["cell_m"] / 2.0
-    )
-    clear = np.abs(xyz[:, 2] - WATER_M) > 0.1
-    np.testing.assert_array_equal(quiet[clear], plain[clear])
-
-
-def test_vote_of_nine_cells():
-    _, _, _, xyz = beach(8000, noise_m=0.1)
-    found, labelling = labelled(part_of(xyz), dead_band=0.15)
-    side = labelling.report()["cell_m"]
-    height = xyz[:, 2] - WATER_M
-    votes = defaultdict(int)
-    cells = [tuple(c) for c in np.floor(xyz[:, :2] / side).astype(int).tolist()]
-    for cell, h in zip(cells, height, strict=True):
-        votes[cell] += round(float(np.clip(h / 0.15, -1, 1)) * 1000)
-    for i, ((c, r), h) in enumerate(zip(cells, height, strict=True)):
-        around = sum(votes.get((c + a, r + b), 0) for a in (-1, 0, 1) for b in (-1, 0, 1))
-        expected = h < 0 if abs(h) > 0.15 else around < 0
-        assert (found[i] == 40) == expected
 
 
 def test_connected():
@@ -137,17 +93,6 @@ def test_least_pool():
     assert (labelled(part_of(xyz), connected=True)[0][two & (x < 42)] == 40).all()
 
 
-def test_band():
-    x, _, _, xyz = beach(20_000)
-    height = xyz[:, 2] - WATER_M
-    found, _ = labelled(part_of(xyz), surface_band=0.05)
-    expected = np.where(np.abs(height) <= 0.05, 41, np.where(height < 0, 40, 0))
-    np.testing.assert_array_equal(found, expected)
-    joined, _ = labelled(part_of(xyz), surface_band=0.05, connected=True)
-    assert not np.isin(joined[x > 70.0], (40, 41)).any()
-    np.testing.assert_array_equal(joined[x < 48], expected[x < 48])
-
-
 def test_respect_classes():
     *_, xyz = beach(20_000)
     classes = np.random.default_rng(0).choice([0, 2, 5, 40, 41], 20_000).astype(np.uint8)
@@ -156,25 +101,8 @@ def test_respect_classes():
     kept = np.isin(classes, (2, 5))
     np.testing.assert_array_equal(found, np.where(wet & ~kept, 40, classes))
     assert labelling.report()["respected"] == (wet & kept).sum()
-    found, _ = labelled(
-        part_of(xyz, classes), respect_classes=(2, 41), reset=True, surface_band=0.02
-    )
-    kept = np.isin(classes, (2, 41))
-    np.testing.assert_array_equal(found[kept], classes[kept])
-    assert (found[(classes == 40) & (xyz[:, 2] > WATER_M + 0.02)] == 1).all()
     with refused("option.respect_classes", points=int(wet.sum())):
         labelled(part_of(xyz, classes), respect_classes=(0, 2, 5, 40, 41))[1].check("cloud")
-
-
-def test_reset():
-    *_, xyz = beach(20_000)
-    classes = np.random.default_rng(0).choice([2, 40, 41, 42, 43, 45], 20_000).astype(np.uint8)
-    wet = xyz[:, 2] < WATER_M
-    found, _ = labelled(part_of(xyz, classes), reset=True)
-    stale = np.isin(classes, (40, 41))
-    np.testing.assert_array_equal(found, np.where(wet, 40, np.where(stale, 1, classes)))
-    found, _ = labelled(part_of(xyz, classes))
-    np.testing.assert_array_equal(found, np.where(wet, 40, classes))
 
 
 def test_line_and_outlier():
@@ -189,23 +117,17 @@ def test_line_and_outlier():
 @pytest.mark.parametrize(
     "choices",
     [
-        {"surface_band": -0.1}, {"dead_band": -1}, {"surface_band": float("nan")},
-        {"surface_band": 0.2, "dead_band": 0.1},
         {"respect_classes": (2, 256)}, {"respect_classes": (-1,)}, {"least_pool": 5.0},
         {"least_pool": -5.0, "connected": True},
     ],
 )  # fmt: skip
 def test_settings_refused(choices):
     with pytest.raises(SettingError):
-        LabelRules(**choices)
+        LandRules(**choices)
 
 
 def test_nothing_left_refused():
     xyz = np.array([[EAST, NORTH, WATER_M - 0.01], [EAST, NORTH, WATER_M + 0.03]])
-    classes, labelling = labelled(part_of(xyz), dead_band=1.5)
-    assert not (classes == 40).any()
-    with refused("option.dead_band", points=1, value=1.5):
-        labelling.check("a cloud", 0)
     box = pytest.importorskip("shapely").box(0, 10, 20, 30)
     _, labelling = labelled(part_of(xyz), WaterMask(box, "lake.gpkg"))
     with refused("mask.no_points", path="lake.gpkg", points=1, bounds=(0.0, 10.0, 20.0, 30.0)):

@@ -16,7 +16,7 @@ from pcfix.photos.calm import corners_in, laid, register
 from pcfix.photos.mapping import Photo
 from pcfix.photos.waves import View, bed_places, slopes_of
 from pcfix.water.surface import surface_above
-from tests.utils.codes import refused, warned
+from tests.utils.codes import refused
 from tests.utils.renderer import Relief, Texture, rendered
 from tests.utils.waves import Sea, bed_seen, frame
 
@@ -156,11 +156,10 @@ def mapped(place, folder, with_own):
         transform=rasterio.Affine(0.25, 0.0, 85.0, 0.0, -0.25, 65.0),
     ) as target:  # fmt: skip
         target.write(ground.height_m, 1)
-    with warned("dsm.origin_unknown"):
-        map_photos(
-            one, place / f"dry_{with_own}", cameras=place / "poses.csv", water="0",
-            dsm=place / "bed.tif", water_per_image=place / "calm_water" if with_own else None,
-        )  # fmt: skip
+    map_photos(
+        one, place / f"dry_{with_own}", cameras=place / "poses.csv", water="0",
+        dsm=place / "bed.tif", water_per_image=place / "calm_water" if with_own else None,
+    )  # fmt: skip
     return cv2.imread(str(place / f"dry_{with_own}" / "f07.png"), 0)
 
 
@@ -180,4 +179,6 @@ def test_bad_frames(tmp_path, folder, calm):
         pcfix.calm_frames(tmp_path / "film.mp4", tmp_path / "calm.png")
     with refused("output.suffix"):
         pcfix.calm_frames(folder, tmp_path / "calm.jpg")
+    with refused("option.missing"):
+        pcfix.calm_frames(folder, tmp_path / "calm.png", surface=True, depth=2.0, gsd=0.02)
     assert not list(tmp_path.glob("calm*"))

@@ -1,4 +1,4 @@
-"""``pcfix photos`` over files: names, metadata, bits of land, resuming, bad input."""
+"""``pcfix photos`` over files: names, metadata, bits of land, bad input."""
 
 import json
 
@@ -14,7 +14,6 @@ from rasterio.transform import from_origin
 import pcfix
 from pcfix.io.photographs import read_photograph
 from tests.photos.test_mapping import GSD_M, LEVEL_M, photo, relief
-from tests.utils.codes import warned
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
 from tests.utils.renderer import Texture, rendered
@@ -64,7 +63,7 @@ def words(project, *more, out="out"):
 def test_command(project):
     done = run_pcfix(*words(project, "--summary", str(project / "said.json")))
     assert done.returncode == 0, done.stderr
-    assert done.warned == ["dsm.origin_unknown"]
+    assert done.warned == []
     found = json.loads((project / "said.json").read_text())
     assert found["images"] == 2
     assert 5.0 < found["largest_shift_px"] < 60.0
@@ -93,15 +92,10 @@ def test_land_unchanged(project):
     assert (before == after)[inland].all()
 
 
-def test_resumed(project):
-    run_pcfix(*words(project, out="again"))
-    (project / "again" / "IMG_1.JPG").unlink()
-    kept = (project / "again" / "IMG_0.JPG").stat().st_mtime_ns
-    done = run_pcfix(*words(project, out="again"))
-    assert (project / "again" / "IMG_0.JPG").stat().st_mtime_ns == kept
-    assert done.returncode == 0
-    assert (project / "again" / "IMG_1.JPG").exists()
-    assert run_pcfix(*words(project, "--index", "1.33", out="again")).code == "output.exists"
+def test_existing(project):
+    assert run_pcfix(*words(project, out="again")).returncode == 0
+    assert run_pcfix(*words(project, out="again")).code == "output.exists"
+    assert run_pcfix(*words(project, "--overwrite", out="again")).returncode == 0
 
 
 @pytest.mark.parametrize(
@@ -124,11 +118,10 @@ def test_formats(project, tmp_path, suffix, dtype):
         tifffile.imwrite(path, bands, **how)
     else:
         cv2.imwrite(str(path), bands)
-    with warned("dsm.origin_unknown"):
-        pcfix.map_photos(
-            folder, tmp_path / "out", cameras=project / "cameras.csv", dsm=project / "bed.tif",
-            water=LEVEL_M,
-        )  # fmt: skip
+    pcfix.map_photos(
+        folder, tmp_path / "out", cameras=project / "cameras.csv", dsm=project / "bed.tif",
+        water=LEVEL_M,
+    )  # fmt: skip
     before, after = read_photograph(path), read_photograph(tmp_path / "out" / path.name)
     assert after.shape == before.shape
     assert after.dtype == dtype

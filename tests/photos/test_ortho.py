@@ -13,7 +13,6 @@ from pcfix.model import WaterPlane
 from pcfix.photos.mapping import Ground, Photo, Scene
 from pcfix.photos.ortho import Picture, mosaic, picture_of, seen_at
 from tests.photos.test_mapping import GSD_M, LEVEL_M, displacement_px, photo, relief
-from tests.utils.codes import warned
 from tests.utils.renderer import Texture, rendered
 
 TEXTURE = Texture(5.0 * GSD_M, 1.5)
@@ -106,8 +105,7 @@ def block(tmp_path, pictures):
 
 def test_file(tmp_path, block):
     folder, how = block
-    with warned("dsm.origin_unknown"):
-        done = pcfix.ortho_photo(folder, tmp_path / "ortho.tif", **how, resolution=0.2)
+    done = pcfix.ortho_photo(folder, tmp_path / "ortho.tif", **how, resolution=0.2)
     with rasterio.open(tmp_path / "ortho.tif") as raster:
         assert raster.crs.to_epsg() == 32636
         assert [one.name for one in raster.colorinterp] == ["red", "green", "blue", "alpha"]

@@ -157,12 +157,3 @@ def test_same_bytes(qgis, scene, tmp_path):
     assert "Corrected" in done.stdout
     pcfix.correct_file(scene / "cloud.laz", tmp_path / "python.laz", **given)
     assert (tmp_path / "qgis.laz").read_bytes() == (tmp_path / "python.laz").read_bytes()
-
-
-def test_qgis_no_pcfix(qgis, scene, tmp_path):
-    done = qgis(
-        "label", "/no/pcfix", input=scene / "cloud.laz", output=tmp_path / "l.laz", water=0.37
-    )
-    assert done.returncode != 0
-    assert "There is no pcfix at '/no/pcfix'" in done.stderr
-    assert not (tmp_path / "l.laz").exists()

@@ -11,8 +11,14 @@ import pytest
 import pcfix
 from pcfix.compare.statistics import tvu_of
 from pcfix.refract.tally import UncertaintyTally
-from pcfix.report.summary import Summary
-from pcfix.report.text import FEWEST, formal_words, order_sentence, summary_rows, tvu_sentence
+from pcfix.report.text import (
+    FEWEST,
+    Summary,
+    formal_words,
+    order_sentence,
+    summary_rows,
+    tvu_sentence,
+)
 
 # Edition 6, table 1: the largest TVU at the surface and at 40 m, m, by hand
 BY_HAND = {

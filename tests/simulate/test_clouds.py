@@ -17,7 +17,7 @@ MICROMETRE = 1e-6
 @pytest.mark.parametrize(
     "more",
     [
-        {"distortion": LENS, "tilt_percent": 1.0, "wave_slope_deg": 2.0, "obliques_deg": 35.0},
+        {"distortion": LENS, "tilt_percent": 1.0, "obliques_deg": 35.0},
         {"bed": "river", "detection": 0.6},
         {"bed": "steps", "area_m": (4, 2), "flying_height_m": 2.0, "greatest_depth_m": 0.3},
     ],

@@ -20,10 +20,3 @@ def test_brown():
         assert image[i] == pytest.approx(slow, abs=1e-8)  # pixels
     assert np.abs(image - ideal).max() > 20.0
     assert optics.to_ideal(image) == pytest.approx(ideal, abs=1e-8)
-
-
-def test_frame():
-    optics = SceneSettings(distortion=REAL).optics
-    assert optics.frames(np.array([[0.0, 0.0], [5471.0, 3647.0]])).all()
-    far = np.array([[2736.0 + 9 * 3648.0, 1824.0]])  # nine focal lengths aside
-    assert not optics.frames(optics.to_image(far)).any()

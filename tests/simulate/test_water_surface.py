@@ -1,10 +1,10 @@
-"""Light through tilted and wavy water: Snell, Fermat, and the statistics of the waves."""
+"""Light through level and tilted water: Snell and Fermat."""
 
 import numpy as np
 import pytest
 
 from pcfix.model import WaterPlane
-from pcfix.simulate.tracing import Water, Waves
+from pcfix.simulate.tracing import Water
 from tests.utils.bed_rays import bed_points
 from tests.utils.twins import bend, light_path
 
@@ -17,17 +17,11 @@ def pairs(seed=3):
     rng = np.random.default_rng(seed)
     points = np.column_stack([rng.uniform(-30, 30, (COUNT, 2)), -rng.uniform(3, 12, COUNT)])
     centres = np.column_stack([rng.uniform(-60, 60, (COUNT, 2)), rng.uniform(40, 90, COUNT)])
-    return points, centres, rng.integers(0, 9, COUNT)
+    return points, centres
 
 
 def waters():
-    waves = Waves.random(9, 3.0, 2.0, np.random.default_rng(8))
-    return {
-        "level": Water(WaterPlane(0.3), N),
-        "tilted": Water(TILTED, N),
-        "waves": Water(WaterPlane(0.3), N, waves),
-        "tilted waves": Water(TILTED, N, waves),
-    }
+    return {"level": Water(WaterPlane(0.3), N), "tilted": Water(TILTED, N)}
 
 
 def angle(one, other):
@@ -38,9 +32,9 @@ def angle(one, other):
 @pytest.mark.parametrize("kind", waters())
 def test_snell_and_fermat(kind):
     water = waters()[kind]
-    points, centres, camera = pairs()
-    found = water.piercing_points(points, centres, camera)
-    anchors, normals = water.tangent_planes(points, centres, camera)
+    points, centres = pairs()
+    found = water.piercing_points(points, centres)
+    anchors, normals = water.planes(COUNT)
     for i in range(COUNT):
         up = normals[i]
         air, deep = centres[i] - found[i], found[i] - points[i]
@@ -60,17 +54,17 @@ def test_snell_and_fermat(kind):
 
 
 def test_land():
-    points, centres, camera = pairs()
+    points, centres = pairs()
     points[:, 2] = 8.0
     for water in waters().values():
-        assert np.array_equal(water.piercing_points(points, centres, camera), points)
+        assert np.array_equal(water.piercing_points(points, centres), points)
 
 
 def test_there_and_back():
-    water = waters()["tilted waves"]
-    points, centres, camera = pairs()
-    surface = water.piercing_points(points, centres, camera)
-    planes = water.tangent_planes(points, centres, camera)
+    water = waters()["tilted"]
+    points, centres = pairs()
+    surface = water.piercing_points(points, centres)
+    planes = water.planes(COUNT)
     bed_normals = np.random.default_rng(1).normal(0, 0.2, (COUNT, 3)) + np.array([0, 0, 1])
     bed_normals /= np.linalg.norm(bed_normals, axis=1)[:, None]
     seen = bed_points(centres, surface - centres, planes, (points, bed_normals), N)
@@ -79,21 +73,3 @@ def test_there_and_back():
         air, under = surface[i] - centres[i], points[i] - surface[i]
         slow = bend(air / np.linalg.norm(air), planes[1][i], N)
         assert slow == pytest.approx(under / np.linalg.norm(under), abs=1e-9)
-
-
-def test_wave_statistics():
-    rng = np.random.default_rng(4)
-    waves = Waves.random(400, 2.0, 1.5, rng)
-    camera = rng.integers(0, 400, 40_000)
-    at = rng.uniform(-50, 50, (40_000, 2))
-    slopes = waves.slopes(camera, at)
-    # 40,000 independent draws: 0.4 % of a standard deviation, and 1 % of the amplitudes' spread
-    assert np.degrees(np.arctan(slopes.std(axis=0))) == pytest.approx([2.0, 2.0], rel=0.02)
-    assert np.abs(slopes.mean(axis=0)).max() < 0.001
-    near, far = np.array([0.05, 0.0]), rng.normal(0.0, 15.0, at.shape)
-    others = [(camera, at + near), (camera, at + far), ((camera + 1) % 400, at)]
-    alike = [np.corrcoef(slopes[:, 0], waves.slopes(*one)[:, 0])[0, 1] for one in others]
-    assert alike[0] > 0.95
-    assert np.abs(alike[1:]).max() < 0.03
-    angles = 2.0 * np.pi / np.linalg.norm(waves.wave_numbers, axis=2)
-    assert angles == pytest.approx(1.5)

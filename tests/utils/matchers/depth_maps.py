@@ -177,8 +177,7 @@ class _Matching:
             return np.where(others >= 0, row_of[sight.point[:, None], others], -1)
 
         self.sight, self.normals, self.known = sight, normals, partners.known
-        points, centres = sight.truth[sight.point], site.true.centres[sight.camera]
-        self.water = site.water.tangent_planes(points, centres, sight.camera)
+        self.water = site.water.planes(len(sight.point))
         self.partner = there(partners.matched)
         self.partner[(self.partner >= 0).sum(axis=1) < LEAST_PARTNERS] = -1
         self.averaged, self.fused = there(partners.averaged), there(partners.fused)
