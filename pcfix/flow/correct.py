@@ -254,10 +254,13 @@ def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
 
 def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> Plausible:
     """Test cameras, cloud and water against each other; warn of what does not fit."""
-    sample, sought = tally.sample or CloudSample(), isinstance(plan.found, WaterProposal)
-    doubts = () if sought else sample.level_doubts()
-    listed = plan.kind is not None
-    tested = plausible(plan.cameras, sample.rows[:, :3], ties, doubts, listed=listed)
+    sample, given = tally.sample or CloudSample(), plan.inputs.cameras
+    doubts = () if isinstance(plan.found, WaterProposal) else sample.level_doubts()
+    tested = plausible(
+        plan.cameras, sample.rows[:, :3], ties, doubts,
+        file="" if isinstance(given, Cameras) else given or "", water_m=sample.water_m,
+        listed=plan.kind is not None,
+    )  # fmt: skip
     for warning in tested.doubts:
         warnings.warn(warning, stacklevel=3)
     return tested

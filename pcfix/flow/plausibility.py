@@ -1,8 +1,9 @@
 """Test whether cameras, cloud and water belong together, with evidence independent of each.
 
-A correction looks plausible with almost any cameras and any level. Three tests use a sample of the
+A correction looks plausible with almost any cameras and any level. These tests use a sample of the
 cloud: each point needs two frames, tie points must match images and cloud, and the shoreline in the
-cloud must be at the water. What cannot be tested is listed. None of it changes a result.
+cloud must be at the water; images point along the flight lines, and cameras are where GNSS and
+barometer recorded them. What cannot be tested is listed. None of it changes a result.
 """
 
 from __future__ import annotations
@@ -13,11 +14,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pcfix.errors import PcfixWarning
+from pcfix.errors import InputError, PcfixWarning
 from pcfix.flow.surfaces import Points
+from pcfix.io.cameras.georeference import adjusted_minus_gnss
+from pcfix.io.tides import read_altitudes
 from pcfix.lens.frames import cameras_in_sight
 from pcfix.lens.imaging import straight_images
 from pcfix.model import Cameras, FloatArray, TiePoints
+from pcfix.options.declare import File
 from pcfix.sums import Sums
 from pcfix.water.auto import LEAST_POINTS, find_elsewhere
 
@@ -29,6 +33,14 @@ MOST_RESIDUAL, MOST_HEIGHT = 0.01, 0.02
 """Of tie points in the images (of the frame), and from the cloud (of the flying height)."""
 LEAST_TIES, TIES = 10, 3_000
 """The fewest tie points that are compared, in an image or with the cloud, and the most."""
+LEAST_STEPS, STEADY, MOST_TURN_DEG = 10, 0.9, 45.0
+"""Steps along flight lines, the consistency of their angle to the images, and its maximum."""
+STEEP_COSINE = 0.9
+"""Of the tilt of images whose top has a clear direction in plan, about 25 degrees."""
+MOST_OFF_M = 15.0
+"""In plan, from positions of the GNSS, in the median; without corrections these are 5 m off."""
+TAKE_OFF_M, MOST_SHARE = (-15.0, 25.0), 0.1
+"""How high above the water drones take off, and the share of their height that barometers err."""
 
 
 class Plausible(NamedTuple):
@@ -71,6 +83,12 @@ class CloudSample(Sums):
         """All rows, shape (n, 7)."""
         return np.vstack([np.zeros((0, 7)), *self.parts])
 
+    @property
+    def water_m(self) -> float | None:
+        """The median height of the water, metres."""
+        known = self.rows[np.isfinite(self.rows[:, 3]), 3]
+        return float(np.median(known)) if len(known) else None
+
     def level_doubts(self) -> tuple[PcfixWarning, ...]:
         """Return warnings if the shoreline in the cloud is at another height than the water."""
         known = self.rows[np.isfinite(self.rows[:, 3])]
@@ -96,23 +114,32 @@ def plausible(
     ties: TiePoints | None = None,
     level_doubts: tuple[PcfixWarning, ...] = (),
     *,
+    file: File = "",
+    water_m: float | None = None,
     listed: bool = False,
 ) -> Plausible:
     """Test cameras and cloud against each other.
 
     Cameras and tie points are in the cloud's frame; `cloud` are some of its points, shape (n, 3),
-    metres, evenly spread. `level_doubts` are those of `CloudSample`, and `listed` says whether the
-    listed images were found to hold their points.
+    metres, evenly spread. `level_doubts` are those of `CloudSample`, `file` is that of the cameras,
+    `water_m` the median height of the water, and `listed` says whether the listed images were found
+    to hold their points.
     """
     level = Plausible(doubts=level_doubts)
     if not len(cameras) or not len(cloud):
         return level
     in_list = Plausible(fits=("listed points visible in their images",))
+    heights, flown = _ties(cameras, cloud, ties), _flown(cameras, file, water_m)
+    if flown != Plausible():
+        heights = heights._replace(unchecked=())
     tests = (
         level,
         _frames(cameras, np.ascontiguousarray(cloud[:: 1 + len(cloud) // IN_FRAMES])),
+        _directions(cameras),
         in_list if listed and cameras.lenses else Plausible(),
-        _ties(cameras, cloud, ties),
+        _positions(cameras, str(file)),
+        heights,
+        flown,
     )
     return Plausible(
         tuple(one for test in tests for one in test.fits),
@@ -137,7 +164,8 @@ def _frames(cameras: Cameras, xyz: FloatArray) -> Plausible:
         )
         return Plausible(doubts=(PcfixWarning("cameras.no_overlap", sentence, share=unseen),))
     fits = f"{100.0 * (1.0 - unseen):.4g} % of the points in two frames or more"
-    return Plausible(fits=(fits,), unchecked=("a shift in plan",))
+    unchecked = () if cameras.gnss else ("a shift in plan (no GNSS positions)",)
+    return Plausible(fits=(fits,), unchecked=unchecked)
 
 
 def _ties(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Plausible:
@@ -197,3 +225,83 @@ def _worst_residual(cameras: Cameras, ties: TiePoints) -> tuple[float, str] | No
     images = np.flatnonzero(counts >= min(LEAST_TIES, counts.max()))
     medians = [float(np.median(residual[camera == i])) for i in images]
     return max(zip(medians, (cameras.labels[i] for i in images), strict=True))
+
+
+def _directions(cameras: Cameras) -> Plausible:
+    """Compare the yaw of near-nadir images with the direction of the flight lines."""
+    # steps between near-nadir images that follow each other
+    step = np.diff(cameras.centres[:, :2], axis=0)
+    length, rows = np.hypot(*step.T), np.zeros(0, np.int64)
+    if cameras.rotations is not None and len(length):
+        steep = cameras.rotations[:, 2, 2] < -STEEP_COSINE
+        usual = 2.0 * np.median(length)
+        rows = np.flatnonzero((length > 0.0) & (length < usual) & steep[:-1] & steep[1:])
+    if cameras.rotations is None or len(rows) < LEAST_STEPS:
+        return Plausible(unchecked=("yaw (no flight lines with it)",))
+    top = -cameras.rotations[rows, 1]  # direction of the upper edge, world frame
+    heading, yaw = np.arctan2(*step[rows].T), np.arctan2(top[:, 0], top[:, 1])
+    # the angles as they are, and as if radians had been taken for degrees
+    means = [np.mean(np.exp(1j * (heading - angle))) for angle in (yaw, np.degrees(yaw))]
+    turns = [abs(float(np.degrees(np.angle(mean)))) for mean in means]
+    is_steady = [bool(abs(mean) >= STEADY) for mean in means]
+    if not is_steady[0]:
+        return Plausible(unchecked=("yaw (no flight lines with it)",))
+    if turns[0] <= MOST_TURN_DEG:
+        return Plausible(fits=("yaw along the flight lines",))
+    are_radians = is_steady[1] and turns[1] <= MOST_TURN_DEG
+    if turns[0] < 180.0 - MOST_TURN_DEG and not are_radians:  # as cameras are mounted in aircraft
+        return Plausible(unchecked=("yaw (the images are across the flight lines)",))
+    sentence = (
+        f"The images are turned by {turns[0]:.0f} degrees against the flight lines. Check the"
+        " convention and the unit of the angles, unless the camera was mounted like that."
+    )
+    return Plausible(doubts=(PcfixWarning("cameras.yaw", sentence, turn_deg=turns[0]),))
+
+
+def _positions(cameras: Cameras, name: str) -> Plausible:
+    """Compare the places of cameras with those that their GNSS recorded."""
+    try:
+        found = np.zeros((0, 2))
+        if cameras.gnss is not None:
+            found = adjusted_minus_gnss(cameras, name)[0][:, :2]
+    except InputError:
+        return Plausible()
+    off_m = np.hypot(*found[np.isfinite(found).all(axis=1)].T)
+    if not len(off_m):
+        return Plausible()
+    middle = float(np.median(off_m))
+    if middle <= MOST_OFF_M:
+        return Plausible(fits=(f"positions {middle:.1f} m in plan from their GNSS",))
+    sentence = (
+        f"The cameras are {middle:.4g} m in plan from their GNSS positions (median of"
+        f" {len(off_m)}). Check their CRS and offset."
+    )
+    return Plausible(doubts=(PcfixWarning("cameras.gnss", sentence, off_m=middle),))
+
+
+def _flown(cameras: Cameras, file: File, water_m: float | None) -> Plausible:
+    """Compare the heights of cameras above the water with those recorded above take-off.
+
+    A wrong vertical datum or unit moves all cameras, which no other test sees without tie points.
+    """
+    if not file or water_m is None:
+        return Plausible()
+    recorded = read_altitudes(file, cameras.labels)
+    rows = np.flatnonzero(np.isfinite(recorded))
+    if not len(rows):
+        return Plausible()
+    above = float(np.median(cameras.centres[rows, 2])) - water_m
+    flown = float(np.median(recorded[rows]))
+    off, (low, high), least = above - flown, TAKE_OFF_M, MOST_SHARE * abs(flown)
+    where = f"{abs(off):.0f} m {'above' if off > 0.0 else 'below'} the water"
+    if low - least <= off <= high + least:
+        return Plausible(fits=(f"heights as recorded in flight, from a take-off {where}",))
+    sentence = (
+        f"The cameras are {above:.0f} m above the water, and recorded {flown:.0f} m above their"
+        f" take-off (median of {len(rows)}), which would be {where}. If it was not, check the"
+        " vertical datum and the unit of cameras and water."
+    )
+    doubt = PcfixWarning(
+        "cameras.flying_height", sentence, above_water_m=above, above_take_off_m=flown
+    )
+    return Plausible(doubts=(doubt,))

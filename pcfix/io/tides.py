@@ -1,13 +1,17 @@
-"""Read tide tables and times of images; compute the level at each image.
+"""Read tide tables, and times and flying heights of images; compute the level at each image.
 
 Times with a zone (or Z) are UTC moments. Times without one are the readings of one clock that
 table and images share. The two cannot be compared, so both must be of one kind.
+
+The heights above the take-off place are those that drones recorded in their images: DJI's XMP has
+``drone-dji:RelativeAltitude`` (metres, by the barometer).
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -163,3 +167,28 @@ def level_offsets(
         sentence = f"{name}: its rows are up to {hours:.1f} h apart; give one each hour."
         notes.append(PcfixWarning("tide.sparse", sentence, hours=hours))
     return level - level.mean(), tuple(notes)
+
+
+FOLDERS = ("", "images")
+"""Where images lie, relative to the folder of the camera file."""
+MOST_IMAGES, HEAD_BYTES = 30, 2**17
+_ABOVE = re.compile(rb"RelativeAltitude(?:=[\"']|>)\s*([+-]?\d+(?:\.\d*)?)")
+
+
+def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
+    """Return how high each image was taken above the take-off place, shape (k,), metres.
+
+    NaN where it is not recorded. At most `MOST_IMAGES` images near the camera file are read.
+    """
+    altitudes, path, found = np.full(len(labels), np.nan), Path(cameras), {}
+    root = path if path.is_dir() else path.parent
+    with suppress(OSError):  # no correction needs them
+        inside = [one for name in FOLDERS for one in sorted(root.joinpath(name).glob("*"))]
+        images = [one for one in inside if one.suffix.lower() in IMAGES and one.is_file()]
+        for image in images[:: 1 + len(images) // MOST_IMAGES]:
+            with image.open("rb") as stream:
+                if above := _ABOVE.search(stream.read(HEAD_BYTES)):
+                    found[image.name] = float(above[1])
+    row = match_labels(list(found), labels, one_to_one=False)[0]
+    altitudes[row[row >= 0]] = np.array(list(found.values()))[row >= 0]
+    return altitudes

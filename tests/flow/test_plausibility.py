@@ -38,6 +38,12 @@ def moved(block, *by):
     return replace(block.cameras, centres=block.cameras.centres + np.array(by))
 
 
+def turned(block, degrees):
+    """Turn every camera about the vertical, clockwise."""
+    turn = Rotation.from_euler("z", -degrees, degrees=True).as_matrix()
+    return replace(block.cameras, rotations=block.cameras.rotations @ turn.T)
+
+
 def in_feet(block):
     return replace(block.cameras, centres=block.cameras.centres / [1.0, 1.0, 0.3048])
 
@@ -56,15 +62,21 @@ FAULTS = {
     "47 m too low": lambda b: moved(b, 0, 0, -47),
     "feet": in_feet,
     "radians": in_radians,
+    "yaw + 90": lambda b: turned(b, 90),
+    "yaw + 180": lambda b: turned(b, 180),
     "40 m beside": lambda b: moved(b, 40, 0, 0),
 }
-DOUBTED = {"47 m too low": "cameras.no_overlap"}
+DOUBTED = {
+    "47 m too low": "cameras.no_overlap",
+    "yaw + 180": "cameras.yaw",
+    "radians": "cameras.yaw",
+}
 """Of the sample scene, which has neither tie points nor GNSS positions."""
 UNCHECKED = {
     "47 m too high": "heights (no tie points; cameras 129 m above the cloud)",
     "feet": "heights (no tie points; cameras 26",
-    "radians": "a shift in plan",
-    "40 m beside": "a shift in plan",
+    "yaw + 90": "yaw (the images are across the flight lines)",
+    "40 m beside": "a shift in plan (no GNSS positions)",
 }
 
 
@@ -75,11 +87,11 @@ def codes(found):
 def test_good_block(scene):
     found = plausible(scene.cameras, scene.xyz)
     assert not found.doubts
-    assert (len(found.fits), len(found.unchecked)) == (1, 2)
+    assert (len(found.fits), len(found.unchecked)) == (2, 2)
     bare = plausible(replace(scene.cameras, rotations=None, lenses=None), scene.xyz)
     assert not bare.fits
     listed = plausible(scene.cameras, scene.xyz, listed=True)
-    assert len(listed.fits) == 2
+    assert len(listed.fits) == 3
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -163,9 +175,30 @@ def test_real_blocks(name):
     sample = sample_of(RENDERED.parent / cloud, above_m)
     ties = quick_ties(inputs, view.crs)
     block = inputs.block(view.crs)[0]
-    found = plausible(block, sample.rows[:, :3], ties, sample.level_doubts())
+    found = plausible(block, sample.rows[:, :3], ties, sample.level_doubts(), file=path)
     assert not found.doubts
     assert found.fits[0].startswith("100 % of the points")
+
+
+@rendered
+def test_gnss_positions():
+    cameras = Inputs(cameras=RENDERED / "cameras.xml", water=LEVEL_M).block("EPSG:32636")[0]
+    xyz = read_xyz(RENDERED / "cloud.las")[::50]
+    assert "positions 1.6 m in plan from their GNSS" in plausible(cameras, xyz).fits
+    beside = replace(cameras, centres=cameras.centres + np.array([40.0, 0.0, 0.0]))
+    assert codes(plausible(beside, xyz)) == ["cameras.no_overlap", "cameras.gnss"]
+
+
+@pytest.mark.parametrize("drone_m", [78.0, 33.0, 130.0])
+def test_recorded_heights(scene, tmp_path, drone_m):
+    """As DJI writes them, beside the camera file; the cameras are 80 m above the water."""
+    (tmp_path / "images").mkdir()
+    for label in scene.cameras.labels:
+        xmp = f'\xff\xd8 <rdf drone-dji:RelativeAltitude="{drone_m:+.2f}" drone-dji:Roll="0">'
+        (tmp_path / "images" / label).write_bytes(xmp.encode("latin-1"))
+    found = plausible(scene.cameras, scene.xyz, file=tmp_path / "cameras.csv", water_m=LEVEL_M)
+    assert codes(found) == ([] if drone_m == 78.0 else ["cameras.flying_height"])
+    assert not any(one.startswith("heights") for one in found.unchecked)
 
 
 def test_great_depths(scene):
