@@ -242,7 +242,6 @@ BAD = {
     "reference": "compare {samples}/scene/cloud.laz nowhere.las",
     "other-reference": "compare {samples}/scene/cloud.laz {shared}/river/points.las",
     "run-nothing": "run",
-    "run-config": "run out --config nowhere.json",
     "no-ties": "adjust {samples}/scene/cameras.csv out --water 0.37",
     "adjust-words": f"adjust {FREE}/sparse out --water 0.37 --free nonsense",
     "no-command": "corect",
@@ -274,7 +273,7 @@ def table() -> dict[str, str]:
     add("river", IN_RIVER, OF_RIVER)
     add("tenth", TENTH, OF_A_TENTH)
     add("water", f"{RIVER} --summary summary.json --water", WATERS)
-    of_cloud = "--cloud {shared}/river/points.las --summary summary.json --plot water.png"
+    of_cloud = "--cloud {shared}/river/points.las --summary summary.json"
     some = ("level", "csv", "gpkg", "shore-river", "auto", "obj", "raster")
     add("fit", f"water {of_cloud}", {name: WATERS[name] for name in some})
     commands["fit.scene"] = "water auto --cloud {samples}/scene/cloud.laz --summary summary.json"

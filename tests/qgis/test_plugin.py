@@ -51,9 +51,8 @@ def test_options(commands):
     assert found["water"]["needed"]
     assert not found["cameras"]["needed"]  # but with a method that looks at none
     assert found["method"]["choices"][:2] == ["auto", "snell"]
-    assert {one["kind"] for one in found.values()} == {
-        "bool", "int", "float", "choice", "file", "written", "text",
-    }  # fmt: skip
+    kinds = {one["kind"] for one in (*found.values(), *commands["correct"]["options"])}
+    assert kinds == {"bool", "int", "float", "choice", "file", "written", "text"}
 
 
 def test_command_line(commands):
