@@ -270,7 +270,7 @@ def table() -> dict[str, str]:
     add("river", IN_RIVER, OF_RIVER)
     add("tenth", TENTH, OF_A_TENTH)
     add("water", f"{RIVER} --summary summary.json --water", WATERS)
-    of_cloud = "--cloud {shared}/river/points.las --summary summary.json --plot water.png"
+    of_cloud = "--cloud {shared}/river/points.las --summary summary.json"
     some = ("level", "csv", "gpkg", "shore-river", "auto", "obj", "raster")
     add("fit", f"water {of_cloud}", {name: WATERS[name] for name in some})
     commands["fit.scene"] = "water auto --cloud {samples}/scene/cloud.laz --summary summary.json"
