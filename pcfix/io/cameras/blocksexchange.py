@@ -39,7 +39,7 @@ import numpy as np
 
 from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Source, damaged, number, read_xml, text_of
+from pcfix.io.cameras.checks import Source, number, read_xml, text_of
 from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.crs import Topocentric
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
@@ -180,8 +180,6 @@ def _crs_of(path: Path, root: Element, srs_id: str) -> str:
     if srs_id in ("", EXIF):
         return srs_id or "local"
     definitions = {text_of(srs, "Id"): srs.findtext("Definition") or "" for srs in root.iter("SRS")}
-    if srs_id not in definitions:
-        raise damaged(path, f"there is no spatial reference system with the id {srs_id}")
     definition = definitions[srs_id].strip()
     if not definition.upper().startswith("ENU:"):
         return checks.crs(path, definition)

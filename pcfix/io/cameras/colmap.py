@@ -40,7 +40,6 @@ from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 from pcfix.options.declare import File
 
 _PART = re.compile(r"(cameras|images|points3D|rigs|frames)\.(bin|txt)")
-_CAMERA_LINE = re.compile(r"^\s*\d+\s+[A-Z][A-Z_0-9]+(\s+\S+){2}", re.MULTILINE)
 FILE, WRITER = "georeference.json", "pcfix"
 
 
@@ -104,10 +103,7 @@ def _models_at(path: Path) -> list[Path]:
 
 def _is_model(listed: Path) -> bool:
     """Whether there are a list of cameras and one of images."""
-    if not (listed.is_file() and listed.with_stem("images").is_file()):
-        return False
-    with listed.open(encoding="utf-8-sig", errors="replace") as stream:
-        return listed.suffix == ".bin" or bool(_CAMERA_LINE.search(stream.read(4096)))
+    return listed.is_file() and listed.with_stem("images").is_file()
 
 
 def read_place(folder: Path) -> tuple[FloatArray, str | None]:

@@ -325,8 +325,6 @@ def _calibrated(
         for entry in calibration
         if entry.tag in PARAMETERS
     }
-    if not given.keys() & {"f", "fx", "fy"}:
-        raise damaged(path, f"the calibration of sensor {sensor} has no focal length")
     (width, height), value = size, defaultdict(float, given)
     if "f" in given:
         given |= {"fx": value["f"] + value["b1"], "fy": value["f"], "skew": value["b2"]}
@@ -457,7 +455,5 @@ def _vertices(archive: zipfile.ZipFile, name: str | None, axes: str) -> tuple[Fl
         raise damaged(where, f"it is not a binary PLY of vertices with {', '.join(axes)}, id")
     with checks.reading(where):
         rows = np.frombuffer(data, np.dtype([*kinds.items()]), header.records, header.end)
-        if rows["id"].dtype.kind not in "iu":
-            raise damaged(where, "the id is not a whole number")
         columns = np.column_stack([rows[axis] for axis in axes]).astype(np.float64)
     return columns, rows["id"].astype(np.int64)

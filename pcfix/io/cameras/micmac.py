@@ -25,13 +25,12 @@ write the formula of each coefficient next to it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError, bad_file
+from pcfix.errors import InputError
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, damaged, number, numbers, read_xml
 from pcfix.io.cameras.checks import text_of as _text
@@ -53,8 +52,7 @@ def read(source: Source) -> Cameras:
     if source.path.is_dir():
         found = [sorted(source.path.glob(f"{one}*{SUFFIX}")) for one in (PREFIX, PREFIX_2)]
         paths = [path for path in found[0] or found[1] if path.is_file()]
-    known: dict[Path, Lens] = {}
-    poses = [_orientation(path, known) for path in paths]
+    poses = [_orientation(path) for path in paths]
     labels = [path.name.removesuffix(SUFFIX).removeprefix(PREFIX) for path in paths]
     return Cameras(
         labels=tuple(label.removeprefix(PREFIX_2) for label in labels),
@@ -64,17 +62,15 @@ def read(source: Source) -> Cameras:
     )
 
 
-def _orientation(path: Path, known: dict[Path, Lens]) -> tuple[FloatArray, FloatArray, Lens]:
+def _orientation(path: Path) -> tuple[FloatArray, FloatArray, Lens]:
     """Return centre, rotation world to camera, and lens."""
     root = read_xml(path)
     if named := _text(root, ".//NameInternalCalib"):  # MMVII
         tags = ("AxeI", "AxeJ", "AxeK")
         axes = [numbers(path, tag, root.findtext(f".//RotMatrix/{tag}"), 3) for tag in tags]
         centre = numbers(path, "Center", root.findtext(".//Center"), 3)
-        where = _calibration_file(path, [path.parent / f"{PurePosixPath(named).name}{SUFFIX}"])
-        if where not in known:
-            known[where] = _calibration_2(where, read_xml(where))
-        return centre, np.array(axes), known[where]
+        where = path.with_name(f"{PurePosixPath(named).name}{SUFFIX}")
+        return centre, np.array(axes), _calibration_2(where, read_xml(where))
     conic = _first(path, root, "OrientationConique")
     projection = _text(conic, "TypeProj") or "eProjStenope"
     outer = _first(path, conic, "Externe")
@@ -87,27 +83,15 @@ def _orientation(path: Path, known: dict[Path, Lens]) -> tuple[FloatArray, Float
     inner, where = conic.find("Interne"), path
     if inner is None:
         name = PurePosixPath(_text(conic, "FileInterne").replace("\\", "/"))
-        places = [path.parent / name.name, path.resolve().parent.parent / name]
-        where = _calibration_file(path, places)
-    if where not in known:
-        if inner is None:
-            inner = _first(where, read_xml(where), "CalibrationInternConique")
-        known[where] = _calibration(where, inner)
+        where = path.parent / name.name
+        where = where if where.is_file() else path.resolve().parent.parent / name
+        inner = _first(where, read_xml(where), "CalibrationInternConique")
     scan = conic.find("OrIntImaM2C")
     if scan is not None:
         text = " ".join(scan.findtext(tag) or "" for tag in ("I00", "V10", "V01"))
         if (numbers(path, "OrIntImaM2C", text, 6) != [0.0, 0.0, 1.0, 0.0, 0.0, 1.0]).any():
             raise _not_held(path, "map to a scanned image (OrIntImaM2C)")
-    return centre, np.array(rows).T, known[where]
-
-
-def _calibration_file(path: Path, places: Sequence[Path]) -> Path:
-    """Return the first place where the calibration of an orientation is."""
-    for place in places:
-        if place.is_file():
-            return place
-    sentence = f"its calibration '{places[0].name}' is missing. Copy it next to the orientation."
-    raise bad_file(path, "cameras.missing_file", sentence, file=places[0].name)
+    return centre, np.array(rows).T, _calibration(where, inner)
 
 
 def _calibration(path: Path, element: Element) -> Lens:

@@ -370,8 +370,6 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
             values = np.array([fields[3:5] for fields in lines], dtype=float).reshape(-1, 2)
             known = (point >= 0) & (camera >= 0)
             parts.append((point[known], camera[known], values[known]))
-    if not parts:
-        raise checks.damaged(tracks, "it is empty")
     point, camera, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.lexsort((camera, point))
     size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]
@@ -408,8 +406,6 @@ def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
         return float(camera.get(key, default))
 
     width, height = value("width"), value("height")
-    if not (width and height):
-        raise checks.damaged(path, f"the width and height of camera {name} are missing")
     scale = max(width, height)
     given = {one: value(_PARAMETERS.get(one, one)) for one in _MODELS[model].names.split()}
     if "transition" in given:

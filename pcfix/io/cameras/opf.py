@@ -123,8 +123,6 @@ def _frame_of(project: Project) -> AffineFrame:
         return AffineFrame(np.eye(3), np.zeros(3), "local")
     way = scene["base_to_canonical"]
     shift, scale = triple(way["shift"]), triple(way["scale"])
-    if not (scale > 0.0).all():
-        raise checks.damaged(path, f"the scale {scale.tolist()} is not positive")
     if way.get("swap_xy"):
         scale = scale[[1, 0, 2]]  # positions are east, north already, scales in the CRS's order
     stated = checks.crs(path, scene["crs"]["definition"])

@@ -88,12 +88,9 @@ def read(source: Source) -> Cameras:
             if not posed:
                 raise damaged(files["external"], f"names none of the images of {PARAMETERS}")
             centres, rotations = (each[rows][posed] for each in (centres, rotations))
-    elif images:
+    else:
         labels, rotations = names, _rotations(files["parameters"], images)
         centres = np.array([image.fields["centre"] for image in images]) + _offset(files)
-    else:
-        sentence = f"{PARAMETERS} is missing. Give the params folder of the project."
-        raise bad_file(source.path, "cameras.missing_file", sentence)
     given = [*names, *labels]
     labels = [names[i] for i in posed] or labels
     lenses = tuple(lens for i in posed if (lens := _lens(images[i])) is not None)

@@ -439,7 +439,7 @@ def test_tie_points_of_components_and_markers(tmp_path):
         (chunk(cameras=camera(0, "")), "cameras.no_pose"),
         ("<chunks/>", "cameras.no_pose"),
         (chunk(sensors=""), "cameras.damaged"),
-        (chunk(sensors=sensor(calibration(""))), "cameras.damaged"),
+        (chunk(sensors=sensor(calibration(""))), "cameras.lens"),
         (chunk(cameras=camera(0, "<transform>1 2 3</transform>")), "cameras.damaged"),
         (chunk(rest=transform(rotation="1 0 0 0 1 0 0 0 2")), "cameras.rotation"),
     ],
