@@ -16,7 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from pcfix.blocks import bounds, empty, grouped, mapped, release, row_numbers
+from pcfix.blocks import blocks, bounds, empty, grouped, mapped, release, row_numbers
 from pcfix.model import FloatArray, IntArray
 from pcfix.running import current
 
@@ -146,3 +146,16 @@ def make_tiles(xyz: FloatArray, points: int | None = None) -> Tiles:
         release()
     low, high = np.swapaxes(np.array(boxes), 0, 1)
     return Tiles(places, row, start, low, high)
+
+
+def spacing_m(xyz: FloatArray, side_m: float) -> float:
+    """Return the spacing of points (n, 3) within the squares of the plan with any; 0 on a line."""
+    squares: IntArray = np.empty(0, np.int64)
+    for rows in blocks(len(xyz)):
+        column, row = np.floor(xyz[rows, :2] / side_m).astype(np.int64).T
+        squares = np.union1d(squares, (row << 32) + column)
+    low, high = bounds(xyz[:, :2])
+    row = squares >> 32
+    corner = np.column_stack([squares - (row << 32), row]) * side_m
+    sides = np.minimum(corner + side_m, high) - np.maximum(corner, low)
+    return float(np.sqrt(np.maximum(sides, 0.0).prod(axis=1).sum() / len(xyz)))

@@ -86,10 +86,12 @@ def fit_line(reference_depth_m: FloatArray, depth_m: FloatArray) -> Figures | No
     """
     if len(depth_m) < 3 or np.ptp(reference_depth_m) <= 1e-9 * np.abs(reference_depth_m).max():
         return None
-    (xx, xy), (_, yy) = np.cov(reference_depth_m, depth_m, ddof=0).tolist()
-    slope, r2 = xy / xx, xy * xy / (xx * yy) if yy > 0.0 else 1.0
-    intercept = float(depth_m.mean() - slope * reference_depth_m.mean())
-    return Figures(slope=slope, intercept_m=intercept, r2=r2, count=len(depth_m))
+    x_mean, y_mean = float(reference_depth_m.mean()), float(depth_m.mean())
+    x, y = reference_depth_m - x_mean, depth_m - y_mean  # np.cov would take more memory
+    xx, xy, yy = float(x @ x), float(x @ y), float(y @ y)
+    r2 = xy * xy / (xx * yy) if yy > 0.0 else 1.0
+    intercept = y_mean - xy / xx * x_mean
+    return Figures(slope=xy / xx, intercept_m=intercept, r2=r2, count=len(depth_m))
 
 
 def binned(

@@ -19,11 +19,11 @@ import numpy as np
 
 from pcfix.blocks import bounds, empty, release
 from pcfix.clean.neighbours import Tiles as PointTiles
-from pcfix.clean.neighbours import make_tiles
+from pcfix.clean.neighbours import make_tiles, spacing_m
 from pcfix.errors import bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.heights import fill_holes, grid_window, margin_cells
-from pcfix.grid.lattice import Lattice, lattice_over, round_resolution, spacing_m
+from pcfix.grid.lattice import Lattice, lattice_over, round_resolution
 from pcfix.io import rasters
 from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.crs import crs_words, parts

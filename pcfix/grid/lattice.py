@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.blocks import blocks, bounds
 from pcfix.errors import SettingError
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.options.steps import MIN_RESOLUTION_M
@@ -174,16 +173,3 @@ def round_resolution(spacing_m: float) -> float:
     most = least * math.sqrt(POINTS_A_CELL[1] / POINTS_A_CELL[0])
     sides = (figure * scale for figure in ROUND for scale in (power, 10.0 * power))
     return next(float(f"{side:.6g}") for side in sides if least * 0.999 <= side <= most * 1.001)
-
-
-def spacing_m(xyz: FloatArray, side_m: float) -> float:
-    """Return the spacing of points (n, 3) within the squares of the plan with any; 0 on a line."""
-    squares: IntArray = np.empty(0, np.int64)
-    for rows in blocks(len(xyz)):
-        column, row = np.floor(xyz[rows, :2] / side_m).astype(np.int64).T
-        squares = np.union1d(squares, (row << 32) + column)
-    low, high = bounds(xyz[:, :2])
-    row = squares >> 32
-    corner = np.column_stack([squares - (row << 32), row]) * side_m
-    sides = np.minimum(corner + side_m, high) - np.maximum(corner, low)
-    return float(np.sqrt(np.maximum(sides, 0.0).prod(axis=1).sum() / len(xyz)))
