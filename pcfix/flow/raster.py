@@ -15,7 +15,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import laspy
 import numpy as np
 import numpy.typing as npt
 
@@ -40,7 +39,7 @@ NO_CODE = 255
 """Value of cells without a height in outcome and class, which have whole numbers."""
 WINDOW_CELLS = 512
 HOLE_CELLS, EDGE_CELLS = 1.5, 2
-"""Reach of known cells into holes and beyond the edge, and whole cells with that reach."""
+"""Reach of known cells into holes, and beyond the edge of the raster."""
 NEAR_CELLS = 0.5
 """Largest distance of a moved point from the centre of the cell that gets its height."""
 MOST_SHIFT_CELLS = 256
@@ -84,10 +83,10 @@ def check_heights(source: object, water: WaterSurface) -> None:
 @contextmanager
 def raster_writer(
     source: Any,
-    header: laspy.LasHeader,
+    header: Any,
     targets: Mapping[str, Path],
     progress: Callable[[int, int], None] | None = None,
-) -> Iterator[Callable[[laspy.ScaleAwarePointRecord], None]]:
+) -> Iterator[Callable[[Any], None]]:
     """Give a function that takes points of cells; the rasters are written when the block ends.
 
     The points are as the header states, after a correction or a labelling; withheld ones have no
@@ -100,7 +99,7 @@ def raster_writer(
         cells = new((whole.height, whole.width), CELL)
         release = current().release  # `append` runs in a thread that has other settings
 
-        def append(points: laspy.ScaleAwarePointRecord) -> None:
+        def append(points: Any) -> None:
             nonlocal farthest
             xyz, cell = coordinates(points), np.zeros(len(points), CELL)
             cell["code"] = points.array[OUTCOME.name if is_corrected else "classification"]
@@ -116,9 +115,9 @@ def raster_writer(
             release()
 
         yield append
-        settings = own_settings(header.vlrs) if is_corrected else {}
-        record = {key: settings[key] for key in settings if key not in ("before", "sha256")}
-        tags = {"PCFIX": json.dumps({"corrected": is_corrected, **record})}
+        record = own_settings(header.vlrs) or {}
+        record = {key: record[key] for key in record if key not in ("before", "sha256")}
+        tags = {"PCFIX": json.dumps({**record, "corrected": is_corrected})}
         margin = int(min(farthest, MOST_SHIFT_CELLS)) + 2 * EDGE_CELLS
         with ExitStack() as files:
             outs = {
@@ -181,15 +180,11 @@ def _layers(
     if source.dtype.kind != "f":
         new, limits = np.rint(new), np.iinfo(source.dtype)
         if ((new < limits.min) | (new > limits.max)).any():
-            sentence = f"its type, {source.dtype}, is too narrow for the corrected heights. Convert"
-            sentence += " it to Float32 first (gdal_translate -unscale -ot Float32)."
+            sentence = f"has the type {source.dtype}, too narrow for its new heights. Use Float32."
             raise bad_file(source.path, "raster.type", sentence)
     stored[wet] = np.where(np.isnan(new), source.nodata, new)
-    layers = {
-        "height": [stored], "depth": [depth], "shift": [*shift], "outcome": [code],
-        "uncertainty": [TO_95 * sigma, sigma],
-    }  # fmt: skip
-    return layers, int(np.isnan(new).sum())
+    layers = {"height": [stored], "depth": [depth], "shift": [*shift], "outcome": [code]}
+    return layers | {"uncertainty": [TO_95 * sigma, sigma]}, int(np.isnan(new).sum())
 
 
 def _moved_heights(
@@ -211,9 +206,10 @@ def _moved_heights(
     around = window.grown(margin).clipped(source.window)
     x, y, z = np.moveaxis(cells[around.within(source.window)]["shift"].astype(np.float64), -1, 0)
     height, to_cells = source.read(around) + z, ~source.raster.transform
+    # d in rows and columns; without a height it is unknown too
     down, right = to_cells.d * x + to_cells.e * y, to_cells.a * x + to_cells.b * y
     height, down, right = (
-        rasters.filled(np.pad(one, EDGE_CELLS, constant_values=np.nan), HOLE_CELLS)
+        rasters.filled(np.pad(one, EDGE_CELLS, "edge"), HOLE_CELLS)
         for one in np.where(np.isnan(height), np.nan, [height, down, right])
     )
 

@@ -65,6 +65,9 @@ class RasterSource(LasSource):
             self.raster = raster = stack.enter_context(open_raster(part.path))
             self.band = band = _height_band(raster, part)
             self.crs = CRS(raster.crs.to_wkt())
+            if metres_up(self.crs) < 0.0 or "depth" in f"{raster.descriptions[band - 1]}".lower():
+                sentence = "contains depths (positive down). Give heights: water level minus depth."
+                raise bad_file(part.path, "raster.depths", sentence)
             self.window = Window(0, raster.height, 0, raster.width)
             self.cell_m = float(np.sqrt(abs(raster.transform.determinant)))
             self.dtype = np.dtype(raster.dtypes[band - 1])
@@ -116,15 +119,12 @@ class RasterSource(LasSource):
             xyz = np.column_stack([x, y, height[row, column]])
             steps = np.rint((xyz - self.header.offsets) / self.header.scales)
             points.array["X"], points.array["Y"], points.array["Z"] = steps.T
-            points["return_number"][:] = 1
-            points["number_of_returns"][:] = 1
+            points["return_number"][:] = points["number_of_returns"][:] = 1
             yield points
 
 
 def _height_band(raster: DatasetReader, part: CloudPart) -> int:
     """Return the number of the band of heights; an `InputError` if there are other values."""
-    from pyproj import CRS
-
     path, band = part.path, part.band
     kinds = [one.name for one in raster.colorinterp]
     known = [number for number, kind in enumerate(kinds, 1) if kind != "alpha"]
@@ -142,12 +142,6 @@ def _height_band(raster: DatasetReader, part: CloudPart) -> int:
     if raster.crs is None or raster.transform.is_identity:
         sentence = "has no CRS, or no georeference. Assign it, for example with gdal_edit."
         raise bad_file(path, "raster.no_crs", sentence)
-    if (
-        metres_up(CRS(raster.crs.to_wkt())) < 0.0
-        or "depth" in f"{raster.descriptions[band - 1]}".lower()
-    ):
-        sentence = "contains depths (positive down). Give heights: the water level minus depth."
-        raise bad_file(path, "raster.depths", sentence)
     unit = (raster.units[band - 1] or "").strip()
     if unit.lower() not in ("", "m", "metre", "meter", "metres", "meters"):
         sentence = f"its heights are in '{unit}'. Convert them to metres."
