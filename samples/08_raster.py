@@ -13,5 +13,5 @@ summary = pcfix.correct_file(
     "dsm.tif", "corrected.tif", cameras=scene / "cameras.csv", water=0.37,
     depth="dsm_depth.tif", uncertainty="dsm_uncertainty.tif", overwrite=True,
 )  # fmt: skip
-print(f"{summary.raster['cells_changed']:,} of {summary.points:,} cells are under water")
+print(f"{summary.submerged:,} of {summary.points:,} cells are under water")
 print(f"deepest cell {summary.depth_m['max']:.2f} m, mean shift {summary.shift_z_m['mean']:.2f} m")

@@ -22,7 +22,7 @@ from pcfix.io.atomic import temporary_output
 from pcfix.io.crs import parse_crs
 from pcfix.io.files import scratch_arrays
 from pcfix.io.photographs import Frames, check_calm, read_frames, write_calm, write_spread
-from pcfix.io.rasters import new_raster, write_part
+from pcfix.io.rasters import new_raster, write_bands
 from pcfix.model import FloatArray, Lens, WaterRaster
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import CalmOptions
@@ -260,4 +260,4 @@ def _write_waters(
             (folder / "sigma" / f"{name}.tif", "standard error", sigma),
         ):
             with new_raster(path, lattice, parsed, {band: "m"}) as target:
-                write_part(target, values.reshape(lattice.height, -1), lattice.window, 1)
+                write_bands(target, [values.reshape(lattice.height, -1)], lattice.window)

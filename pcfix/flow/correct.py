@@ -20,8 +20,8 @@ from pcfix.flow.diagnosis import diagnose_in_passing, quick_ties
 from pcfix.flow.inputs import CameraInputs, Inputs, paths_in, transfer_between
 from pcfix.flow.planning import plan_correction, plan_of, read_inputs
 from pcfix.flow.plausibility import CloudSample, Plausible, plausible
-from pcfix.flow.raster import command_for
-from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress
+from pcfix.flow.raster import check_heights
+from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
 from pcfix.io.cameras.georeference import likely_mistake
 from pcfix.io.las import columns
@@ -92,14 +92,14 @@ def correct_file(
 
     def plan(task: FileTask) -> Plan:
         """Return the plan for a file, or for many as one cloud."""
-        return plan_correction(read_inputs(given, view_of(task.source, given.jobs)))
+        planned = plan_correction(read_inputs(given, view_of(task.source, given.jobs)))
+        check_heights(task.source, planned.found.surface)
+        return planned
 
-    run = command_for(output, given)
-    result: Summary = run(
+    return run_command(
         "correct", input, output, given, plan=plan, work=_correcting, finish=finish,
         reads=paths_in(given), progress=progress,
     )  # fmt: skip
-    return result
 
 
 def _correcting(plan: Plan, source: LasSource) -> FileWork:

@@ -30,6 +30,7 @@ from pcfix.io.crs import crs_words, parts
 from pcfix.io.files import check_output, scratch_arrays, write_text
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.las.writing import is_ours
+from pcfix.io.rasters import METRE, TO_95
 from pcfix.io.styles import raster_style
 from pcfix.io.tiles import CloudFiles, Clouds, cloud_of, inputs_of, open_cloud
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, FloatArray
@@ -44,13 +45,10 @@ TIN_REACH_SPACINGS = 5.0
 TIN_REACH_CELLS = 3.0
 """Largest diameter of circles around triangles: the larger of the two, or --fill."""
 
-METRE = "metre"
 BLOCK_CELLS = 1024
 """Longest side of a window."""
 BIN_POINTS = 200_000
 """Points of a tile by which they are sorted, on average."""
-TO_95 = 1.959964
-"""Half-width of 95 % of a normal distribution, in standard deviations."""
 SIGMA_Z = "SigmaZ"
 DIMENSIONS = {"height": None, "depth": "WaterDepth", "uncertainty": SIGMA_Z}
 """Where the values of a quantity are."""
@@ -199,10 +197,9 @@ def _write_rasters(
             values = height[~np.isnan(height)]
             if widest:
                 height = fill_holes(whole, window, around, widest)
-            rasters.write_part(dsm, height, window, 1)
+            rasters.write_bands(dsm, [height], window)
             if "counts" in paths:
-                rasters.write_part(counts, number, window, 1)
-                rasters.write_part(counts, spread, window, 2)
+                rasters.write_bands(counts, [number, spread], window)
             cells += int((number > 0).sum())
             filled += int((~np.isnan(height) & (number == 0)).sum())
             known += int((~np.isnan(height)).sum())

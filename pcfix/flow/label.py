@@ -12,8 +12,7 @@ import numpy.typing as npt
 
 from pcfix.errors import PcfixWarning
 from pcfix.flow.inputs import labelling_of, mask_of, paths_in
-from pcfix.flow.raster import command_for
-from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress
+from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
 from pcfix.flow.surfaces import (
     CloudView,
     Points,
@@ -116,13 +115,11 @@ def label_file(
         See `pcfix.correct_file`. With connectivity the cloud is read twice.
     """
     given = taken(LabelOptions, options, keywords, "label_file")
-    run = command_for(output, given)
-    result: Figures = run(
+    return run_command(
         "label", input, output, given, work=_labelling, finish=_finish, reads=paths_in(given),
         plan=lambda task: plan_labelling(given, view_of(task.source, given.jobs)),
         progress=progress,
     )  # fmt: skip
-    return result
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 
 from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
-from pcfix.flow.raster import write_cells
+from pcfix.flow.raster import raster_writer
 from pcfix.flow.run_folder import SURFACE, RunFolder
 from pcfix.flow.runner import Progress
 from pcfix.flow.surfaces import file_points, view_of
@@ -20,11 +20,11 @@ from pcfix.grid.lattice import Window, round_resolution
 from pcfix.grid.maps import contours, depth_interval, hillshade, relief_colours
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters
-from pcfix.io.atomic import scratch_folder, temporary_output
 from pcfix.io.las.source import RasterBand
+from pcfix.io.raster_cloud import RasterSource
 from pcfix.io.styles import Symbol, limits_of, vector_style
 from pcfix.io.tables import read_check_depths
-from pcfix.io.tiles import Tiles
+from pcfix.io.tiles import Tiles, open_cloud
 from pcfix.io.vectors import Layer, write_layers
 from pcfix.model import BATHYMETRIC_POINT, Cameras, FloatArray, WaterSurface
 from pcfix.options.correct import LEVEL_M
@@ -63,9 +63,14 @@ def write_rasters(run: RunFolder, *, errors: bool, progress: Progress | None = N
     folder, cloud, cell_m = run.folder, run.cloud("cleaned"), run.options.resolution
     source = run.source
     if isinstance(source, RasterBand) and isinstance(cloud, Path):
-        write_cells(source, cloud, {"height": folder / CORRECTED})
-        with rasters.open_raster(source.path) as raster:
-            cell_m = cell_m or float(raster.res[0])
+        cells = RasterSource(source)
+        cell_m = cell_m or cells.cell_m
+        with (
+            cells, open_cloud(cloud) as corrected,
+            raster_writer(cells, corrected.header, {"height": folder / CORRECTED}) as append,
+        ):  # fmt: skip
+            for points in corrected.chunks():
+                append(points)
     if cell_m is None:
         cell_m = round_resolution(point_spacing_m(cloud, folder / SURFACE))
     plain = DsmOptions(resolution=cell_m, style=True, overwrite=True)
@@ -98,15 +103,13 @@ def _write_shaded(folder: Path) -> None:
     target, edge = folder / SHADED, int(HOLE_CELLS)
     high = limits_of(rasters.preview(folder / DEPTH)[0], "depth")[1]
     with ExitStack() as stack:
-        draft = stack.enter_context(temporary_output(target))
-        plain = stack.enter_context(scratch_folder(target)) / SHADED
         surface = stack.enter_context(rasters.open_raster(folder / SURFACE))
         depth = stack.enter_context(rasters.open_raster(folder / DEPTH))
         lattice, below = rasters.lattice_of(surface), rasters.lattice_of(depth)
         down, right = lattice.first_row - below.first_row, lattice.first_column - below.first_column
         bands = dict.fromkeys(("red", "green", "blue", "alpha"), "")
         plan = None if depth.crs is None else depth.crs.to_wkt()
-        with rasters.new_raster(plain, lattice, plan, bands, dtype="uint8", nodata=None) as out:
+        with rasters.new_cog(target, lattice, plan, bands, dtype="uint8", nodata=None) as out:
             for window in lattice.window.parts(BLOCK_CELLS):
                 wide = window.grown(edge)
                 height = rasters.read_within(surface, wide)
@@ -117,10 +120,7 @@ def _write_shaded(folder: Path) -> None:
                 deep = np.where(is_wet, level - height, deep)[edge:-edge, edge:-edge]
                 around = height[edge - 1 : 1 - edge, edge - 1 : 1 - edge]
                 light = hillshade(around, lattice.resolution_m)
-                colours = relief_colours(light, deep, high)
-                for number, band in enumerate(colours, start=1):
-                    rasters.write_part(out, band, window, number)
-        rasters.copy_as_cog(plain, draft)
+                rasters.write_bands(out, relief_colours(light, deep, high), window)
 
 
 def write_map(path: Path, run: RunFolder, corrected: Plain, compared: Plain) -> None:

@@ -133,8 +133,7 @@ def _write(
                 known = known.reshape(window.height, window.width)
                 tile[:-1, known] = np.clip(np.rint(colour), 0, most).T
                 tile[-1, known] = most * is_seen
-                for number, band in enumerate(tile, start=1):
-                    rasters.write_part(target, band, window, number)
+                rasters.write_bands(target, tile, window)
                 covered += int(is_seen.sum())
             done += window.height * window.width
             if progress is not None:

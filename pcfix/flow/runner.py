@@ -15,7 +15,7 @@ import signal
 import sys
 import time
 import warnings
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures import as_completed as completed
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -30,11 +30,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar, cast
 
 from pcfix import version
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
+from pcfix.flow.raster import raster_outputs, raster_writer
 from pcfix.io import files
 from pcfix.io.atomic import all_or_none
 from pcfix.io.files import write_bytes, write_text
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix, corrected_identity, las_writer
+from pcfix.io.rasters import check_tif
 from pcfix.io.tiles import Clouds, Tiles, band_of, check_one_file, inputs_of, open_cloud, tiles_of
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.libraries import optional_library
@@ -93,6 +95,7 @@ class FileTask:
     jobs: int | None = None
     progress: Progress | None = None  # called with (points done, points in all)
     started: float = field(default_factory=time.perf_counter)
+    rasters: Mapping[str, Path] = field(default_factory=dict)  # instead of a cloud
     # of one of many files: its points, the first as a row of all files, a checksum of all
     # that the output depends on, and the version that must process it
     points: int = 0
@@ -140,9 +143,14 @@ def run_command(
     the task and the statistics of all points; it refuses what cannot be right, else returns the
     result. `reads` are further inputs. With many files, `progress` is called after each.
     """
-    tiles = tiles_of(input)
+    targets, tiles = raster_outputs(name, input, output, options), tiles_of(input)
     if tiles is None:
-        task = file_task(cast("File", input), output, options, reads=reads, progress=progress)
+        check = check_tif if targets else check_cloud
+        task = file_task(
+            cast("File", input), output, options,
+            reads=reads, more=list(targets.values())[1:], check=check, progress=progress,
+        )  # fmt: skip
+        task = replace(task, rasters=targets)
         with threads(task.jobs), running(clouds={}), all_or_none():
             planned = plan(task)
             result: Result = stream(work, planned, task, partial(finish, planned, task))
@@ -209,7 +217,12 @@ def stream(work: Work, plan: Any, task: FileTask, finish: Callable[[Any], Any]) 
         # the index of a COPC file would be wrong
         evlrs = [one for one in source.evlrs if one.user_id != "copc"]
         last = evlrs, own.identity or corrected_identity(source), task.jobs
-        with las_writer(task.target, own.header, *last) as append, ThreadPoolExecutor(1) as writer:
+        output = (
+            raster_writer(source, own.header, task.rasters, task.progress)
+            if task.rasters
+            else las_writer(task.target, own.header, *last)
+        )
+        with output as append, ThreadPoolExecutor(1) as writer:
 
             def write(points: Chunk, result: Any) -> None:
                 append(own.apply(points, result))

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import Delaunay, QhullError
 
 from pcfix.grid.lattice import Lattice, Window
-from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.model import FloatArray, IntArray
 from pcfix.options.steps import DsmMethod
 from pcfix.running import current
 
@@ -75,29 +75,25 @@ _MIX = np.array([0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB], np
 
 
 def triangulated(
-    position: FloatArray, z: FloatArray, window: Window, widest: float, spacing: float,
-    wanted: BoolArray | None = None,
-) -> FloatArray:  # fmt: skip
+    position: FloatArray, z: FloatArray, window: Window, widest: float, spacing: float
+) -> FloatArray:
     """Return the height (m) of the triangle above each centre of a window; NaN outside all.
 
     `position`, shape (n, 2), are columns and rows, in cells from the top left corner of the raster,
-    of at least the points within `widest` of the window; `z`, shape (n,), their heights (m), or
-    several quantities, shape (k, n). Of several points at one place the mean is used. `widest` is
-    the diameter of the widest circle around a triangle and `spacing` a usual distance between
-    points, cells. The result has the shape of the window, after k if there is one. Only cells that
-    are `wanted`, of the shape of the window, are looked for; by default all.
+    of at least the points within `widest` of the window; `z`, shape (n,), their heights (m). Of
+    several points at one place the mean height is used. `widest` is the diameter of the widest
+    circle around a triangle and `spacing` a usual distance between points, cells.
     """
-    shape = window.height, window.width
-    out = np.full((*z.shape[:-1], *shape), np.nan)
+    out = np.full(window.height * window.width, np.nan)
     position, z = _one_a_place(position, z)
     moved = position + MOVED * spacing * _offsets(position)
-    row, column = np.nonzero(np.ones(shape, np.bool_) if wanted is None else wanted)
+    row, column = np.divmod(np.arange(out.size), window.width)
     centre = np.column_stack([column + window.column, row + window.row]) + 0.5
     origin = np.floor(moved.mean(axis=0)) if len(moved) else 0.0
     try:
         mesh = Delaunay(moved - origin)
     except (QhullError, ValueError):  # fewer than three points, or all on one line
-        return out
+        return out.reshape(window.height, window.width)
     found = mesh.find_simplex(centre - origin, tol=ON_EDGE)
     corners = np.sort(mesh.simplices[found], axis=1)
     # the radius of the circle through three points is a b c / 4 area
@@ -110,9 +106,9 @@ def triangulated(
     a, b, c = np.moveaxis(position[corners], 1, 0)
     area = _cross(b - a, c - a)
     s, u = _cross(centre - a, c - a) / area, _cross(b - a, centre - a) / area
-    i, j, k = np.moveaxis(z[..., corners], -1, 0)
-    out[..., row[inside], column[inside]] = i + s * (j - i) + u * (k - i)
-    return out
+    i, j, k = z[corners].T
+    out[inside] = i + s * (j - i) + u * (k - i)
+    return out.reshape(window.height, window.width)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -122,16 +118,16 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def _one_a_place(position: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return points sorted by column and row, each place once, with the mean of its heights."""
-    order = np.lexsort((*np.atleast_2d(z), position[:, 1], position[:, 0]))
-    position, z = position[order], z[..., order]
-    new = np.ones(len(order), bool)
+    order = np.lexsort((z, position[:, 1], position[:, 0]))
+    position, z = position[order], z[order]
+    new = np.ones(len(z), bool)
     new[1:] = (position[1:] != position[:-1]).any(axis=1)
     if new.all():
         return position, z
     first = np.flatnonzero(new)
-    n = np.diff(first, append=len(order))
-    low = z[..., first]
-    return position[first], low + np.add.reduceat(z - np.repeat(low, n, -1), first, -1) / n
+    n = np.diff(first, append=len(z))
+    mean = z[first] + np.add.reduceat(z - np.repeat(z[first], n), first) / n
+    return position[first], mean
 
 
 def _offsets(position: FloatArray) -> FloatArray:

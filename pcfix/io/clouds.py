@@ -174,7 +174,7 @@ def own_water(source: LasSource) -> WaterSurface | None:
     """Return the plane of the water surface that the cloud's own VLR names, if any."""
     with record_errors(source.path):
         ours = own_settings(source.vlrs)
-        plane = None if ours is None else ours["water_plane"]
+        plane = None if ours is None else ours.get("water_plane")
         return None if plane is None else WaterPlane(*map(float, plane))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError, bad_file
 from pcfix.grid.lattice import Lattice, Window
-from pcfix.io.atomic import is_full_disk, temporary_output
+from pcfix.io.atomic import is_full_disk, scratch_folder, temporary_output
 from pcfix.io.files import check_input, check_output, refusing
 from pcfix.libraries import analysis_library
 from pcfix.model import FloatArray
@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 NO_HEIGHT = -9999.0
 """Value of cells without a height; every program that reads GeoTIFF knows this one."""
+METRE = "metre"
+TO_95 = 1.959964
+"""Half-width of 95 % of a normal distribution, in standard deviations."""
 TILE = 256
 check_tif = partial(check_output, suffixes=(".tif", ".tiff"))
 """Return the path of a GeoTIFF that may be written."""
@@ -96,23 +99,28 @@ def read_onto(path: Path, lattice: Lattice) -> FloatArray:
 
 def filled_heights(source: DatasetReader) -> FloatArray:
     """Return the first band with its holes interpolated."""
+    height = read_masked(source)
+    if np.isnan(height).all():
+        raise bad_file(source.name, "raster.empty", "has no heights in its first band. Give a DSM.")
+    return filled(height, float(max(height.shape)))
+
+
+def filled(values: FloatArray, reach: float) -> FloatArray:
+    """Return a band whose holes are interpolated, up to `reach` cells from known values."""
     from rasterio.fill import fillnodata
 
-    height = read_masked(source)
-    known = np.isfinite(height)
-    if not known.any():
-        raise bad_file(source.name, "raster.empty", "has no heights in its first band. Give a DSM.")
+    known = np.isfinite(values)
     if known.all():
-        return height
-    reach = float(max(height.shape))
-    return np.asarray(fillnodata(np.where(known, height, 0.0), known, max_search_distance=reach))
+        return values
+    return np.where(known, values, fillnodata(values.copy(), known, max_search_distance=reach))
 
 
-def write_part(target: DatasetWriter, values: npt.NDArray[Any], window: Window, band: int) -> None:
-    """Write part of a band, shape (rows, columns); NaN becomes the raster's nodata."""
-    if np.issubdtype(values.dtype, np.floating):
-        values = np.where(np.isnan(values), target.nodata, values)
-    target.write(values.astype(target.dtypes[band - 1]), band, window=slices(window))
+def write_bands(target: DatasetWriter, bands: Iterable[npt.NDArray[Any]], window: Window) -> None:
+    """Write part of all bands, each of shape (rows, columns); NaN becomes the raster's nodata."""
+    for number, values in enumerate(bands, start=1):
+        if np.issubdtype(values.dtype, np.floating):
+            values = np.where(np.isnan(values), target.nodata, values)
+        target.write(values.astype(target.dtypes[number - 1]), number, window=slices(window))
 
 
 def slices(window: Window) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -132,7 +140,7 @@ def new_raster(
     tags: Mapping[str, str] | None = None,
     scale_offset: tuple[float, float] = (1.0, 0.0),
 ) -> Iterator[DatasetWriter]:
-    """Open a new tiled, compressed GeoTIFF for `write_part`.
+    """Open a new tiled, compressed GeoTIFF for `write_bands`.
 
     Its cells are those of `lattice`, which may be another raster. `bands` maps the description of
     each band to its unit; `dtype` and `nodata` are those of all bands, `tags` the metadata of the
@@ -165,6 +173,27 @@ def new_raster(
         if scale_offset != (1.0, 0.0):
             target.scales, target.offsets = ([one] * len(bands) for one in scale_offset)
         yield target
+
+
+@contextmanager
+def new_cog(
+    target: Path,
+    lattice: Lattice | DatasetReader,
+    crs: CRS | str | None,
+    bands: Mapping[str, str],
+    *,
+    resampling: str = "average",
+    **how: Any,
+) -> Iterator[DatasetWriter]:
+    """Open a new cloud optimised GeoTIFF (COG) for `write_bands`; see `new_raster`.
+
+    It is a copy of a plain one. `resampling` is for its overviews.
+    """
+    with temporary_output(target) as temporary, scratch_folder(target) as folder:
+        plain = folder / target.name
+        with new_raster(plain, lattice, crs, bands, **how) as out:
+            yield out
+        copy_as_cog(plain, temporary, resampling)
 
 
 @contextmanager

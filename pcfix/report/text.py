@@ -51,8 +51,6 @@ _CORRECTED: RowTable = (
     ("Submerged", "{submerged:,} points ({submerged:of points}), {corrected_words}", ""),
     ("", "{count:,} not corrected: {name} (not moved, withheld)", "*uncorrected"),
     _NO_SURFACE,
-    ("Raster", "{raster[cells_changed]:,} cells changed, {raster[cells_empty]:,} of them have no"
-     " height any more", "raster"),
     ("Depth", "{depth_m[min]:.2f} to {depth_m[max]:.2f} m, mean {depth_m[mean]:.2f} m", "depth_m"),
     ("Z shift", "mean {shift_z_m[mean]:.3f} m (5th to 95th percentile {shift_z_m[p5]:.3f} to"
      " {shift_z_m[p95]:.3f} m)", "shift_z_m"),

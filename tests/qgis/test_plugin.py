@@ -9,6 +9,7 @@ import subprocess
 import sys
 import types
 import zipfile
+from unittest import mock
 
 import pytest
 
@@ -68,29 +69,16 @@ def test_command_line(commands):
     assert words_of(commands["compare"], sections) == expected
 
 
-class Field:
-    """A field of a form, or a flag of one; it accepts everything."""
-
-    FlagAdvanced = Folder = File = Integer = Double = 0
-
-    def __init__(self, *given, **more):
-        self.given = given
-
-    def __getattr__(self, name):
-        return lambda *given: 0
-
-
 def test_raster_layer(commands, monkeypatch):
     """A raster layer of the project replaces the file of the cloud; one of the two is needed."""
-    core = types.ModuleType("qgis.core")
-    core.__getattr__ = lambda name: Field
-    core.QgsProcessingException = RuntimeError
-    config = types.ModuleType("processing.core.ProcessingConfig")
-    config.ProcessingConfig = types.SimpleNamespace(getSetting=lambda name: sys.executable)
-    config.Setting = Field
-    for module in (core, config, *map(types.ModuleType, ("qgis", "processing", "processing.core"))):
-        monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setattr(sys.modules["qgis"], "core", core, raising=False)
+    qgis = mock.MagicMock()
+    qgis.core.QgsProcessingException = RuntimeError
+    qgis.ProcessingConfig.getSetting.return_value = sys.executable
+    qgis.core.QgsProcessingProvider = qgis.core.QgsProcessingAlgorithm = type(
+        "Base", (), {"addParameter": lambda *given, **more: None, "addOutput": lambda *given: None}
+    )
+    for name in ("qgis", "processing", "processing.core", "processing.core.ProcessingConfig"):
+        monkeypatch.setitem(sys.modules, name, qgis)
     monkeypatch.delitem(sys.modules, "pcfix.qgis.provider", raising=False)
     provider = importlib.import_module("pcfix.qgis.provider")
     ran = []
@@ -102,10 +90,10 @@ def test_raster_layer(commands, monkeypatch):
         one._value = lambda field, parameters, context: parameters.get(field["name"], "")
         for chosen, file in ((layer, ""), (None, "cloud.laz")):
             one.parameterAsRasterLayer = lambda *given, chosen=chosen: chosen
-            one.processAlgorithm({"input": file, "cloud": file}, None, Field())
+            one.processAlgorithm({"input": file, "cloud": file}, None, mock.MagicMock())
             assert ran[-1][:2] == [name, "/survey/dsm.tif" if chosen else "cloud.laz"]
         with pytest.raises(RuntimeError, match="raster layer"):
-            one.processAlgorithm({}, None, Field())
+            one.processAlgorithm({}, None, mock.MagicMock())
     sys.modules.pop("pcfix.qgis.provider")
 
 
