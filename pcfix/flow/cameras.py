@@ -126,14 +126,16 @@ class CamerasReport:
 
 
 def sensors_of(cameras: Cameras, above_m: FloatArray | None) -> list[Plain]:
-    """Return the sensors of a block: lenses of one name, frame and projection.
+    """Return the sensors of a block.
 
-    ``lenses`` counts those that differ.
+    A sensor is a lens, or if nearly each image has its own, the lenses of one name, frame and
+    projection. ``lenses`` counts those that differ.
     """
     all_lenses, groups = cameras.lenses or (), dict[Any, list[int]]()
+    is_shared = 2 * len(set(all_lenses)) <= len(cameras)
     for row, lens in enumerate(all_lenses):
         kind = lens.sensor, lens.width, lens.height, lens.unit, lens.projection
-        groups.setdefault(kind, []).append(row)
+        groups.setdefault(lens if is_shared else kind, []).append(row)
     sensors = []
     for rows in groups.values():
         lenses = list(dict.fromkeys(all_lenses[row] for row in rows))
