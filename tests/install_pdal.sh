@@ -4,14 +4,14 @@
 #
 #   bash tests/install_pdal.sh FOLDER
 #
-# A PDAL of 2.5 or newer that is already there (pdal-config in PATH) is used, and only its Python
-# packages are built. Otherwise, on Debian 12, PDAL 2.2 comes from the packages of Debian 11,
-# which are unpacked into FOLDER/pdal beside the libraries that Debian 12 still has. Exit code 3
-# means that this machine has neither. The second call only checks. With the packages of Debian 11
-# go the oldest libraries that pyproject.toml allows (oldest.txt).
+# If PDAL 2.5 or newer is installed (pdal-config in PATH), only its Python packages are built.
+# Otherwise, on Debian 12, PDAL 2.2 comes from the packages of Debian 11, which are unpacked into
+# FOLDER/pdal and use the libraries that Debian 12 still has. Together with them, the oldest libraries
+# that pyproject.toml allows are installed (oldest.txt). Exit code 3 means that neither is possible on
+# this machine. The second call only checks.
 #
-# What goes with what: PDAL 2.2 needs pdal 3.1.2, pdal-plugins 1.0.2, Python 3.11 and numpy below
-# 2; PDAL from 2.7 on takes the newest of all.
+# Versions: PDAL 2.2 needs pdal 3.1.2, pdal-plugins 1.0.2, Python 3.11 and numpy below 2; PDAL 2.7 and
+# later work with the newest of all.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 mkdir -p "$1"
@@ -102,7 +102,7 @@ unpack_debian_11() (
 
 build_from_debian_11() {
     echo "no PDAL of 2.5 or newer here: unpacking PDAL 2.2 of Debian 11"
-    ( # beside samples/install.sh, which waits too
+    ( # samples/install.sh uses the same lock
         flock 9
         as_root apt-get update -qq
         as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends \
