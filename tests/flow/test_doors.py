@@ -136,11 +136,10 @@ def test_demo(tmp_path):
         for name in ("uncorrected", "default options", "with the view list"):
             if line.startswith(name):
                 rows.setdefault(name, []).append(float(line[30:].split()[6]))
-    before, factor, snell, consistent = (np.array(r) for r in rows.values())
+    before, snell, consistent = (np.array(r) for r in rows.values())
     assert (consistent < 0.5).all()  # GSD; the noise floor of these blocks is 0.2 and 0.4
     assert (consistent < snell).all()
-    assert (snell < 0.2 * factor).all()
-    assert (factor < before).all()
+    assert (snell < 0.2 * before).all()
     again = run_pcfix("demo", tmp_path / "demo", "--points", "1500")
     assert again.returncode == 1
 
@@ -157,7 +156,7 @@ def test_river(tmp_path):
         "--method", "consistent", "--camera-set", "all",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert done.stderr.count("\n") == 1  # the labels that occur twice
+    assert not done.stderr
     cloud = laspy.read(out)
     reference = np.genfromtxt(RIVER / "ref_out.csv", delimiter=",", names=True)[every]
     assert (cloud.classification == 40).all()

@@ -293,7 +293,7 @@ def test_compared(scene, tmp_path):
         compared(scene / "cloud" / name, scene / "lidar" / name, tmp_path / name) for name in names
     )
     assert one[1] == many[1]
-    assert len(one[1]) == 4
+    assert len(one[1]) == 3
     first, second = (figures(found) for found, _ in (one, many))
     for settings in (first["settings"], second["settings"]):
         del settings["also"]

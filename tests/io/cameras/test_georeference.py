@@ -349,8 +349,8 @@ def test_in_the_axes_of_a_map():
 @pytest.mark.parametrize(
     ("crs", "gnss_crs", "reason"),
     [
-        ("EPSG:4978", "EPSG:4326+5773", "without the grid us_nga_egm96_15.tif"),
-        ("EPSG:32654+5773", "EPSG:4979", "without the grid us_nga_egm96_15.tif"),
+        ("EPSG:4978", "EPSG:4326+5773", "us_nga_egm96_15.tif"),
+        ("EPSG:32654+5773", "EPSG:4979", "us_nga_egm96_15.tif"),
         ("EPSG:32654+5773", "EPSG:4326", "the CRS of the GNSS names no vertical datum"),
         ("EPSG:32654", "EPSG:4326+5773", "the CRS of the cameras names no vertical datum"),
     ],
