@@ -252,9 +252,10 @@ def land_sign(higher_m: FloatArray, gsd_m: float) -> Sign | None:
         return None
     bias, spread, sigma = _median_of(found)
     limit = max(SIGMAS * sigma, LAND_GSD * gsd_m)
+    side = "high" if bias > 0.0 else "low"
     words = (
-        f"land of the cloud is {bias:+.3f} m too high ({len(found):,} places, spread {spread:.3f}"
-        f" m, limit {limit:.3f} m)"
+        f"land of the cloud is {abs(bias):.3f} m too {side} ({len(found):,} places, spread"
+        f" {spread:.3f} m, limit {limit:.3f} m)"
     )
     figures = {"bias_m": bias, "spread_m": spread, "limit_m": limit, "places": float(len(found))}
     return Sign("heights of land", True if abs(bias) > limit else None, words, figures, abs(bias))

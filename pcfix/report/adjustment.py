@@ -57,7 +57,7 @@ def adjustment_sentence(d: Plain) -> str:
 def adjustment_text(d: Plain) -> str:
     """Return the summary of an adjustment as text."""
     lines = [_head(d), *_change_table(d).lines()]
-    lines += [f"  {label:<17} {words}" for label, words in _facts(d)]
+    lines += [wrapped(f"  {label:<29} ", words) for label, words in _facts(d)]
     if (surveyed := _survey_table(d)).rows:
         lines += surveyed.lines()[: 1 + MOST_LISTED]
     return "\n".join([*lines, *(wrapped("", f"Note: {note}") for note in all_notes(d))])
