@@ -12,12 +12,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.blocks import kept, row_numbers
 from pcfix.clean.neighbours import PIECE_ROWS, SLACK, Neighbours, make_tiles
 from pcfix.errors import bad_file
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import LEAST_NEIGHBOURS, CleanRules
-from pcfix.running import current
+from pcfix.running import current, kept, row_numbers
 from pcfix.water.checks import as_surface, checked_column, checked_points
 from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
 

@@ -331,7 +331,7 @@ def table() -> dict[str, str]:
     add("simulate", SIMULATE, kinds)
     reference = f"{RUN} --reference {{samples}}/scene/lidar.laz --resolution 2"
     commands["run.reference"] = reference
-    commands["run.again"] = f"{RUN} --quiet && {RUN} && run other --config out/run.json"
+    commands["run.again"] = f"{RUN} --quiet && {RUN}"
     mended = f"run {{inputs}}/free.las out --cameras {FREE}/sparse --water 0.37 {OFFSET}"
     commands["run.adjust"] = f"{mended} --gnss {FREE}/gnss.csv --adjust yes --jobs 1"
     commands["demo"] = "demo out --points 4000"
