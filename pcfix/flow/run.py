@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from pcfix.adjust.diagnosis import MOST_STATED_M
 from pcfix.compare.m3c2 import load_py4dgeo
-from pcfix.errors import PcfixError, PcfixWarning, SettingError, bad_file, plain
+from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError, bad_file, plain
 from pcfix.flow import outputs as results
 from pcfix.flow.adjust import FOLDER, MODELS, SUMMARY, adjust_into
 from pcfix.flow.clean import clean_file
@@ -169,8 +169,8 @@ def run(
         compared = step("compare", "Comparing", found, lambda _: _compare(adjusted))
     layers = out_dir / "map.gpkg"
     try:
-        vectors.check_layers(layers, overwrite=True)
-    except SettingError as error:
+        vectors.load_pyogrio()
+    except InputError as error:  # the extra vector is not installed
         say(f"{'map':<9} not written: {error}")
     else:
         draw = partial(results.write_map, layers, adjusted, corrected, compared)
