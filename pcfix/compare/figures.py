@@ -97,7 +97,7 @@ def figures_of(
         "depth_bins": [],
         "tvu": None,  # of all submerged places
     }  # fmt: skip
-    if rules.vertical:
+    if not rules.c2c_only:
         pairs = _pairs(match)
         vertical = both(lambda p: distribution_of(p.error_m, BINS, (), TAIL_PERCENT), pairs)
         by_depth |= _by_depth(match, pairs, notes)
