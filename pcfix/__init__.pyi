@@ -1,6 +1,5 @@
 """The public interface of pcfix: the home of each name."""
 
-from pcfix.clean.points import clean_points as clean_points
 from pcfix.errors import GeometryError as GeometryError
 from pcfix.errors import InputError as InputError
 from pcfix.errors import PcfixError as PcfixError
@@ -14,7 +13,6 @@ from pcfix.flow.correct import correct_file as correct_file
 from pcfix.flow.correct import correct_points as correct_points
 from pcfix.flow.dsm import grid_dsm as grid_dsm
 from pcfix.flow.label import label_file as label_file
-from pcfix.flow.label import label_points as label_points
 from pcfix.flow.ortho import ortho_photo as ortho_photo
 from pcfix.flow.photos import map_photos as map_photos
 from pcfix.flow.plan import plan_flight as plan_flight

@@ -8,13 +8,10 @@ import errno
 import math
 import re
 import sys
-import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, is_dataclass
 from types import SimpleNamespace
-from typing import Any, TypeVar
-
-_Found = TypeVar("_Found")
+from typing import Any
 
 
 class CodedError(Exception):
@@ -127,18 +124,6 @@ def refusal(error: Exception) -> str:
     """Describe in words why the system refused a file."""
     words = getattr(error, "strerror", None) or str(error).strip().rstrip(".")
     return _REFUSALS.get(getattr(error, "errno", None) or 0, f"cannot be read ({words})")
-
-
-def shown_once(read: Callable[[], _Found], notes: Callable[[_Found], Iterable[object]]) -> _Found:
-    """Call a function, and show only the warnings that are not among the notes of its result."""
-    with warnings.catch_warnings(record=True) as shown:
-        warnings.simplefilter("always", PcfixWarning)
-        found = read()
-    known = {str(note) for note in notes(found)}
-    for one in shown:
-        if str(one.message) not in known:
-            warnings.warn(one.message, one.category, stacklevel=3)
-    return found
 
 
 def show_warning(

@@ -29,8 +29,8 @@ _Value = TypeVar("_Value")
 _Result = TypeVar("_Result")
 
 KERNEL_SOURCES = (
-    "kernels.py", "model.py", "io/ply.py", "adjust/*.py", "clean/*.py", "compare/*.py", "grid/*.py",
-    "label/*.py", "lens/*.py", "port/*.py", "refract/**/*.py", "water/*.py",
+    "kernels.py", "model.py", "io/ply.py", "adjust/*.py", "lens/*.py", "port/*.py", "refract/*.py",
+    "water/*.py",
 )  # fmt: skip
 """Files with kernels, and those whose constants are compiled into them."""
 MOST_CACHES = 5

@@ -3,6 +3,7 @@
 import ctypes
 import importlib
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +25,8 @@ def optional_library(name: str, extra: str, who: str) -> Any:
         ) from error  # fmt: skip
 
 
-def analysis_library(name: str) -> Any:
-    """Import a library of the extra ``analysis``."""
-    return optional_library(name, "analysis", "This")
-
-
-def photo_library(name: str) -> Any:
-    """Import a library of the extra ``photos``."""
-    return optional_library(name, "photos", "Work on photographs")
+analysis_library = partial(optional_library, extra="analysis", who="This")
+photo_library = partial(optional_library, extra="photos", who="Work on photographs")
 
 
 def load_open3d(part: str = "open3d") -> Any:

@@ -2,6 +2,9 @@
 
 `running` sets them, as one value `Run`, for the current thread. So no kernel or search needs them
 as arguments. No result depends on them. Other threads start with the defaults.
+
+Arrays larger than memory are stored in files, and processed in blocks of rows in the order of the
+file. So results depend neither on tiles nor on threads. An array of one block is plain numpy.
 """
 
 from __future__ import annotations
@@ -19,7 +22,8 @@ import numpy.typing as npt
 
 from pcfix.errors import SettingError
 
-Empty: TypeAlias = Callable[[tuple[int, ...], npt.DTypeLike], npt.NDArray[Any]]
+Array: TypeAlias = npt.NDArray[Any]
+Empty: TypeAlias = Callable[[tuple[int, ...], npt.DTypeLike], Array]
 """Creates an array with undefined values: `numpy.empty`, or an array on disk."""
 
 
@@ -89,3 +93,97 @@ def threads(jobs: int | None) -> Iterator[None]:
         )
     with running(threads=jobs or current().threads):
         yield
+
+
+# Large arrays
+
+ROWS = 1_000_000
+FEW_ROWS = 65_536
+"""Rows of a block whose intermediate arrays fit into the processor's cache."""
+LARGE = 2_000_000
+"""An array with more rows is stored on disk, if there is a folder for it."""
+
+
+def empty(shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64) -> Array:
+    """Return an array with undefined values, on disk if it is large."""
+    return current().empty(shape, dtype) if shape[0] > LARGE else np.empty(shape, dtype)
+
+
+def release() -> None:
+    """Free the memory of arrays on disk; they are read again when they are used."""
+    current().release()
+
+
+def blocks(count: int, most: int = ROWS) -> Iterator[slice]:
+    """Yield slices of all rows, of at most `most` each."""
+    for first in range(0, count, most):
+        yield slice(first, min(first + most, count))
+        release()
+
+
+def mapped(function: Callable[..., Any], *arrays: Array) -> Array:
+    """Apply a function that works row by row to arrays, (n, ...), block by block."""
+    count, result = len(arrays[0]), None
+    if count <= ROWS:
+        return np.asarray(function(*arrays))
+    for rows in blocks(count):
+        part = function(*(one[rows] for one in arrays))
+        if result is None:
+            result = empty((count, *part.shape[1:]), part.dtype)
+        result[rows] = part
+    return np.asarray(result)
+
+
+def kept(mask: Array, array: Array) -> Array:
+    """Return the rows of an array, (n, ...), where a mask, (n,), is true."""
+    count, done = int(np.count_nonzero(mask)), 0
+    if count == len(mask):
+        return array
+    result = empty((count, *array.shape[1:]), array.dtype)
+    for rows in blocks(len(mask)):
+        part = array[rows][mask[rows]]
+        result[done : done + len(part)] = part
+        done += len(part)
+    return result
+
+
+def bounds(points: Array) -> tuple[Array, Array]:
+    """Return the minimum and maximum of each column of points, (n, d), both of shape (d,)."""
+    ends = [
+        [(column.min(), column.max()) for column in points[rows].T] for rows in blocks(len(points))
+    ]
+    return np.min(ends, axis=0)[:, 0], np.max(ends, axis=0)[:, 1]
+
+
+def row_numbers(count: int) -> Array:
+    """Return 0 to count - 1."""
+    result = empty((count,), np.int64)
+    for rows in blocks(count):
+        result[rows] = np.arange(rows.start, rows.stop)
+    return result
+
+
+def grouped(number: Array, groups: int, *columns: Array) -> tuple[Array, list[Array]]:
+    """Sort columns, (n, ...), by the group number of their rows, (n,), in a stable order.
+
+    Returns
+    -------
+    start : array, shape (groups + 1,)
+        Group i has the rows ``start[i]`` to ``start[i + 1]`` of the sorted columns.
+    sorted : list of array
+    """
+    count = len(number)
+    counts = np.zeros(groups, np.int64)
+    for rows in blocks(count):
+        counts += np.bincount(number[rows], minlength=groups)
+    place = np.cumsum(counts) - counts
+    start = np.append(place, count)
+    result = [empty(one.shape, one.dtype) for one in columns]
+    for rows in blocks(count):
+        order = np.argsort(number[rows], kind="stable")
+        group = number[rows][order]
+        to = place[group] + np.arange(len(group)) - np.searchsorted(group, group)
+        for one, into in zip(columns, result, strict=True):
+            into[to] = one[rows][order]
+        place += np.bincount(group, minlength=groups)
+    return start, result

@@ -19,7 +19,6 @@ HOUSE = Path(__file__).parents[1] / "pcfix"
 FLOORS = (
     ("version", "errors", "qgis"),
     ("running",),
-    ("blocks",),
     ("libraries",),
     ("kernels",),
     ("options",),

@@ -16,9 +16,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from pcfix.blocks import blocks, bounds, empty, grouped, mapped, release, row_numbers
 from pcfix.model import FloatArray, IntArray
-from pcfix.running import current
+from pcfix.running import blocks, bounds, current, empty, grouped, mapped, release, row_numbers
 
 PIECE_ROWS = 65_536
 LEAF_POINTS = 32

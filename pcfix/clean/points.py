@@ -12,14 +12,12 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.blocks import kept, row_numbers
 from pcfix.clean.neighbours import PIECE_ROWS, SLACK, Neighbours, make_tiles
 from pcfix.errors import bad_file
-from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
+from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.options.steps import LEAST_NEIGHBOURS, CleanRules
-from pcfix.running import current
-from pcfix.water.checks import as_surface, checked_column, checked_points
-from pcfix.water.surface import SurfaceAbove, is_submerged, surface_above
+from pcfix.running import current, kept, row_numbers
+from pcfix.water.surface import SurfaceAbove, is_submerged
 
 ReasonArray = npt.NDArray[np.uint8]
 
@@ -153,72 +151,3 @@ def _pieces(
     for piece in tiles.pieces(PIECE_ROWS):
         yield near, row[tiles.row[piece]], tiles.xyz[piece]
         current().report(piece.stop - piece.start)
-
-
-def clean_points(
-    xyz: npt.ArrayLike,
-    *,
-    water: WaterSurface | float | npt.ArrayLike | None = None,
-    ray_count: npt.ArrayLike | None = None,
-    ray_miss_m: npt.ArrayLike | None = None,
-    incidence_deg: npt.ArrayLike | None = None,
-    used: npt.ArrayLike | None = None,
-    settings: CleanRules | None = None,
-) -> npt.NDArray[np.uint8]:
-    """Find the points that are noise, and the reasons.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Points, metres, world frame; corrected ones where the cloud was corrected.
-    water : WaterSurface, float, or array of shape (n,), optional
-        See `pcfix.correct_points`. Without it the points with rays are the submerged ones, and
-        without rays no point is tested against the bed.
-    ray_count : array, shape (n,), optional
-        Rays that were intersected, 0 for points that were not corrected. Without it no
-        intersection is weak.
-    ray_miss_m, incidence_deg : array, shape (n,), optional
-        Metres, degrees in air; see `pcfix.Correction`.
-    used : array of bool, shape (n,), optional
-        Points to test; the others are not neighbours of any. Default: all.
-    settings : CleanRules, optional
-        The thresholds.
-
-    Returns
-    -------
-    array of uint8, shape (n,)
-        Bits of `Reason`; 0 for a good point.
-
-    Examples
-    --------
-    A bed of 30 by 30 points, 2 m under the water, and one point 1 m above it:
-
-    >>> import numpy as np
-    >>> from pcfix.clean.points import Reason, clean_points
-    >>> from pcfix.options.steps import CleanRules
-    >>> x, y = (grid.ravel() / 4 for grid in np.mgrid[:30, :30])
-    >>> cloud = np.column_stack([x, y, -2 + 0.01 * np.sin(9 * x + 7 * y)])
-    >>> cloud[450, 2] += 1
-    >>> reasons = clean_points(cloud, water=0.0, settings=CleanRules(deviations=None))
-    >>> [(int(row), Reason(int(reasons[row])).name) for row in np.flatnonzero(reasons)]
-    [(450, 'FLOATING')]
-    """
-    points, rules = checked_points(xyz), settings or CleanRules()
-    n = len(points)
-    given = {"ray_count": ray_count, "ray_miss_m": ray_miss_m, "incidence_deg": incidence_deg}
-    rays = {
-        dimension: checked_column(name, values, (n,))
-        for dimension, (name, values) in zip(WEAK, given.items(), strict=True)
-        if values is not None
-    }
-    mask = np.ones(n, np.bool_)
-    if used is not None:
-        mask = checked_column("used", used, (n,)).astype(np.bool_)
-    above = None
-    if water is not None:
-        surface, heights = as_surface(water, n)
-        above = surface_above(surface, points, heights)
-    cloud = Cloud(np.empty((n, 3)), *(np.zeros(n, kind) for kind in (bool, bool, np.uint8)))
-    cloud.add(slice(n), points, mask, above, rays, rules)
-    flag_neighbours("xyz", cloud, rules)
-    return cloud.reasons

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.blocks import blocks, bounds, kept, mapped
 from pcfix.clean.neighbours import nearest_distance, spacing_m
 from pcfix.compare.m3c2 import m3c2_distances
 from pcfix.compare.match import Match, heights_at, mean_spacing_m
 from pcfix.compare.statistics import binned, distribution_of, fit_line, statistics_of, tvu_of
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, plain
 from pcfix.model import FloatArray
+from pcfix.running import blocks, bounds, kept, mapped
 from pcfix.sums import Figures
 
 
@@ -97,7 +97,7 @@ def figures_of(
         "depth_bins": [],
         "tvu": None,  # of all submerged places
     }  # fmt: skip
-    if rules.vertical:
+    if not rules.c2c_only:
         pairs = _pairs(match)
         vertical = both(lambda p: distribution_of(p.error_m, BINS, (), TAIL_PERCENT), pairs)
         by_depth |= _by_depth(match, pairs, notes)

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.blocks import blocks, bounds, empty, kept, mapped
 from pcfix.clean.neighbours import nearest_of
 from pcfix.errors import GeometryError, SettingError, bad_file
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import CompareRules
+from pcfix.running import blocks, bounds, empty, kept, mapped
 
 GAP_SPACINGS, MIN_GAP_M = 5.0, 1.0
 """A point counts up to this distance outside the other cloud, unless the user sets it."""

@@ -7,10 +7,10 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from pcfix.blocks import blocks, grouped, mapped
 from pcfix.errors import SettingError
 from pcfix.model import FloatArray
 from pcfix.refract.tally import share_of_orders, within_orders
+from pcfix.running import blocks, grouped, mapped
 from pcfix.sums import Figures
 
 PERCENTILES = (5, 25, 50, 75, 95)

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.blocks import release
 from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.photos import check_kind, finished, photo_of, read_heights
@@ -29,7 +28,7 @@ from pcfix.options.steps import CalmOptions
 from pcfix.photos.calm import LEAST_CORNERS, corners_in, covered, laid, median_of, register
 from pcfix.photos.mapping import Photo
 from pcfix.photos.waves import Nodes, View, displacements, fit_waves, nodes_of, slopes_of
-from pcfix.running import threads
+from pcfix.running import release, threads
 from pcfix.sums import Figures
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above

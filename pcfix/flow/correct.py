@@ -290,7 +290,7 @@ def correct_points(
         none.
     water : WaterSurface, float, or array of shape (n,)
         The water surface (see `pcfix.read_water`), its level in metres, or its height above
-        each point, NaN for land (`pcfix.label_points` finds it) and where it is unknown.
+        each point, NaN for land and where it is unknown.
     options : RefractionOptions, optional
         Or its attributes as keywords, as of ``pcfix correct``: index, method, max_angle (degrees
         from the surface normal), camera_set, matcher, depth_factor, sigma_image and the other

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.blocks import bounds, empty, release
 from pcfix.clean.neighbours import Tiles as PointTiles
 from pcfix.clean.neighbours import make_tiles, spacing_m
 from pcfix.errors import bad_file
@@ -36,6 +35,7 @@ from pcfix.io.tiles import CloudFiles, Clouds, cloud_of, inputs_of, open_cloud
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, FloatArray
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules
+from pcfix.running import bounds, empty, release
 from pcfix.sums import Figures
 from pcfix.version import __version__
 

@@ -4,95 +4,28 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import astuple, dataclass
-from os import PathLike
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import PcfixWarning
-from pcfix.flow.inputs import labelling_of, mask_of, paths_in
+from pcfix.flow.inputs import labelling_of, paths_in
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
-from pcfix.flow.surfaces import (
-    CloudView,
-    Points,
-    corners,
-    find_surface,
-    parts_of,
-    points_of,
-    view_of,
-)
+from pcfix.flow.surfaces import CloudView, Points, find_surface, parts_of, points_of, view_of
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header
 from pcfix.io.tiles import Clouds
-from pcfix.label.labelling import LabelCounts, Labelling, Part, WaterMask
+from pcfix.label.labelling import LabelCounts, Labelling
 from pcfix.model import WaterPlane, WaterSurface
 from pcfix.options.correct import LabelOptions, StageLabelOptions
 from pcfix.options.declare import File, taken
-from pcfix.options.shared import LandRules
 from pcfix.sums import Figures
 from pcfix.version import __version__
-from pcfix.water.checks import (
-    as_surface,
-    check_submerged,
-    check_tilt,
-    checked_column,
-    checked_points,
-)
-from pcfix.water.surface import surface_above
+from pcfix.water.checks import check_submerged, check_tilt
 
 Classes = npt.NDArray[np.uint8]
-
-
-def label_points(
-    xyz: npt.ArrayLike,
-    water: WaterSurface | float | npt.ArrayLike,
-    *,
-    classes: npt.ArrayLike | None = None,
-    water_mask: WaterMask | File | None = None,
-    crs: str | None = None,
-    options: LandRules | None = None,
-    **keywords: Any,
-) -> Classes:
-    """Return the classes of points, 40 where they are submerged.
-
-    Parameters
-    ----------
-    xyz : array, shape (n, 3)
-        Points, metres, world frame.
-    water : WaterSurface, float, or array of shape (n,)
-        See `pcfix.correct_points`.
-    classes : array of uint8, shape (n,), optional
-        Their classes. Default: 0, never classified.
-    water_mask : WaterMask or path, optional
-        See `label_file`.
-    crs : str, optional
-        CRS of the points, for a mask from a file.
-    options : LandRules, optional
-        Or its attributes as keywords: connected, least_pool and respect_classes.
-
-    Returns
-    -------
-    array of uint8, shape (n,)
-
-    Examples
-    --------
-    >>> from pcfix.flow.label import label_points
-    >>> label_points([[0, 0, 1.0], [5, 0, -1.0]], 0.0).tolist()
-    [0, 40]
-    """
-    rules = taken(LandRules, options, keywords, "label_points")
-    points = checked_points(xyz)
-    given = np.zeros(len(points), np.uint8)
-    if classes is not None:
-        given = checked_column("classes", classes, given.shape).astype(np.uint8)
-    surface, heights = as_surface(water, len(points))
-    if water_mask is None or isinstance(water_mask, str | PathLike):
-        water_mask = mask_of(water_mask, crs)
-    part = Part(points, surface_above(surface, points, heights), given)
-    labelling = Labelling(rules, water_mask).scanned([part], *corners(*points[:, :2].T))
-    return labelling.labels(part)[0]
 
 
 def label_file(

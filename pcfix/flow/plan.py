@@ -39,7 +39,6 @@ from pcfix.water.index import index_of
 
 POINTS = 400
 """Of each bed; they are also the tie points of the adjustments."""
-MOST_FOOTPRINTS = 400
 MOST_BASES, MOST_SPACINGS = 8, 4
 """Limits of the simulated block: farther inside, the geometry repeats."""
 FEWEST_SEEN = 50

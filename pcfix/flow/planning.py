@@ -12,23 +12,25 @@ from itertools import compress
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning, SettingError, coded
-from pcfix.flow.check_depths import fit_check_depths
+from pcfix.errors import GeometryError, PcfixWarning, SettingError, coded
 from pcfix.flow.correction import Plan, batch_of, transferred
 from pcfix.flow.inputs import CameraInputs, Inputs, labelling_of, original_ties, read_blocks
 from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
 from pcfix.io.las.source import CHUNK_POINTS
+from pcfix.io.tables import read_check_depths
 from pcfix.io.views import ViewMatch
-from pcfix.label.labelling import Labelling
+from pcfix.label.labelling import Labelling, Part
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, Views, WaterPlane
 from pcfix.options.correct import CorrectOptions
+from pcfix.options.declare import File
 from pcfix.refract import learning
 from pcfix.refract.batch import Batch, Learned, Survey, require_orientation, stacked
 from pcfix.refract.occlusion import Occluder, OccluderBuilder, wants_occlusion
 from pcfix.refract.patches import PATCH_WIDTH, Squares
 from pcfix.refract.reconstructions import hint_of
-from pcfix.refract.regression import DepthRegression
+from pcfix.refract.regression import LEAST_COUNT, DepthRegression, apparent_depths, fit_depths
 from pcfix.water.checks import check_above_water, check_tilt
+from pcfix.water.fit import FEWEST
 from pcfix.water.index import with_index
 from pcfix.water.surface import FoundSurface, surface_above
 
@@ -37,6 +39,8 @@ HEIGHT_M = 100.0
 BED_POINTS_A_M2 = 5.0
 FEWEST_BED_POINTS, MOST_BED_POINTS = 125_000, 1_000_000
 """Size of the sample of the cloud that the bed of the surroundings is estimated from."""
+LEAST_R2 = 0.5
+"""Smallest coefficient of determination of a regression that is used."""
 Chunks = Callable[[], Iterable[Points]]
 """The whole cloud, chunk by chunk, transferred to the adjusted cameras if there are any."""
 
@@ -167,6 +171,62 @@ def plan_correction(plan: Plan) -> Plan:
         plan = _with_type_of_list(plan, first)
     doubts = dict.fromkeys(note for one in plan.verdicts for note in one.warnings())
     return replace(plan, notes=(*plan.notes, *coded("cloud.reconstruction", doubts)))
+
+
+def fit_check_depths(path: File, parts: Iterable[Part]) -> DepthRegression:
+    """Fit true depth = a + b * apparent depth to the check depths of a file.
+
+    The parts are the entire apparent cloud, each point with the water above it; they are read once,
+    in bounded memory. Points of noise (classes 7 and 18) do not count.
+
+    Notes
+    -----
+    The apparent depth at a check depth is the median of the nearest submerged points, 3 to 16,
+    within four times the distance between neighbouring points there. Check depths with fewer are
+    excluded, with a note.
+    """
+    checks, notes = read_check_depths(path), list[str]()
+    apparent, level, nearest_m, radius = apparent_depths(checks.xy, parts)
+    covered = ~np.isnan(apparent)
+    if not covered.all():
+        first = int(np.argmin(covered))
+        notes.append(
+            f"{checks.where(first)}: {int((~covered).sum())} of {len(checks)} check depths have no"
+            f" bed around them: {FEWEST} submerged points are needed within {radius:.2f} m, the"
+            f" nearest is {nearest_m[first]:,.2f} m away. Check that they have the cloud's CRS and"
+            " are in the water."
+        )
+        if covered.sum() < LEAST_COUNT:
+            raise GeometryError("check_depths.no_bed", notes[0], covered=int(covered.sum()))
+    rows = np.flatnonzero(covered)
+    true = np.asarray(checks.value_m[rows])
+    if checks.are_heights:  # they are subtracted from the water above them
+        true = level[rows] - true
+        above = np.flatnonzero(true < 0.0)
+        if len(above):
+            first = int(rows[above[0]])
+            raise GeometryError(
+                "check_depths.above_water",
+                f"{checks.where(first)}: the height {checks.value_m[first]:.2f} m is above the"
+                f" water, {level[first]:.2f} m there ({len(above)} of {len(rows)} are). Give"
+                " heights of the bed in the cloud's vertical datum, or depths in a column depth.",
+                height_m=float(checks.value_m[first]),
+                count=len(above),
+            )
+    try:
+        found = fit_depths(apparent[rows], true)
+    except GeometryError as error:
+        raise GeometryError(error.code, f"{checks.name}: {error}", **error.values) from error
+    if found.r2 < LEAST_R2:
+        raise GeometryError(
+            "check_depths.low_r2",
+            f"{checks.name}: r2 {found.r2:.3f} of the regression over {found.count} check depths is"
+            f" below {LEAST_R2:g}. Check their CRS and the water level.",
+            r2=found.r2,
+            least=LEAST_R2,
+        )
+    notes += found.notes
+    return replace(found, notes=tuple(notes))
 
 
 def _with_pose_errors(plan: Plan) -> Plan:

@@ -50,17 +50,10 @@ class Plausible(NamedTuple):
     doubts: tuple[PcfixWarning, ...] = ()  # tests that were not
     unchecked: tuple[str, ...] = ()  # what could not be tested
 
-    def __str__(self) -> str:
-        """Return a line that claims no more than was tested."""
-        found = "cameras and cloud match" if self.fits else "nothing was tested"
-        found = "cameras and cloud may not match, see the warnings" if self.doubts else found
-        found += f"; tested: {', '.join(self.fits)}" if self.fits else ""
-        return found + (f"; not checked: {', '.join(self.unchecked)}" if self.unchecked else "")
-
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
         lists = {"fits": self.fits, "problems": self.doubts, "unchecked": self.unchecked}
-        return {"words": str(self), **{name: list(map(str, one)) for name, one in lists.items()}}
+        return {name: list(map(str, one)) for name, one in lists.items()}
 
 
 @dataclass(frozen=True)

@@ -174,7 +174,7 @@ def _reconstruct(
 def _difference(block: PhotoBlock, cloud: Path, dsm: Path, before: Path) -> Figures:
     """Return by how much the DSM of a round differs from that before, under water."""
     raster = dsm.with_name("difference.tif")
-    write_dod(dsm, before, raster, overwrite=True)  # an error if they do not overlap
+    write_dod(dsm, before, raster)  # an error if they do not overlap
     with open_raster(raster) as source, open_raster(dsm) as heights:
         change, z, transform = read_masked(source), read_masked(heights), source.transform
     row, column = np.nonzero(np.isfinite(change))

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from pcfix.adjust.diagnosis import MOST_STATED_M
 from pcfix.compare.m3c2 import load_py4dgeo
-from pcfix.errors import PcfixError, PcfixWarning, SettingError, bad_file, plain
-from pcfix.flow import maps
+from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError, bad_file, plain
+from pcfix.flow import outputs as results
 from pcfix.flow.adjust import FOLDER, MODELS, SUMMARY, adjust_into
 from pcfix.flow.clean import clean_file
 from pcfix.flow.compare import compare_clouds
@@ -25,7 +25,7 @@ from pcfix.flow.correct import correct_file
 from pcfix.flow.diagnosis import diagnose_inputs, has_datum
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.report import DIFFERENCE, PAGE, report_run
+from pcfix.flow.outputs import DIFFERENCE, PAGE, SECTIONS, report_run
 from pcfix.flow.run_folder import SURFACE, Record, RunFolder, finished_steps
 from pcfix.flow.runner import Bar, Progress, check_folder, no_bar
 from pcfix.flow.surfaces import view_of
@@ -157,10 +157,10 @@ def run(
     )  # fmt: skip
     errors = corrected["uncertainty"] is not None
     cells = isinstance(adjusted.source, RasterBand)
-    outputs = maps.raster_files(out_dir, errors=errors, cells=cells)
+    outputs = results.raster_files(out_dir, errors=errors, cells=cells)
     step(
         "dsm", "Gridding", outputs[0],
-        lambda progress: maps.write_rasters(adjusted, errors=errors, progress=progress), outputs,
+        lambda progress: results.write_rasters(adjusted, errors=errors, progress=progress), outputs,
         lambda result: f", cells of {result['resolution_m']:g} m",
     )  # fmt: skip
     compared: Plain = {}
@@ -169,11 +169,11 @@ def run(
         compared = step("compare", "Comparing", found, lambda _: _compare(adjusted))
     layers = out_dir / "map.gpkg"
     try:
-        vectors.check_layers(layers, overwrite=True)
-    except SettingError as error:
+        vectors.load_pyogrio()
+    except InputError as error:  # the extra vector is not installed
         say(f"{'map':<9} not written: {error}")
     else:
-        draw = partial(maps.write_map, layers, adjusted, corrected, compared)
+        draw = partial(results.write_map, layers, adjusted, corrected, compared)
         step("map", "Drawing the map", layers, lambda _: draw())
     step(
         "report", "Writing the report", out_dir / PAGE,
@@ -324,7 +324,7 @@ def _compare(run: RunFolder) -> Plain:
     """Compare the cleaned cloud with the reference, and write a raster of differences."""
     folder = run.folder / COMPARED
     result = compare_clouds(
-        run.cloud("cleaned"), run.reference, out_dir=folder, sections=maps.SECTIONS, overwrite=True,
+        run.cloud("cleaned"), run.reference, out_dir=folder, sections=SECTIONS, overwrite=True,
         **vars(run.options.part(DistanceOptions)),
     )  # fmt: skip
     if run.has_surface:
@@ -335,7 +335,7 @@ def _compare(run: RunFolder) -> Plain:
             with warnings.catch_warnings(action="ignore", category=PcfixWarning):
                 grid_dsm(run.reference, heights, resolution=run.resolution_m, overwrite=True)
         difference = run.folder / DIFFERENCE
-        rasters.write_dod(run.folder / SURFACE, heights, difference, overwrite=True)
+        rasters.write_dod(run.folder / SURFACE, heights, difference)
     sections = [
         {"distance_m": one.distance_m, "heights_m": one.heights_m} for one in result.sections
     ]
@@ -376,12 +376,12 @@ class RunResults:
     @property
     def depth(self) -> DataArray:
         """Depth of the bed, shape (y, x), metres below the water, positive down; NaN on land."""
-        return rasters.open_array(self._file(maps.DEPTH))
+        return rasters.open_array(self._file(results.DEPTH))
 
     @property
     def bed(self) -> DataArray:
         """Heights of the bed, shape (y, x), metres; NaN on land."""
-        return rasters.open_array(self._file(maps.BED))
+        return rasters.open_array(self._file(results.BED))
 
     @property
     def surface(self) -> DataArray:
@@ -391,7 +391,7 @@ class RunResults:
     @property
     def uncertainty(self) -> DataArray:
         """Vertical uncertainty of the bed at 95 %, shape (y, x), metres, predicted."""
-        return rasters.open_array(self._file(maps.UNCERTAINTY))
+        return rasters.open_array(self._file(results.UNCERTAINTY))
 
     def layer(self, name: str) -> GeoDataFrame:
         """Return a layer of ``map.gpkg``: depth_contours, waterline, corrected_area, cameras ..."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import plain, shown_once
+from pcfix.errors import PcfixWarning, plain
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import find_surface, sample_of, view_of
 from pcfix.io.files import check_input
@@ -50,7 +51,12 @@ def check_water(
     inputs = [] if cloud is None else [cloud]
     check_summary(given, inputs)
     view = None if cloud is None else view_of(check_input(cloud))
-    found = shown_once(lambda: find_surface(spec, given, view), lambda found: found.notes)
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always", PcfixWarning)
+        found = find_surface(spec, given, view)
+    for one in shown:
+        if str(one.message) not in found.notes:  # those are printed with the summary
+            warnings.warn(one.message, one.category, stacklevel=2)
     below, unknown = None, None
     if view is not None and not isinstance(found.surface, WaterDimension):
         sample = sample_of(view, SAMPLE_POINTS).xyz

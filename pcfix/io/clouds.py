@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.blocks import FEW_ROWS, blocks, empty, kept, mapped, release
 from pcfix.compare.match import Reference, SurveyCloud
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.crs import is_same, parts
@@ -34,6 +33,7 @@ from pcfix.model import (
     WaterPlane,
     WaterSurface,
 )
+from pcfix.running import FEW_ROWS, blocks, empty, kept, mapped, release
 
 if TYPE_CHECKING:
     from pyproj import CRS

@@ -248,7 +248,7 @@ def run_logged(words: list[str], log: Path) -> tuple[int, list[str]]:
 def scratch_arrays(target: Path) -> Iterator[Empty]:
     """Give a maker of arrays on the disk of a target, which are gone when the block ends.
 
-    Within the block the large arrays of `pcfix.blocks` are made this way too. Their files have no
+    Within the block the large arrays of `pcfix.running` are made this way too. Their files have no
     name, so that nothing stays when the process is killed, and the disk gets its space back as soon
     as an array is no longer used.
     """

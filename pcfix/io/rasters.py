@@ -253,8 +253,8 @@ def copy_as_cog(source: Path, target: Path, resampling: str = "average") -> None
         )  # fmt: skip
 
 
-def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = False) -> int:
-    """Write the first band of one raster minus that of another, metres, and count its cells.
+def write_dod(dsm: Path, reference: Path, output: Path) -> None:
+    """Write the first band of one raster minus that of another, metres; replace an older file.
 
     The output is a GeoTIFF of one band, float32, with the cells and the CRS of `dsm`; -9999 where
     either has no height. If the cells of the reference differ, it is resampled (bilinear).
@@ -262,7 +262,7 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
     from rasterio.enums import Resampling
     from rasterio.vrt import WarpedVRT
 
-    target = check_tif(output, overwrite=overwrite, inputs=[dsm, reference])
+    target = check_tif(output, overwrite=True, inputs=[dsm, reference])
     known = 0
     with open_raster(dsm) as one, open_raster(reference) as source:
         crs = source.crs or one.crs
@@ -281,7 +281,6 @@ def write_dod(dsm: Path, reference: Path, output: Path, *, overwrite: bool = Fal
                 sentence = f"{dsm} and {reference} have no cell in common. Check their CRS."
                 raise GeometryError("raster.no_overlap", sentence, dsm=dsm, reference=reference)
             add_overviews(temporary)
-    return known
 
 
 def open_array(path: Path) -> DataArray:

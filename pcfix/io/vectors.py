@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -302,12 +302,6 @@ class Layer(NamedTuple):
     geometries: Sequence[Any]
     values: dict[str, Any]
     style: str = ""
-
-
-def check_layers(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> None:
-    """Refuse what `write_layers` cannot write."""
-    check_output(path, overwrite=overwrite, inputs=inputs, suffixes=(".gpkg",))
-    load_pyogrio()
 
 
 def write_layers(

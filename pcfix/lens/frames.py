@@ -227,10 +227,6 @@ def may_hold(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: 
     return True
 
 
-BORDER_POINTS = 8
-"""Points on each side of a footprint, enough to show the curve of a distorted frame."""
-
-
 def cameras_in_sight(xyz: FloatArray, cameras: Cameras, views: Views | None = None) -> IntArray:
     """Return how many cameras have each point, (n, 3), in their frame; occlusion is ignored.
 
@@ -260,15 +256,3 @@ def _count(
         for at in range(first, last):
             c = camera[at] if start.size else at
             counts[i] += holds(frames, c, minus(row_of(centres, c), row_of(xyz, i)))
-
-
-def footprint(cameras: Cameras, row: int, height_m: float) -> FloatArray:
-    """Return the border of a frame on a level (world Z), shape (p, 2); NaN above the horizon."""
-    if cameras.rotations is None or cameras.lenses is None:
-        return np.zeros((0, 2))
-    lens = cameras.lenses[row]
-    rays = unproject(lens, _border(lens, BORDER_POINTS)[:-1]) @ cameras.rotations[row]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        reach = (height_m - cameras.centres[row, 2]) / rays[:, 2]
-    reach = np.where(reach > 0.0, reach, np.nan)
-    return np.asarray(cameras.centres[row, :2] + reach[:, None] * rays[:, :2])

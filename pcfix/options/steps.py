@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from pcfix.errors import SettingError
 from pcfix.options.declare import File, OptionSet, numbers, option
@@ -126,12 +126,8 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
 
     @property
     def cell_m(self) -> float:
-        """The resolution; it must be known."""
-        if self.resolution is None:
-            raise SettingError(
-                "option.missing", "resolution is missing. Give the cell size in metres."
-            )
-        return self.resolution
+        """The resolution, which must be known."""
+        return cast(float, self.resolution)
 
     def check(self) -> None:
         """Check the rules between the value, the surface and the width of holes."""
@@ -252,11 +248,6 @@ class CompareRules(DistanceOptions, panel=Panel.FIGURES):
     """Number of automatic cross-sections, down the slope."""
     corridor: float = option(1.0, above=0)
     """Half-width of a cross-section. [m]"""
-
-    @property
-    def vertical(self) -> bool:
-        """Whether signed differences, and all that follows from them, are computed."""
-        return not self.c2c_only
 
 
 class CompareOptions(BandOption, OverwriteOption, SummaryOption, CompareRules, panel=Panel.OUTPUT):

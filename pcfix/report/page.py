@@ -21,7 +21,6 @@ import numpy as np
 
 from pcfix.grid.lattice import Lattice
 from pcfix.grid.maps import (
-    DEPTH,
     HEIGHT,
     NO_LIGHT,
     Extent,
@@ -39,7 +38,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-MOST_POINTS = 8000
 FIGURES = 4
 """Shown; the others are folded."""
 
@@ -57,11 +55,6 @@ def new_figure(
     if mosaic is not None:
         return figure, figure.subplot_mosaic(mosaic, **grid)
     return figure, figure.subplots(**grid)
-
-
-def legend_below(axes: Axes) -> None:
-    """Put the legend below the axes, where it covers nothing."""
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=3, frameon=False)
 
 
 def png_of(figure: Figure) -> bytes:
@@ -94,35 +87,12 @@ def map_figure(
     return figure
 
 
-def label_plan(axes: Axes, turned_deg: float = 30.0) -> None:
+def label_plan(axes: Axes) -> None:
     """Name the axes of a plan; equal scales, whole coordinates, turned so that they have room."""
     axes.set_aspect("equal")
     axes.ticklabel_format(style="plain", useOffset=False)
-    axes.tick_params(axis="x", labelrotation=turned_deg)
+    axes.tick_params(axis="x", labelrotation=30.0)
     axes.set(xlabel="East (m)", ylabel="North (m)")
-
-
-def draw_cloud(
-    figure: Figure, plan: Axes, xyz: FloatArray, level_m: float | None = None, **look: Any
-) -> FloatArray:
-    """Draw points of a cloud in plan; return those that are shown.
-
-    They are coloured by their apparent depths below a level, land grey, or else by their heights.
-    """
-    shown = xyz[:: max(1, len(xyz) // MOST_POINTS)]
-    if len(shown) == 0:
-        return shown
-    x, y, z = shown.T
-    wet = np.zeros(len(z), bool) if level_m is None else z < level_m
-    if level_m is not None and wet.any():
-        plan.plot(x[~wet], y[~wet], ".", color="0.75", markersize=2, markeredgewidth=0)
-        dots = plan.scatter(x[wet], y[wet], c=level_m - z[wet], s=2, cmap=DEPTH, vmin=0.0, **look)
-        label = "Apparent depth (m)"
-    else:
-        dots = plan.scatter(x, y, c=z, s=2, cmap=HEIGHT, **look)
-        label = "Height of the cloud (m)"
-    figure.colorbar(dots, ax=plan, label=label, shrink=0.8)
-    return shown
 
 
 @dataclass(frozen=True)

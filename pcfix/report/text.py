@@ -261,16 +261,11 @@ def share(part: int, whole: int) -> str:
     return f"{percent:.0f} %" if percent >= 10 or percent == 0 else f"{percent:.1f} %"
 
 
-def summary_text(summary: Summary) -> str:
-    """Return the summary of a correction."""
-    head = _Words(vars(summary)).written(_TABLES["correct"][0], {})
-    return aligned(head, summary_rows(summary), summary.notes)
-
-
 def text_of(command: str, found: Figures) -> str:
     """Return the summary of a command as text."""
+    head, rows = _TABLES[command]
     if isinstance(found, Summary):
-        return summary_text(found)
+        return aligned(_Words(vars(found)).written(head, {}), summary_rows(found), found.notes)
     s = found.as_dict()
     if command == "dsm":
         s |= {
@@ -283,7 +278,6 @@ def text_of(command: str, found: Figures) -> str:
         s |= {"count": len(s["rounds"]), "last": s["rounds"][-1]}
     elif command == "ortho":
         s["is_dry"] = s["water"] is None
-    head, rows = _TABLES[command]
     return aligned(_Words(s).written(head, {}), filled(rows, s))
 
 

@@ -45,7 +45,6 @@ class WaterProposal(FoundSurface):
     confidence: float  # 0 to 1, by how much the evidence exceeds what is refused
     evidence: dict[str, float]  # figures by name
     reasons: tuple[str, ...]  # the same in sentences
-    ground: FloatArray  # (c, 3), the cloud thinned to cells, metres, world frame
 
     def sigma_at(self, xy: FloatArray) -> FloatArray:
         """Return the standard error (m) of the height at places (m, 2), the same for all."""
@@ -257,7 +256,6 @@ def _judged(coarse: Scan) -> WaterProposal:
         confidence=float(min(1.0 - rival / total, 1.0 - math.exp(-total / (2.0 * least)))),
         evidence=evidence,
         reasons=tuple(sentences),
-        ground=samples.xyz + origin,
     )
 
 

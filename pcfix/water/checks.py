@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -54,18 +53,6 @@ def checked_points(xyz: npt.ArrayLike) -> FloatArray:
     return points
 
 
-def checked_column(name: str, values: npt.ArrayLike, shape: tuple[int, ...]) -> npt.NDArray[Any]:
-    """Return values as an array; SettingError ``option.shape`` if it has not this shape."""
-    column = np.asarray(values)
-    if column.shape != shape:
-        raise SettingError(
-            "option.shape",
-            f"{name} has the shape {column.shape}. It must be {shape}, one row per point.",
-            option=name, shape=column.shape,
-        )  # fmt: skip
-    return column
-
-
 def as_surface(
     water: WaterSurface | float | npt.ArrayLike, n: int
 ) -> tuple[WaterSurface, FloatArray | None]:
@@ -81,7 +68,10 @@ def as_surface(
         if not math.isfinite(level):
             raise SettingError("water.number", f"water '{level}' is not finite.", value=level)
         return WaterPlane(level), None
-    return WaterDimension("given heights"), checked_column("water", heights, (n,))
+    if heights.shape != (n,):
+        sentence = f"water has the shape {heights.shape}. It must be {(n,)}, one row per point."
+        raise SettingError("option.shape", sentence, option="water", shape=heights.shape)
+    return WaterDimension("given heights"), heights
 
 
 def check_above_water(

@@ -36,7 +36,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 import pcfix
-from pcfix.flow.check_depths import fit_check_depths
+from pcfix.flow.planning import fit_check_depths
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.label.labelling import Part
 from pcfix.options.correct import BudgetOptions

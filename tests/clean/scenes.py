@@ -6,6 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 import pcfix
+from pcfix.clean.points import Cloud, ReasonArray, flag_neighbours
+from pcfix.model import BoolArray, FloatArray, WaterPlane
+from pcfix.options.steps import CleanRules
+from pcfix.water.surface import surface_above
 
 POINTS, OUTLIERS = 60_000, 300
 
@@ -51,3 +55,16 @@ def spoilt_scene(points: int = POINTS, outliers: int = OUTLIERS) -> Spoilt:
         slice(points),
         *(slice(a, b) for a, b in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)),
     )
+
+
+def reasons_of(
+    xyz: FloatArray, *, water: float | None = None, used: BoolArray | None = None,
+    rules: CleanRules | None = None, **rays: FloatArray,
+) -> ReasonArray:  # fmt: skip
+    """Return the reasons of the tests for each point; `rays` are dimensions of a correction."""
+    n, rules = len(xyz), rules or CleanRules()
+    above = None if water is None else surface_above(WaterPlane(water), xyz)
+    cloud = Cloud(np.empty((n, 3)), *(np.zeros(n, kind) for kind in (bool, bool, np.uint8)))
+    cloud.add(slice(n), xyz, np.ones(n, bool) if used is None else used, above, rays, rules)
+    flag_neighbours("xyz", cloud, rules)
+    return cloud.reasons

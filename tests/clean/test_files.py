@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.clean.points import clean_points
 from pcfix.errors import InputError, SettingError
 from pcfix.flow.clean import clean_file
 from pcfix.io.las.source import read_xyz
 from pcfix.options.steps import CleanRules
-from tests.clean.scenes import spoilt_scene
+from tests.clean.scenes import reasons_of, spoilt_scene
 from tests.utils.clouds import (
     WATER_M,
     RawLas,
@@ -71,7 +70,7 @@ def test_nothing_is_lost(tmp_path: Path, point_format: int, suffix: str) -> None
     before, after = read_raw(source), read_raw(target)
     aside = _before(before)
     rules = CleanRules(**MANY)
-    noise = clean_points(read_xyz(source), water=WATER_M, used=~aside, settings=rules) != 0
+    noise = reasons_of(read_xyz(source), water=WATER_M, used=~aside, rules=rules) != 0
     assert 100 < result.noise == noise.sum()
     assert not (noise & aside).any()
     assert (after.version, after.point_format >= 6) == ((1, 4), True)
@@ -115,7 +114,7 @@ def test_record(tmp_path: Path) -> None:
     # noise in the input is not tested again, and no neighbour
     first, second = (read_raw(tmp_path / name) for name in ("out.las", "twice.las"))
     aside = _before(first)
-    again = clean_points(s.xyz.round(3), water=s.water_level_m, used=~aside) != 0
+    again = reasons_of(s.xyz.round(3), water=s.water_level_m, used=~aside) != 0
     assert np.array_equal(_before(second), aside | again)
 
 

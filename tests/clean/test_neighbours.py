@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from pcfix.clean.neighbours import Neighbours, make_tiles
-from pcfix.clean.points import Reason, clean_points
+from pcfix.clean.points import Reason
 from pcfix.libraries import load_open3d
 from pcfix.options.steps import CleanRules
-from tests.clean.scenes import spoilt_scene
+from tests.clean.scenes import reasons_of, spoilt_scene
 from tests.utils.nightly import mostly_nightly
 
 K = 12
@@ -50,9 +50,9 @@ def test_neighbours_of_all_pairs() -> None:
 def test_tiles_do_not_matter(points: int, monkeypatch: pytest.MonkeyPatch) -> None:
     s = spoilt_scene(FEW, OUTLIERS)
     settings = CleanRules(deviations=2.0, radius=1.0)
-    whole = clean_points(s.xyz, water=s.water_level_m, settings=settings)
+    whole = reasons_of(s.xyz, water=s.water_level_m, rules=settings)
     monkeypatch.setattr("pcfix.clean.neighbours.POINTS_PER_TILE", points)
-    cut = clean_points(s.xyz, water=s.water_level_m, settings=settings)
+    cut = reasons_of(s.xyz, water=s.water_level_m, rules=settings)
     assert np.array_equal(cut, whole)
     for reason in (Reason.STATISTICAL, Reason.RADIUS, Reason.BELOW_BED, Reason.FLOATING):
         assert (whole & reason).any()
@@ -75,6 +75,6 @@ def test_outliers_of_open3d(test: str, rules: dict, arguments: tuple) -> None:
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz))
     _, kept = getattr(cloud, f"remove_{test}_outlier")(*arguments)
     settings = CleanRules(**rules, below=None, floating=None)
-    found = clean_points(xyz, settings=settings)
+    found = reasons_of(xyz, rules=settings)
     assert np.array_equal(np.flatnonzero(found == 0), np.asarray(kept))
     assert len(kept) < len(xyz)

@@ -3,21 +3,21 @@
 import numpy as np
 import pytest
 
-from pcfix.clean.points import Reason, clean_points
+from pcfix.clean.points import Reason
 from pcfix.errors import SettingError
 from pcfix.options.steps import CleanRules
-from tests.clean.scenes import spoilt_scene
+from tests.clean.scenes import reasons_of, spoilt_scene
 
 
 def _scene_reasons(settings: CleanRules | None = None) -> np.ndarray:
     s = spoilt_scene()
-    return clean_points(
+    return reasons_of(
         s.xyz,
         water=s.water_level_m,
-        ray_count=s.ray_count,
-        ray_miss_m=s.ray_miss_m,
-        incidence_deg=s.incidence_deg,
-        settings=settings,
+        RayCount=s.ray_count,
+        RayMiss=s.ray_miss_m,
+        Incidence=s.incidence_deg,
+        rules=settings,
     )
 
 
@@ -45,7 +45,7 @@ def test_wall_and_rock_spared() -> None:
     face = rng.uniform((20.0, 0.0, -8.0), (20.01, 40.0, -5.0), (1200, 3))
     xyz = np.vstack([xyz, face])
     xyz[:, 2] += rng.normal(0.0, 0.03, len(xyz))
-    reasons = clean_points(xyz, water=0.0, settings=CleanRules(deviations=None))
+    reasons = reasons_of(xyz, water=0.0, rules=CleanRules(deviations=None))
     # the rock's crown of 1.5 m holds 70 points, more than twice a neighbourhood
     assert (reasons > 0).mean() < 1e-3
 
@@ -57,7 +57,7 @@ def test_land_spared() -> None:
     ground = rng.uniform((0, 0, 1.0), (30, 30, 1.0), (300, 3))
     bed = rng.uniform((40, 0, -2.1), (70, 30, -2.0), (9000, 3))
     xyz = np.vstack([canopy, ground, bed])
-    assert not clean_points(xyz, water=0.0, settings=CleanRules(deviations=None)).any()
+    assert not reasons_of(xyz, water=0.0, rules=CleanRules(deviations=None)).any()
 
 
 def test_weak_intersections() -> None:
@@ -68,10 +68,10 @@ def test_weak_intersections() -> None:
     rays[20], miss[21], angle[22] = 2, 0.51, 75.1
     rays[23], miss[23] = 2, 0.6
     only = CleanRules(deviations=None, below=None, floating=None)
-    found = clean_points(xyz, ray_count=rays, ray_miss_m=miss, incidence_deg=angle, settings=only)
+    found = reasons_of(xyz, RayCount=rays, RayMiss=miss, Incidence=angle, rules=only)
     weak = {20: 4, 21: 8, 22: 16, 23: 12}
     assert found.tolist() == [weak.get(i, 0) for i in range(50)]
-    assert clean_points(xyz, ray_count=rays, settings=only).tolist() == [
+    assert reasons_of(xyz, RayCount=rays, rules=only).tolist() == [
         4 if i in (20, 23) else 0 for i in range(50)
     ]
 

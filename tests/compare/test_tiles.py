@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 
-from pcfix import blocks
+from pcfix import running
 from pcfix.clean import neighbours
 from pcfix.clean.neighbours import nearest_distance
 from pcfix.compare import m3c2
@@ -22,8 +22,8 @@ from tests.utils.codes import refused
 def in_small_tiles(monkeypatch, points, rows=1_000_000, large=2_000_000):
     """Have tiles of so many points, blocks of so many rows, and larger arrays on disk."""
     monkeypatch.setattr(neighbours, "POINTS_PER_TILE", points)
-    monkeypatch.setattr(blocks, "ROWS", rows)
-    monkeypatch.setattr(blocks, "LARGE", large)
+    monkeypatch.setattr(running, "ROWS", rows)
+    monkeypatch.setattr(running, "LARGE", large)
 
 
 def bed(count, seed, lift_m=0.0):
@@ -148,7 +148,7 @@ def test_m3c2():
 
 def test_disk_after_errors(clouds, tmp_path, monkeypatch):
     """Arrays on disk are removed if the clouds do not overlap, or the disk is full."""
-    monkeypatch.setattr(blocks, "LARGE", 500)
+    monkeypatch.setattr(running, "LARGE", 500)
     far, summary = tmp_path / "far.las", tmp_path / "found.json"
     write_las(far, bed(1000, 3) + 5000.0)
     with refused("reference.no_overlap"):

@@ -18,7 +18,7 @@ NONE = {"water": WATER_M}
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     # the apparent depths of a random cloud have no bed, so that any fit must do
-    monkeypatch.setattr("pcfix.flow.check_depths.LEAST_R2", 0.0)
+    monkeypatch.setattr("pcfix.flow.planning.LEAST_R2", 0.0)
     write_cloud(tmp_path / "cloud.las", 7)
     cameras_csv(tmp_path / "cameras.csv", block())
     las = laspy.read(tmp_path / "cloud.las")

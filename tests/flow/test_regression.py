@@ -7,7 +7,7 @@ import pytest
 
 import pcfix
 from pcfix.errors import GeometryError
-from pcfix.flow.check_depths import fit_check_depths
+from pcfix.flow.planning import fit_check_depths
 from pcfix.label.labelling import Part
 from pcfix.model import Outcome, WaterPlane
 from pcfix.options.correct import ScienceOptions

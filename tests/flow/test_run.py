@@ -16,7 +16,7 @@ import rasterio
 import shapely
 
 import pcfix
-from pcfix.errors import SettingError
+from pcfix.errors import InputError
 from pcfix.flow.run_folder import STEPS, Record, RunFolder
 from pcfix.io import vectors
 from pcfix.io.rasters import values_at
@@ -355,7 +355,7 @@ def test_without_reference_and_vectors(tmp_path, monkeypatch):
     said: list[str] = []
 
     def lacking():
-        raise SettingError("library.missing", "Vector files need pyogrio.")
+        raise InputError("library.missing", "Vector files need pyogrio.")
 
     monkeypatch.setattr(vectors, "load_pyogrio", lacking)
     found = pcfix.run(

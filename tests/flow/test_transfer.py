@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import pcfix
 from pcfix.flow.inputs import Inputs, both_models
 from pcfix.model import Cameras, Outcome, Views
-from pcfix.report.text import summary_text
+from pcfix.report.text import text_of
 from tests.flow.test_adjust_shared import errors_gsd
 from tests.utils.beyond_frames import BEYOND_FRAMES
 from tests.utils.clouds import (
@@ -109,7 +109,7 @@ def test_land_and_bed(cloud, old):
     way = np.linalg.norm(similar(came) - came, axis=1)[carried]
     assert told.transfer["points"] == carried.sum()
     assert told.transfer["shift_m"]["rms"] == pytest.approx(np.sqrt((way**2).mean()), abs=1e-4)
-    assert f"({told.transfer['land']:,} on land)" in summary_text(told)
+    assert f"({told.transfer['land']:,} on land)" in text_of("correct", told)
 
 
 def test_unseen_points(cloud, old):

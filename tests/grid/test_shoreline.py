@@ -8,7 +8,7 @@ import pytest
 import shapely
 
 import pcfix
-from pcfix.flow.maps import waterline
+from pcfix.flow.outputs import waterline
 from pcfix.grid import shoreline
 from pcfix.grid.shoreline import NearWater
 from pcfix.io.scenes import write_scene

@@ -11,7 +11,7 @@ from pcfix.errors import GeometryError, SettingError
 from pcfix.options.correct import ScienceOptions
 from pcfix.port.methods import correct_through_port
 from pcfix.port.shapes import FlatPort
-from pcfix.report.text import summary_text
+from pcfix.report.text import text_of
 from tests.utils.clouds import write_las
 from tests.utils.port_scenes import simulate_port
 
@@ -52,7 +52,7 @@ def test_file(scene, cloud, tmp_path):
     report = json.loads((tmp_path / "run.json").read_text())
     assert report["settings"]["port"]["thickness_m"] == 0.008
     assert report["depth_m"] == {}
-    assert str(scene.port) in summary_text(told)
+    assert str(scene.port) in text_of("correct", told)
 
 
 def test_restored(scene, cloud, tmp_path):

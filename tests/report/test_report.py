@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.flow.report import read_maps, write_report
+from pcfix.flow.outputs import read_maps, write_report
 from pcfix.grid.lattice import Lattice
 from pcfix.report.page import Layer, Report, Table, Tile, render
 from tests.utils.browser import needs_browser, open_page

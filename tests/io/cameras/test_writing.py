@@ -18,7 +18,6 @@ from tests.utils.codes import refused
 from tests.utils.reprojection import bring_to
 
 FRAME = (1600.0, 1200.0, 810.0, 590.0)
-CENTRED = (1600.0, 1200.0, 800.0, 600.0)
 RAYS = np.random.default_rng(1).uniform([-0.4, -0.4, 1], [0.4, 0.4, 1], (50, 3))
 BENT = {"radial": (-0.1, 0.02, -0.003), "tangential": (1e-3, -2e-3)}
 FISH = {"projection": "equidistant"}

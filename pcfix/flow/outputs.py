@@ -1,7 +1,8 @@
-"""The rasters and vector layers that a run writes for a GIS."""
+"""What a run writes besides clouds: rasters and vector layers for a GIS, and the report page."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -11,16 +12,19 @@ from typing import Any
 import numpy as np
 import shapely
 
+from pcfix.flow.adjust import FOLDER, SUMMARY
 from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
 from pcfix.flow.raster import raster_writer
 from pcfix.flow.run_folder import SURFACE, RunFolder
 from pcfix.flow.runner import Progress
 from pcfix.flow.surfaces import file_points, view_of
-from pcfix.grid.lattice import Window, round_resolution
+from pcfix.grid.lattice import Lattice, Window, round_resolution
 from pcfix.grid.maps import contours, depth_interval, hillshade, relief_colours
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters
-from pcfix.io.las.source import RasterBand
+from pcfix.io.crs import crs_words
+from pcfix.io.files import read_json, sha256, write_bytes, write_text
+from pcfix.io.las.source import RasterBand, stated_crs
 from pcfix.io.raster_cloud import RasterSource
 from pcfix.io.styles import Symbol, limits_of, vector_style
 from pcfix.io.tables import read_check_depths
@@ -30,9 +34,13 @@ from pcfix.model import BATHYMETRIC_POINT, Cameras, FloatArray, WaterSurface
 from pcfix.options.correct import LEVEL_M
 from pcfix.options.declare import File
 from pcfix.options.steps import DsmOptions
+from pcfix.report.adjustment import adjustment_sentence
+from pcfix.report.comparison import evaluation
+from pcfix.report.page import Report, Table, extent_of, render
+from pcfix.report.run import RunMaps, run_report
+from pcfix.report.text import Plain, Summary
 from pcfix.water.surface import surface_above
 
-Plain = dict[str, Any]
 BED, DEPTH, UNCERTAINTY = "bed.tif", "depth.tif", "uncertainty.tif"
 COUNTS, SHADED, CORRECTED = "surface_counts.tif", "shaded.tif", "corrected.tif"
 HOLE_CELLS = 3.0
@@ -42,6 +50,28 @@ MOST_CELLS = 4_000_000
 SECTIONS = 3
 DARK, RED, GREY = (8, 48, 107), (203, 24, 29), (120, 120, 120)
 ORANGE, GREEN = (253, 141, 60), (35, 139, 69)
+DIFFERENCE = "compare/dod.tif"
+MOST_PAGE_CELLS = 300_000
+"""Of the map on the page, so that this stays below 4 MB."""
+PAGE = "report.html"
+RESULTS = {
+    "corrected.laz": "all points, the bed corrected",
+    "cleaned.laz": "all points, with outliers flagged as noise",
+    DEPTH: "depth below the water",
+    BED: "heights of the bed",
+    SURFACE: "heights of land and bed",
+    UNCERTAINTY: "vertical uncertainty at 95 %",
+    COUNTS: "number of points in each cell, and their spread",
+    SHADED: "coloured, shaded relief",
+    "map.gpkg": "contours, waterline and other layers for a GIS",
+    "run.json": "options and results of the run",
+    "compare/compare.json": "all figures of the comparison",
+    "compare/depth_bins.csv": "errors by depth",
+    DIFFERENCE: "cloud minus reference",
+    "compare/reference_dsm.tif": "heights of the reference",
+    "adjusted/report.html": "the adjustment of the cameras",
+}
+"""The results of a run by name; only existing ones are listed."""
 
 
 def raster_files(folder: Path, *, errors: bool, cells: bool) -> list[Path]:
@@ -221,3 +251,88 @@ def _checks(folder: Path, points: FloatArray, depths: File | None) -> list[Layer
         places = list(shapely.points(checks.xy))
         layers.append(Layer("check_depths", "Point", places, values, style))
     return layers
+
+
+# The report page
+
+
+def report_run(
+    run: RunFolder, inputs: list[Path], first: Plain, corrected: Plain, compared: Plain
+) -> Plain:
+    """Write the page of a run, and return what it says in short.
+
+    `first`, `corrected` and `compared` are the results of these steps.
+    """
+    more: Plain = {"pictures": [], "tables": [], "compared": compared.get("figures", {})}
+    if first["why"]:
+        how = "not adjusted:" if first["model"] is None else "adjusted first, as"
+        more["verdict"] = f" The cameras were {how} {first['why']}."
+    options, summary = run.options, Summary(**corrected)
+    names = [SURFACE, DEPTH, *([] if summary.uncertainty is None else [UNCERTAINTY])]
+    names += [DIFFERENCE] if compared and run.has_surface else []
+    with open_cloud(run.cloud("cleaned")) as source:
+        maps = read_maps(run.folder, names, *crs_words(stated_crs(source)))
+    if compared:
+        figures = evaluation(
+            compared["figures"], compared["sections"], maps.difference_m, extent_of(maps.lattice)
+        )
+        more |= {"pictures": figures[0], "tables": figures[1]}
+    if first["model"] is not None:
+        more["verdict"] += f" {adjustment_sentence(read_json(run.folder / FOLDER / SUMMARY))}."
+    page = write_report(
+        run.folder, summary, run.cameras, maps, inputs,
+        project=options.project or "", date=options.date or "", **more,
+    )  # fmt: skip
+    shown = (
+        f"{tile.title} {tile.tag}: " + ", ".join(f"{name} {value}" for name, value in tile.figures)
+        for tile in page.tiles
+        if tile.figures
+    )
+    return {"in_short": "; ".join(shown)}
+
+
+def write_report(
+    folder: Path, summary: Summary, cameras: Cameras, maps: RunMaps, inputs: Sequence[Path],
+    **more: Any,
+) -> Report:  # fmt: skip
+    """Write ``report.html`` and ``figures/*.png`` of a run, into its folder.
+
+    The page lists size and checksum of the files `inputs`; `more` goes to `run_report`.
+    """
+    rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in inputs]
+    table = Table("Input files", ["file", "bytes", "SHA-256"], rows)
+    files = []
+    for name, words in RESULTS.items():
+        tiles = folder / name.removesuffix(".laz")
+        if (folder / name).is_file():
+            files.append((name, words))
+        elif tiles.is_dir():  # of many files
+            files.append((f"{tiles.name}/", words))
+    sections = sorted(folder.glob("compare/section_*.csv"))
+    files += [(f"compare/{one.name}", "a cross-section") for one in sections]
+    report = run_report(summary, cameras, maps, inputs=[table], files=files, **more)
+    figures = folder / "figures"
+    figures.mkdir(exist_ok=True)
+    for picture in report.pictures:
+        write_bytes(figures / f"{picture.name}.png", picture.png, overwrite=True)
+    write_text(folder / PAGE, render(report), overwrite=True)
+    return report
+
+
+def read_maps(folder: Path, names: Sequence[str], crs: str = "", heights: str = "") -> RunMaps:
+    """Read rasters of a run by name, in cells of theirs, or of several where there are many.
+
+    `crs` and `heights` name the CRS of the cloud and its vertical datum.
+    """
+    with rasters.open_raster(folder / SURFACE) as source:
+        fine = rasters.lattice_of(source)
+    k = max(1, math.ceil(math.sqrt(fine.width * fine.height / MOST_PAGE_CELLS)))
+    column, row = fine.first_column // k, fine.first_row // k
+    width = (fine.first_column + fine.width - 1) // k - column + 1
+    height = (fine.first_row + fine.height - 1) // k - row + 1
+    lattice = Lattice(k * fine.resolution_m, column, row, width, height)
+    values = {name: rasters.read_onto(folder / name, lattice) for name in names}
+    uncertainty_m = values.get(UNCERTAINTY, np.full((height, width), np.nan))
+    return RunMaps(
+        lattice, values[SURFACE], values[DEPTH], uncertainty_m, values.get(DIFFERENCE), crs, heights
+    )
