@@ -141,8 +141,6 @@ def plan_correction(plan: Plan) -> Plan:
     The cloud is read a few times: for the surroundings of labels, the surface that occludes points,
     a sample that shows the reconstruction type, and the points of its view list.
     """
-    if plan.inputs.port is not None:
-        return plan
     inputs, view, transfer = plan.inputs, plan.view, plan.transfer
     water, first = plan.found.surface, None
     if plan.kind is not None or transfer is not None:
@@ -152,6 +150,8 @@ def plan_correction(plan: Plan) -> Plan:
             plan = replace(plan, match=plan.match.settled(first.xyz))
         if transfer is not None:
             transfer.check_models(first.xyz)
+    if inputs.port is not None:  # no water surface, and no reconstruction type to detect
+        return plan
     chunks = partial(_whole_cloud, plan)
     labelling = plan.labelling.scanned(parts_of(chunks(), water), view.low, view.high)
     plan = replace(plan, labelling=labelling)
