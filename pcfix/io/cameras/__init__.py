@@ -26,12 +26,6 @@ from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
 
-LISTS = (
-    *(".xml", ".csv", ".txt", ".json", ".geojson", ".psx", ".psz", ".xmlz", ".opf", ".out", ".nvm"),
-)
-"""Suffixes of possible camera files."""
-
-
 FORMATS = {
     "metashape": "Agisoft Metashape, PhotoScan",
     "pix4d": "Pix4D",
@@ -151,7 +145,7 @@ def _recognised(path: File, sensor: File | None, angles: Angles | None) -> tuple
     )
     if form := _format_of(source):
         return source, form
-    for file in sorted(p for p in where.glob("*") if p.suffix.lower() in LISTS and p.is_file()):
+    for file in sorted(filter(Path.is_file, where.glob("*"))):
         if form := _format_of(Source(file)):
             sentence = f"is a folder with a camera file ({FORMATS[form]}). Give {file}."
             raise bad_file(where, "cameras.folder", sentence, file=file.name)
@@ -173,7 +167,7 @@ def reader_of(form: str) -> Any:
 
 def _format_of(source: Source) -> str | None:
     """Return the first format that recognises the content."""
-    for form in () if unsupported.is_part(source) else FORMATS:
+    for form in () if unsupported.is_part(source.path) else FORMATS:
         with suppress(Exception), np.errstate(all="ignore"):
             if checks.recognises(reader_of(form), source):
                 return form

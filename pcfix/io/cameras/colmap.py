@@ -117,12 +117,6 @@ def read_place(folder: Path) -> tuple[FloatArray, str | None]:
         return offset, crs if crs is None or is_topocentric(crs) else checks.crs(path, crs)
 
 
-def place_text(offset_m: FloatArray, crs: str | None) -> str:
-    """Return the content of the file."""
-    place = {"crs": crs, "offset_m": [float(value) for value in offset_m], "written_by": WRITER}
-    return json.dumps(place, indent=2) + "\n"
-
-
 BY_NAME = {
     "SIMPLE_PINHOLE": LensModel("f cx cy"),
     "PINHOLE": LensModel("fx fy cx cy"),
@@ -340,10 +334,11 @@ def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = 
         posed.append(struct.pack("<I7dI", i + 1, *turns[i], *shifts[i], number_of[lens]))
         posed.append(label.encode() + b"\0" + struct.pack("<Q", len(seen[i])))
         posed.append(np.array(seen[i], OBSERVATION).tobytes())
+    place = {"crs": cameras.crs, "offset_m": offset.tolist(), "written_by": WRITER}
     contents = {
         "cameras.bin": struct.pack("<Q", len(number_of)) + b"".join(listed),
         "images.bin": struct.pack("<Q", len(cameras)) + b"".join(posed),
         "points3D.bin": struct.pack("<Q", len(points)) + b"".join(points),
-        FILE: place_text(offset, cameras.crs).encode(),
+        FILE: (json.dumps(place, indent=2) + "\n").encode(),
     }
     checks.write_new(target, contents)

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.errors import bad_file
+from pcfix.lens.imaging import project
 from pcfix.model import Lens, Projection
 
 SHAPES: Mapping[Projection, str] = {
@@ -27,7 +28,7 @@ SHAPES: Mapping[Projection, str] = {
 }
 LETTERS = {"radial": "k", "denominator": "d", "tangential": "p", "thin_prism": "s"}
 ROUNDING = 1e-11
-"""Of a principal point in the middle, and of equal focal lengths, in focal lengths."""
+"""Of the image of a lens that is written, in focal lengths."""
 
 
 class LensModel(NamedTuple):
@@ -64,32 +65,25 @@ def model_of(
 
     With `whole` the frame must be whole pixels. An `InputError` if there is no model for `path`.
     """
-    terms = {
+    values = {
         f"{letter}{i}": value
         for field, letter in LETTERS.items()
         for i, value in enumerate(getattr(lens, field), start=1)
     }
-    values = terms | {"f": lens.focal, "fx": lens.focal + lens.b1, "fy": lens.focal}
+    values |= {"f": lens.focal, "fx": lens.focal + lens.b1, "fy": lens.focal}
     values |= {"cx": lens.principal_x, "cy": lens.principal_y, "skew": lens.b2, "b3": lens.b3}
     values |= dict(zip(SHAPES.get(lens.projection, "").split(), lens.shape, strict=False))
-    is_bent = any(terms.values())
-    unlike_plain = {
-        "fx": abs(lens.b1) > ROUNDING * lens.focal,
-        "cx": abs(lens.principal_x - lens.width / 2.0) > ROUNDING * lens.focal,
-        "cy": abs(lens.principal_y - lens.height / 2.0) > ROUNDING * lens.focal,
-        "skew": lens.b2 != 0.0,
-        "b3": lens.b3 != 0.0,
-        "inverse": lens.inverse and is_bent,  # no model that is written has these two
-        "distortion_centre": is_bent and lens.distortion_centre != (0.0, 0.0),
-    }
-    needed = {name for name, value in (terms | unlike_plain).items() if value}
-    turns = any((*lens.tangential, *lens.thin_prism))
+    x, y = np.meshgrid(*(np.linspace(-0.5, 0.5, 8) * side for side in (lens.width, lens.height)))
+    rays = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, lens.focal)])
+    exact = project(lens, rays)
     fits = not whole or (lens.unit == "px" and lens.width % 1.0 == lens.height % 1.0 == 0.0)
-    for name in sorted(models, key=lambda one: models[one].names.count(" ")) if fits else ():
-        model, names = models[name], models[name].names.split()
-        is_alike = model.projection == lens.projection
-        if is_alike and needed <= {*names} and (model.in_turn == lens.in_turn or not turns):
-            return name, {one: values.get(one, 0.0) for one in names}
+    alike = [one for one in models if models[one].projection == lens.projection] if fits else []
+    for name in sorted(alike, key=lambda one: models[one].names.count(" ")):
+        given = {one: values.get(one, 0.0) for one in models[name].names.split()}
+        more = {"projection": lens.projection, "in_turn": models[name].in_turn}
+        held = project(lens_by_name(given, lens.width, lens.height, **more), rays)
+        if np.allclose(held, exact, rtol=0.0, atol=ROUNDING * lens.focal, equal_nan=True):
+            return name, given
     kind = f"{lens.sensor or 'of the images'} ({lens.projection} in {lens.unit})"
     sentence = f"the format cannot hold the lens {kind} exactly. Use another format."
     raise bad_file(path, "output.lens", sentence, lens=lens.sensor)

@@ -304,8 +304,8 @@ def _kind(sensor: Element) -> str:
 def _lens(path: Path, sensor: Element) -> Lens:
     """Return the adjusted calibration, else the initial one."""
     label, found = name_of(sensor), _calibration(sensor)
-    sizes = [one.find("resolution") for one in (found, sensor) if one is not None]
-    resolution = next((one for one in sizes if one is not None), None)
+    resolution = None if found is None else found.find("resolution")
+    resolution = sensor.find("resolution") if resolution is None else resolution
     if resolution is None or found is None:
         raise damaged(path, f"sensor {label} has no calibration or no size")
     sides = (resolution.get(side) for side in ("width", "height"))
@@ -356,20 +356,13 @@ def _gnss_positions(chunk: Document, images: list[Image]) -> GnssPositions | Non
         xyz = [number(path, where, of[axis]) if axis in of else np.nan for axis in "xyz"]
         sigma = spreads(path, where, of, start)
         places[i] = xyz, np.where(np.isfinite(xyz) & (sigma > 0.0), sigma, np.nan)
-    # the CRS of the cameras may differ from that of the chunk
-    own = text_of(chunk.root, "camera_reference")
-    crs = own or text_of(chunk.root, "reference") or "LOCAL"
+    references = text_of(chunk.root, "camera_reference"), text_of(chunk.root, "reference")
+    crs = next(filter(None, references), "LOCAL")
     found = checks.measured(range(len(images)), places, crs)
     if found is None:
         return None
-    if crs.upper() == "LOCAL" or is_local(parsed := parse_crs(crs, str(path))):
-        return replace(found, crs=LOCAL)
-    largest = np.nanmax(np.abs(found.xyz[:, :2]), axis=0)
-    if own or parsed.is_geographic or (largest > [180.0, 90.0]).any():
-        return found
-    sentence = "the camera positions are degrees in a CRS in metres; WGS 84 is assumed."
-    warn(path, "cameras.gnss_in_degrees", sentence)
-    return replace(found, crs="EPSG:4979")
+    is_plain = crs.upper() == "LOCAL" or is_local(parse_crs(crs, str(path)))
+    return replace(found, crs=LOCAL) if is_plain else found
 
 
 def spreads(path: Path, where: str, stated: dict[str, str], start: FloatArray) -> FloatArray:
@@ -419,22 +412,16 @@ def _tie_points(frame: Document, images: list[Image]) -> Iterator[checks.Observa
     """Yield the points of every component that has a place; their archive may be missing."""
     clouds = (*frame.root.iterfind("point_cloud"), *frame.root.iterfind("tie_points"))
     there = [one for one in clouds if (path := frame.path_to(one)) is None or path.is_file()]
-    for document in map(frame.follow, there):
-        listed = document.root.findall("projections")
-        if listed:
-            break
-    else:
+    found = (one for one in map(frame.follow, there) if one.root.find("projections") is not None)
+    if (document := next(found, None)) is None:
         return
+    listed = document.root.iterfind("projections")
     files = {entry.get("camera_id") or "": entry.get("path") or "" for entry in listed}
     with checks.reading(document.path), zipfile.ZipFile(document.path) as archive:
         for points in document.root.iterfind("points"):
             component = points.get("component_id")
-            rows = [
-                i
-                for i, image in enumerate(images)
-                if image.id in files
-                and (component == image.component or None in (component, image.component))
-            ]
+            inside = [component in (one.component, None) or one.component is None for one in images]
+            rows = [i for i, image in enumerate(images) if inside[i] and image.id in files]
             if not rows:
                 continue
             xyz, tracks = _vertices(archive, points.get("path"), "xyz")

@@ -106,14 +106,6 @@ def read(source: Source) -> Cameras:
     )
 
 
-def tie_points(source: Source, cameras: Cameras) -> TiePoints:
-    """Read points and tracks, in the frame of the poses."""
-    files = _files_of(source.path)
-    found = read_reconstruction(files["poses"])
-    points, placed = read_tie_points(found), _frame(files, found)
-    return points if placed is None else replace(points, xyz=placed.points(points.xyz))
-
-
 def _files_of(path: Path) -> Files:
     """Return the files of the project that a file or folder belongs to.
 
@@ -349,14 +341,17 @@ def read_reconstruction(path: Path) -> Reconstruction:
 CHUNK_BYTES = 1 << 24
 
 
-def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
-    """Return the points in the frame of the file, and where its images saw them."""
-    path, cameras, _, points = reconstruction
+def tie_points(source: Source, cameras: Cameras) -> TiePoints:
+    """Read points and tracks, in the frame of the poses."""
+    files = _files_of(source.path)
+    found = read_reconstruction(files["poses"])
+    path, points, placed = found.path, found.points, _frame(files, found)
     tracks = path.with_name("tracks.csv")
     if not points or not tracks.is_file():
         why = "it has no points" if not points else "there is no tracks.csv next to it"
         raise checks.no_tie_points(path, why)
     xyz = np.array([point["coordinates"] for point in points.values()], float).reshape(-1, 3)
+    xyz = xyz if placed is None else placed.points(xyz)
     camera_of, point_of = (
         {name.encode(errors="replace"): i for i, name in enumerate(names)}
         for names in (cameras.labels, points)

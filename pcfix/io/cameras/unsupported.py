@@ -1,12 +1,13 @@
 """Files that are known but not read: each is refused with its name and a remedy.
 
 Files reach this module if no reader has recognised them. They are recognised by signatures and
-keywords in the first bytes, or by names of files, also inside a folder.
+keywords in the first bytes, or by their name. A folder is refused for the first such file in it.
 """
 
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 from pcfix.errors import bad_file
 from pcfix.io.cameras.checks import Source
@@ -16,10 +17,10 @@ OPK = "Write a table with the header label,x,y,z,omega,phi,kappa and give its le
 COLMAP = "Export a COLMAP model (cameras, images, points3D)"
 GCPS = "a list of ground control points (ODM)", POSES
 BARE = "a table without a header", "Write one, for example label,x,y,z,omega,phi,kappa"
-PIX4D = "a project of Pix4D", "Give its folder 1_initial/params"
 MICMAC = "a calibration of MicMac", "Give the folder with its orientations"
 LENSES = "a list of lenses (OpenDroneMap), without poses", "Give reconstruction.json"
 NERF = "a scene of nerfstudio or instant-ngp", "Give the model from which it was converted"
+PIX4D_PART = ["a part of the parameters of Pix4D", "Give calibrated_camera_parameters.txt"]
 CONTENTS: tuple[tuple[bytes, str, str], ...] = (
     (rb"\A(\xff\xd8\xff|II[*+]\0|MM\0[*+]|\x89PNG)", "an image", POSES),
     (rb"\ALASF", "a point cloud (LAS, LAZ)", POSES),
@@ -27,7 +28,7 @@ CONTENTS: tuple[tuple[bytes, str, str], ...] = (
     (rb"\A(SQLite format 3\0|\0\0\x27\x0a)", "a vector file", POSES),
     (rb"\A(\x1f\x8b|PK[\x03\x05])", "an archive", POSES),
     (rb"\AMVS[I\0]", "a scene of OpenMVS", COLMAP),
-    (rb"<!DOCTYPE Pix4D", *PIX4D),
+    (rb"<!DOCTYPE Pix4D", "a project of Pix4D", "Give its folder 1_initial/params"),
     (rb"<Reality(Capture|Scan)", "a project of RealityCapture", "Export XMP files"),
     (rb"<kml[\s>]", "a map of Google Earth (KML)", POSES),
     (rb"\A(EPSG:|\+proj=|WGS84 UTM )[^\n]*\n\s*([-+.\d]+[ \t]+){2}", *GCPS),
@@ -49,40 +50,22 @@ PART = re.compile(
     r"|internal_camera_parameters\.cam|camera_parameters(_wgs84)?_error\.txt)"
 )
 """Files of Pix4D's parameters without poses."""
-FOLDERS: tuple[tuple[str, str, str], ...] = (
-    (r"AutoCal.*\.xml|Calib-PerspCentral-.*\.xml", *MICMAC),
-    (r"cameras\.json|camera_models\.json", *LENSES),
-    (r"sfm_data\.(json|bin)|.*\.(sfm|mg)", "a scene of OpenMVG or AliceVision", COLMAP),
-    (r"transforms\.json", *NERF),
-    (r"1_initial", *PIX4D),
-    (r"(?i).*\.(jpe?g|tiff?|png|dng)", "a folder of images", POSES),
-)
-"""Names inside a folder."""
 
 
-def is_part(source: Source) -> bool:
+def is_part(path: Path) -> bool:
     """Whether a file is by its name a part of an export; standard errors look like poses."""
-    return source.path.is_file() and bool(PART.fullmatch(source.path.name))
+    return path.is_file() and bool(PART.fullmatch(path.name))
 
 
 def refuse(source: Source) -> None:
-    """Raise InputError if the content is one of these."""
-    if found := _refusal(source):
-        what, remedy = found
-        sentence = f"is {what}, which pcfix does not read as cameras. {remedy}."
-        raise bad_file(source.path, "cameras.not_read", sentence, what=what)
-
-
-def _refusal(source: Source) -> tuple[str, str] | None:
-    """Return what the content is and what to do, or None if it is not known."""
+    """Raise InputError if the file, or one in the folder, is one of these."""
     is_folder = source.path.is_dir()
-    names = sorted(p.name for p in source.path.iterdir()) if is_folder else [source.path.name]
-    if any(map(PART.fullmatch, names)):
-        return "a part of the parameters of Pix4D", "Give calibrated_camera_parameters.txt"
-    for pattern, what, remedy in FOLDERS if is_folder else ():
-        if found := next((name for name in names if re.fullmatch(pattern, name)), None):
-            return f"a folder with {found}: {what}", remedy
-    for head, what, remedy in CONTENTS:
-        if re.search(head, source.head, re.MULTILINE):
-            return what, remedy
-    return None
+    files = filter(Path.is_file, source.path.iterdir()) if is_folder else [source.path]
+    for file in sorted(files):
+        head, found = Source(file).head, [PIX4D_PART] if is_part(file) else []
+        found += [of for pattern, *of in CONTENTS if re.search(pattern, head, re.MULTILINE)]
+        if found:
+            what, remedy = found[0]
+            sentence = f"has {file.name}, {what}" if is_folder else f"is {what}"
+            sentence += f", which pcfix does not read as cameras. {remedy}."
+            raise bad_file(source.path, "cameras.not_read", sentence, what=what)
