@@ -39,8 +39,7 @@ import numpy as np
 
 from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Source, number, read_xml, text_of
-from pcfix.io.cameras.lenses import lens_by_name
+from pcfix.io.cameras.checks import Source, lens_by_name, number, read_xml, text_of
 from pcfix.io.crs import Topocentric
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints

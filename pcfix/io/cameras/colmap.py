@@ -33,8 +33,7 @@ import numpy as np
 
 from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Source, damaged
-from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
+from pcfix.io.cameras.checks import LensModel, Source, damaged, lens_by_name, model_of
 from pcfix.io.crs import is_topocentric
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 from pcfix.options.declare import File
@@ -139,7 +138,7 @@ BY_NAME = {
     "EUCM": LensModel("fx fy cx cy alpha beta", "eucm"),
     "EQUIRECTANGULAR": LensModel("w h", None),
 }
-"""In the order of their numbers in binary files, from 0; the names are those of `lenses`."""
+"""In the order of their numbers in binary files, from 0; the names are those of `checks`."""
 MODELS = tuple(BY_NAME)
 
 

@@ -25,6 +25,7 @@ from pcfix.model import Cameras, FloatArray
 if TYPE_CHECKING:
     from pyproj import CRS
 
+LARGEST_DEG = 360.0 + 1e-6
 STEP_M, EARTH_RADIUS_M = 10.0, 6.4e6
 """About half the distance over which directions are compared."""
 
@@ -40,6 +41,14 @@ class Frame(NamedTuple):
     enter: Callable[[FloatArray], FloatArray]
     direct: bool = False
     topocentric: bool = False
+
+    def check(self, xyz: FloatArray, labels: Sequence[str], name: str) -> None:
+        """Raise InputError for degrees that are none."""
+        bad = (np.abs(xyz[:, :2]) > [LARGEST_DEG, LARGEST_DEG / 4.0]).any(axis=1)
+        if self.direct and self.crs.is_geographic and bad.any():
+            sentence = f"the coordinates of image {labels[int(np.argmax(bad))]} are not longitude"
+            sentence += " and latitude. Give --cameras-crs."
+            raise bad_file(name, "cameras.degrees", sentence, crs=self.crs.name)
 
 
 def frame_of(text: str, name: str) -> Frame:
@@ -59,19 +68,6 @@ def frame_of(text: str, name: str) -> Frame:
         sentence = f"{crs.name} is not a CRS for cameras. Give another with --cameras-crs."
         raise bad_file(name, "cameras.crs", sentence, crs=crs.name)
     return Frame(crs, lambda xyz: xyz, direct=True)
-
-
-def check_transformed(
-    name: str, labels: Sequence[str], xyz: FloatArray, found: FloatArray, crs: str | None
-) -> None:
-    """Raise InputError if the numbers of an image have no place in the CRS that it is to be in."""
-    lost = ~np.isfinite(found).all(axis=1)
-    if lost.any():
-        i = int(np.argmax(lost))
-        x, y, z = xyz[i]
-        sentence = f"image {labels[i]}: {x:.10g}, {y:.10g}, {z:.6g} is outside"
-        sentence += f" {systems.shortened(crs or '')}. Check --cameras-crs."
-        raise bad_file(name, "cameras.not_transformed", sentence, image=labels[i])
 
 
 def is_tied(crs: str | None, name: str) -> bool:
@@ -102,7 +98,13 @@ class Georeference:
         """Return the cameras in the target; `gnss` stays in its own CRS."""
         centres, rotations = self.points(cameras.centres), cameras.rotations
         numbers = cameras.centres + self.offset
-        check_transformed(self.name, cameras.labels, numbers, centres, self.crs)
+        lost = ~np.isfinite(centres).all(axis=1)
+        if lost.any():
+            i = int(np.argmax(lost))
+            x, y, z = numbers[i]
+            sentence = f"image {cameras.labels[i]}: {x:.10g}, {y:.10g}, {z:.6g} is outside"
+            sentence += f" {systems.shortened(self.crs or '')}. Check --cameras-crs."
+            raise bad_file(self.name, "cameras.not_transformed", sentence, image=cameras.labels[i])
         if rotations is not None and self.frame is not None:
             turns = self._turns(self.frame, numbers)
             rotations = rotations @ turns.transpose(0, 2, 1)
@@ -230,6 +232,7 @@ def _into(
     plan = systems.crs_text(systems.parts(frame.crs if frame.direct else target)[0])
     given = "ENU:latitude,longitude,height" if frame.topocentric else systems.shortened(plan)
     instead = f"or, if the heights of cameras and cloud agree, give --cameras-crs {given}"
+    frame.check(cameras.centres + offset, cameras.labels, name)
     at = frame.enter(cameras.centres + offset)
     forward, of_step = systems.transformation(
         frame.crs, target, at, name, heights=heights, instead=instead
@@ -259,6 +262,7 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatA
     if len(rows) == 0:
         return found, ""
     own, other = frame_of(crs, name), frame_of(stated, name)
+    other.check(cameras.gnss.xyz[rows], [cameras.labels[i] for i in rows], name)
     adjusted, measured = own.enter(cameras.centres[rows]), other.enter(cameras.gnss.xyz[rows])
     kinds, reason = [systems.heights_of(one.crs) for one in (own, other)], ""
     if stated != crs and {"gravity", "unstated"} <= {*kinds}:
@@ -271,8 +275,6 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatA
         reason = str(error).partition("; or, if")[0].rstrip(".") + "; only plan is compared."
         forward, _ = systems.transformation(other.crs, own.crs, measured, name, heights=False)
     measured = forward(measured)
-    labels = [cameras.labels[i] for i in rows]
-    check_transformed(name, labels, cameras.gnss.xyz[rows], measured, crs)
     unit = systems.plan_unit(own.crs)[1]
     off = (adjusted - measured) * [unit, unit, abs(systems.metres_up(own.crs))]
     if own.crs.is_geographic and (geod := own.crs.get_geod()) is not None:

@@ -41,7 +41,6 @@ import numpy as np
 from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, damaged, number, numbers, read_xml, text_of, warn
-from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.crs import LOCAL, crs_text, is_local, parse_crs, shortened, unbound
 from pcfix.io.ply import parse_header
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
@@ -331,7 +330,7 @@ def _calibrated(
         given |= {"cx": width / 2.0 + value["cx"], "cy": height / 2.0 + value["cy"]}
     else:  # PhotoScan's
         given |= {"fy": given.get("fy", value["fx"]), "p1": value["p2"], "p2": value["p1"]}
-    return lens_by_name(given, width, height, projection=PROJECTIONS[kind], sensor=sensor)
+    return checks.lens_by_name(given, width, height, projection=PROJECTIONS[kind], sensor=sensor)
 
 
 # ---- what was measured ----
@@ -356,13 +355,20 @@ def _gnss_positions(chunk: Document, images: list[Image]) -> GnssPositions | Non
         xyz = [number(path, where, of[axis]) if axis in of else np.nan for axis in "xyz"]
         sigma = spreads(path, where, of, start)
         places[i] = xyz, np.where(np.isfinite(xyz) & (sigma > 0.0), sigma, np.nan)
-    references = text_of(chunk.root, "camera_reference"), text_of(chunk.root, "reference")
-    crs = next(filter(None, references), "LOCAL")
+    # the CRS of the cameras may differ from that of the chunk
+    own = text_of(chunk.root, "camera_reference")
+    crs = own or text_of(chunk.root, "reference") or "LOCAL"
     found = checks.measured(range(len(images)), places, crs)
     if found is None:
         return None
-    is_plain = crs.upper() == "LOCAL" or is_local(parse_crs(crs, str(path)))
-    return replace(found, crs=LOCAL) if is_plain else found
+    if crs.upper() == "LOCAL" or is_local(parsed := parse_crs(crs, str(path))):
+        return replace(found, crs=LOCAL)
+    largest = np.nanmax(np.abs(found.xyz[:, :2]), axis=0)
+    if own or parsed.is_geographic or (largest > [180.0, 90.0]).any():
+        return found
+    sentence = "the camera positions are degrees in a CRS in metres; WGS 84 is assumed."
+    warn(path, "cameras.gnss_in_degrees", sentence)
+    return replace(found, crs="EPSG:4979")
 
 
 def spreads(path: Path, where: str, stated: dict[str, str], start: FloatArray) -> FloatArray:

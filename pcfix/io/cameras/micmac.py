@@ -32,9 +32,8 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Source, damaged, number, numbers, read_xml
+from pcfix.io.cameras.checks import Source, damaged, lens_by_name, number, numbers, read_xml
 from pcfix.io.cameras.checks import text_of as _text
-from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.model import Cameras, FloatArray, Lens
 
 PREFIX, PREFIX_2, SUFFIX = "Orientation-", "Ori-PerspCentral-", ".xml"

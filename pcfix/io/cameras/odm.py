@@ -43,8 +43,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import AffineFrame, Source, damaged, load_json, triple
-from pcfix.io.cameras.lenses import LensModel, lens_by_name
+from pcfix.io.cameras.checks import AffineFrame, LensModel, Source, damaged, lens_by_name, triple
 from pcfix.io.crs import Topocentric
 from pcfix.io.labels import unnamed
 from pcfix.io.tables import read_lines
@@ -222,7 +221,9 @@ def _read_shots(files: Files) -> Cameras:
     known = {}
     if lenses_file := files.get("cameras.json"):
         with checks.reading(lenses_file):
-            known = {k: lens(lenses_file, k, entry) for k, entry in load_json(lenses_file).items()}
+            known = {
+                k: lens(lenses_file, k, entry) for k, entry in checks.load_json(lenses_file).items()
+            }
     lenses, plain = [], 0
     for shot in each:
         width, height = float(shot["width"]), float(shot["height"])
@@ -258,7 +259,7 @@ def read_images(
         return None, []
     places = {}
     with checks.reading(path):
-        images = {str(image.get("filename")): image for image in load_json(path)}
+        images = {str(image.get("filename")): image for image in checks.load_json(path)}
         for label in labels:
             image = images.get(label) or images.get(PurePath(label).stem) or {}
             if image.get("latitude") is not None:
@@ -269,7 +270,7 @@ def read_images(
 
 def _shots(path: Path) -> dict[str, dict[str, Any]]:
     """Return the properties of every feature by file name, with its `geometry`."""
-    features = load_json(path)["features"]
+    features = checks.load_json(path)["features"]
     shots = {
         str(one["properties"]["filename"]): one["properties"] | {"geometry": one.get("geometry")}
         for one in features
@@ -383,10 +384,10 @@ _MODELS = {
     "fisheye624": LensModel("fx fy cx cy k1 k2 k3 k4 k5 k6 p2 p1 s1 s2 s3 s4", "equidistant"),
     "dual": LensModel("f k1 k2 transition", "dual"),
 }
-"""By names of `lenses`; not every version of OpenSfM knows simple_radial and radial."""
+"""By names of `checks`; not every version of OpenSfM knows simple_radial and radial."""
 _PARAMETERS = {"f": "focal", "fx": "focal_x", "fy": "focal_y", "cx": "c_x", "cy": "c_y"}
 _PARAMETERS |= {"p1": "p2", "p2": "p1", "s1": "s0", "s2": "s1", "s3": "s2", "s4": "s3"}
-"""What OpenSfM calls what has another name in `lenses`."""
+"""What OpenSfM calls what has another name in `checks`."""
 
 
 def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:

@@ -30,8 +30,7 @@ import numpy as np
 
 from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import AffineFrame, Source, load_json, triple
-from pcfix.io.cameras.lenses import lens_by_name
+from pcfix.io.cameras.checks import AffineFrame, Source, lens_by_name, load_json, triple
 from pcfix.io.crs import crs_text, parse_crs, plan_unit
 from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import Cameras, GnssPositions, Lens, TiePoints

@@ -29,8 +29,7 @@ import numpy as np
 
 from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Source, damaged, numbers
-from pcfix.io.cameras.lenses import lens_by_name
+from pcfix.io.cameras.checks import Source, damaged, lens_by_name, numbers
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import Cameras, FloatArray, Lens, TiePoints
@@ -63,7 +62,7 @@ FIELDS = {
     "position": "centre",
     "rotation": "rotation",
 }
-"""Words in the header of the camera parameters, and the names of the numbers in `lenses`."""
+"""Words in the header of the camera parameters, and the names of the numbers in `checks`."""
 SHAPE = re.compile(r"^(.*?)\s*\[\s*(\d{1,2})\s*x\s*(\d{1,2})\s*\]\s*$")
 
 
@@ -87,10 +86,13 @@ def read(source: Source) -> Cameras:
         poses = np.array([numbers(path, where, text, 6) for where, text in texts]).reshape(-1, 6)
         centres, rotations = poses[:, :3], from_omega_phi_kappa(*poses[:, 3:].T)
         if images:
-            rows_of = defaultdict[str, list[int]](list)  # of equal names, both are in one order
-            for row, label in reversed([*enumerate(labels)]):
+            rows_of = defaultdict[str, list[int]](list)
+            for row, label in enumerate(labels):
                 rows_of[label].append(row)
-            rows = [rows_of[name].pop() if rows_of[name] else -1 for name in names]
+            rows = []
+            for name, turn in zip(names, _rotations(files["parameters"], images), strict=True):
+                off = np.linalg.norm(rotations[rows_of[name]] - turn, axis=(1, 2))
+                rows.append(rows_of[name].pop(int(np.argmin(off))) if len(off) else -1)
             posed = [i for i in posed if rows[i] >= 0]
             if not posed:
                 raise damaged(path, f"names none of the images of {PARAMETERS}")

@@ -28,8 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Source, image_size, number, numbers, read_xml
-from pcfix.io.cameras.lenses import lens_by_name
+from pcfix.io.cameras.checks import Source, image_size, lens_by_name, number, numbers, read_xml
 from pcfix.io.cameras.table import FILM_MM, read_sensor, sensor_file
 from pcfix.model import Cameras, Lens
 

@@ -45,8 +45,7 @@ import numpy as np
 from pcfix.errors import InputError, bad_file
 from pcfix.io import tables
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Angles, Source
-from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
+from pcfix.io.cameras.checks import Angles, LensModel, Source, lens_by_name, model_of
 from pcfix.io.crs import is_topocentric, shortened
 from pcfix.io.tables import Table
 from pcfix.lens import rotations
@@ -311,7 +310,7 @@ def _own_lenses(columns: Table, source: Source) -> tuple[Lens, ...]:
 MILLIMETRES = ("focal", "sensor_x", "sensor_y")
 PIXELS = ("focal_px", "width_px", "height_px")
 OPENCV_NAMES = {"d1": "k4", "d2": "k5", "d3": "k6", "p2": "p1", "p1": "p2"}
-"""What OpenCV calls the parameters that have another name in `lenses`."""
+"""What OpenCV calls the parameters that have another name in `checks`."""
 OPENCV = {"OpenCV": LensModel("f cx cy k1 k2 k3 d1 d2 d3 p2 p1")}
 TERMS = OPENCV["OpenCV"].names.split()[1:]
 CENTRED = {"centred": LensModel("f")}
