@@ -106,12 +106,6 @@ def unsupported(path: Path, what: str, remedy: str, **values: Any) -> InputError
     return bad_file(path, "cameras.unsupported", f"{what} is not supported. {remedy}.", **values)
 
 
-def no_sensor(path: Path) -> InputError:
-    """Return the error for a table of poses without a lens."""
-    sentence = "has angles but no sensor. Give --sensor a table with focal,sensor_x,sensor_y (mm)."
-    return bad_file(path, "cameras.sensor_missing", sentence)
-
-
 def note(path: object, code: str, sentence: str, **values: Any) -> PcfixWarning:
     """Return a warning about a camera file."""
     return PcfixWarning(code, f"{path}: {sentence}", path=path, **values)
@@ -335,7 +329,7 @@ class LensModel(NamedTuple):
     """A model of a package: the names of its parameters, in the order of its files."""
 
     names: str
-    projection: Projection | None = "perspective"  # None for a panorama, which is no lens
+    projection: Projection = "perspective"
     in_turn: bool = False
 
 

@@ -58,7 +58,7 @@ def read(source: Source) -> Cameras:
     labels = tuple(image.name for image in images)
     rotations = checks.quaternions(path, labels, poses[:, :4])
     used = dict.fromkeys(image.camera for image in images)
-    lenses = {number: lens_of(listed, number, cameras[number]) for number in used}
+    lenses = {number: lens_of(number, cameras[number]) for number in used}
     offset, crs = read_place(folder)
     checks.warn_several(folder, len(others) + 1, len(images))
     return Cameras(
@@ -136,7 +136,6 @@ BY_NAME = {
     "SIMPLE_FISHEYE": LensModel("f cx cy", "equidistant"),
     "FISHEYE": LensModel("fx fy cx cy", "equidistant"),
     "EUCM": LensModel("fx fy cx cy alpha beta", "eucm"),
-    "EQUIRECTANGULAR": LensModel("w h", None),
 }
 """In the order of their numbers in binary files, from 0; the names are those of `checks`."""
 MODELS = tuple(BY_NAME)
@@ -146,14 +145,12 @@ Camera = tuple[str, float, float, tuple[float, ...]]
 """A row of the camera list: model, width, height, parameters."""
 
 
-def lens_of(path: Path, identifier: int, camera: Camera) -> Lens:
+def lens_of(identifier: int, camera: Camera) -> Lens:
     """Return the lens of a camera."""
     name, width, height, values = camera
     model = BY_NAME[name]
-    if model.projection is None:
-        raise _no_model(path, identifier, name)
-    given = dict(zip(model.names.split(), values, strict=True))
     more = {"in_turn": model.in_turn, "sensor": f"{identifier} {name}"}
+    given = dict(zip(model.names.split(), values, strict=True))
     return lens_by_name(given, width, height, projection=model.projection, **more)
 
 

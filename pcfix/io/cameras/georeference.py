@@ -106,8 +106,7 @@ class Georeference:
             sentence += f" {systems.shortened(self.crs or '')}. Check --cameras-crs."
             raise bad_file(self.name, "cameras.not_transformed", sentence, image=cameras.labels[i])
         if rotations is not None and self.frame is not None:
-            turns = self._turns(self.frame, numbers)
-            rotations = rotations @ turns.transpose(0, 2, 1)
+            rotations = rotations @ self._turns(self.frame, numbers).transpose(0, 2, 1)
         found = replace(cameras, centres=centres, rotations=rotations, crs=self.crs)
         return replace(found, project_crs=None, notes=cameras.notes + self.notes)
 
@@ -232,10 +231,10 @@ def _into(
     plan = systems.crs_text(systems.parts(frame.crs if frame.direct else target)[0])
     given = "ENU:latitude,longitude,height" if frame.topocentric else systems.shortened(plan)
     instead = f"or, if the heights of cameras and cloud agree, give --cameras-crs {given}"
-    frame.check(cameras.centres + offset, cameras.labels, name)
-    at = frame.enter(cameras.centres + offset)
+    at = cameras.centres + offset
+    frame.check(at, cameras.labels, name)
     forward, of_step = systems.transformation(
-        frame.crs, target, at, name, heights=heights, instead=instead
+        frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
     )
     notes = (*(PcfixWarning("crs.transformation", str(one), path=name) for one in of_step), *notes)
     return Georeference(name, offset, crs, notes, frame, lambda xyz: forward(frame.enter(xyz)))

@@ -141,7 +141,7 @@ def _frame(files: Files, found: Reconstruction) -> AffineFrame | None:
     if not (whole or files.keys() & {*_OF_CRS, SHOTS, TOPOCENTRIC}):
         return None
     unmoved = AffineFrame(np.eye(3), np.zeros(3), found.cameras.crs or "", crs)
-    if reference is None or found.path.name == TOPOCENTRIC:
+    if reference is None or files["poses"].name == TOPOCENTRIC:
         return unmoved
     if path := files.get(TRANSFORMATION):
         with checks.reading(path):
@@ -291,7 +291,6 @@ class Reconstruction(NamedTuple):
     has none, or the zeros that OpenSfM writes for images without positions.
     """
 
-    path: Path
     cameras: Cameras
     reference: tuple[float, float, float] | None
     points: dict[str, Any]
@@ -336,7 +335,7 @@ def read_reconstruction(path: Path) -> Reconstruction:
             gnss=checks.measured([*shots], places, crs) if reference else None,
             unposed=unnamed(others, shots),
         )
-        return Reconstruction(path, cameras, reference, chosen.get("points", {}))
+        return Reconstruction(cameras, reference, chosen.get("points", {}))
 
 
 CHUNK_BYTES = 1 << 24
@@ -345,8 +344,9 @@ CHUNK_BYTES = 1 << 24
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read points and tracks, in the frame of the poses."""
     files = _files_of(source.path)
-    found = read_reconstruction(files["poses"])
-    path, points, placed = found.path, found.points, _frame(files, found)
+    path = files["poses"]
+    found = read_reconstruction(path)
+    points, placed = found.points, _frame(files, found)
     tracks = path.with_name("tracks.csv")
     if not points or not tracks.is_file():
         why = "it has no points" if not points else "there is no tracks.csv next to it"
@@ -364,8 +364,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
             point = np.array([point_of.get(fields[1], -1) for fields in lines], dtype=np.int64)
             camera = np.array([camera_of.get(fields[0], -1) for fields in lines], dtype=np.int64)
             values = np.array([fields[3:5] for fields in lines], dtype=float).reshape(-1, 2)
-            known = (point >= 0) & (camera >= 0)
-            parts.append((point[known], camera[known], values[known]))
+            parts.append((point, camera, values))
     point, camera, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.lexsort((camera, point))
     size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]
@@ -388,6 +387,7 @@ _MODELS = {
 _PARAMETERS = {"f": "focal", "fx": "focal_x", "fy": "focal_y", "cx": "c_x", "cy": "c_y"}
 _PARAMETERS |= {"p1": "p2", "p2": "p1", "s1": "s0", "s2": "s1", "s3": "s2", "s4": "s3"}
 """What OpenSfM calls what has another name in `checks`."""
+_DEFAULTS = {"transition": 0.5}
 
 
 def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
@@ -398,16 +398,17 @@ def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
         what = f"the projection_type '{model}' of camera {name}"
         raise checks.unsupported(path, what, remedy, model=model, camera=name)
 
-    def value(key: str, default: float = 0.0) -> float:
+    def value(key: str, default: Any = 0.0) -> float:
         return float(camera.get(key, default))
 
     width, height = value("width"), value("height")
     scale = max(width, height)
-    given = {one: value(_PARAMETERS.get(one, one)) for one in _MODELS[model].names.split()}
-    if "transition" in given:
-        given["transition"] = value("transition", 0.5)
-    across = float(camera["focal_x" if "focal_x" in camera else "focal"])
-    down = value("focal_y", across) if "focal_x" in camera else across
+    given = {
+        one: value(_PARAMETERS.get(one, one), _DEFAULTS.get(one, 0.0))
+        for one in _MODELS[model].names.split()
+    }
+    across = value("focal_x", camera.get("focal"))
+    down = value("focal_y", across)
     given |= {"fx": across * scale, "fy": down * scale}
     given |= {"cx": width / 2.0 + value("c_x") * scale, "cy": height / 2.0 + value("c_y") * scale}
     projection = _MODELS[model].projection

@@ -99,7 +99,8 @@ def read(source: Source) -> Cameras:
             centres, rotations = (each[rows][posed] for each in (centres, rotations))
     else:
         labels, rotations = names, _rotations(files["parameters"], images)
-        centres = np.array([image.fields["centre"] for image in images]) + _offset(files)
+        centres = np.array([image.fields["centre"] for image in images]).reshape(-1, 3)
+        centres += _offset(files)
     given = [*names, *labels]
     labels = [names[i] for i in posed] or labels
     lenses = tuple(lens for i in posed if (lens := _lens(images[i])) is not None)
@@ -203,8 +204,6 @@ def read_parameters(path: Path) -> list[Image]:
         parts = np.split(numbers(path, where, " ".join(words_of), ends[-1]), ends[:-1])
         fields = {name: part for (name, _), part in zip(layout, parts, strict=True) if name}
         images.append(Image(label.strip(), (width, height), fields))
-    if not images:
-        raise damaged(path, "has a header but no images")
     return images
 
 

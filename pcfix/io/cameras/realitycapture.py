@@ -48,8 +48,6 @@ IMAGES = (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".webp", ".bmp", ".exr", ".j
 
 def recognises(source: Source) -> bool:
     """Whether a file, or one of the .xmp files of a folder, uses RealityCapture's namespace."""
-    if not source.path.is_dir():
-        return NAMESPACE.encode() in source.head
     return bool(_files(source.path))
 
 
@@ -88,12 +86,11 @@ def read(source: Source) -> Cameras:
 
 
 def _files(path: Path) -> list[Path]:
-    """Return the one file, or those of a folder that use RealityCapture's namespace."""
-    if not path.is_dir():
-        return [path]
-    listed = sorted(p for p in path.iterdir() if p.suffix.lower() == ".xmp" and p.is_file())
+    """Return the one file, or those of a folder, if they use RealityCapture's namespace."""
+    inside = (p for p in path.glob("*") if p.suffix.lower() == ".xmp" and p.is_file())
+    listed = sorted(inside) if path.is_dir() else [path]
     named = [file for file in listed if file.stem != "_common"]  # which is of no image
-    return [file for file in named if NAMESPACE.encode() in file.read_bytes()]
+    return [file for file in named if NAMESPACE.encode() in Source(file).head]
 
 
 def _lens(path: Path, fields: dict[str, str], width: float, height: float) -> Lens:

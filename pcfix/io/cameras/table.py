@@ -126,12 +126,13 @@ def read(source: Source) -> Cameras:
     if by_gnss:
         sentence = "its positions are those of the GNSS, not adjusted ones."
         checks.warn(source.path, "cameras.not_adjusted", sentence)
+    sensor = sensor_file(source)
     has_lens = turns is not None and columns.has("f", "px", "py")
     return Cameras(
         labels=tuple(columns.labels),
         centres=centres(columns, needed=True),
         rotations=turns,
-        lenses=_own_lenses(columns, source) if has_lens else None,
+        lenses=_own_lenses(columns, read_sensor(sensor)) if has_lens and sensor else None,
         crs=system,
         gnss=gnss_positions(measured) if has_both else None,
         unposed=tuple(unposed),
@@ -288,12 +289,8 @@ def _degrees(columns: Table, roles: tuple[str, ...]) -> FloatArray:
     return values.T
 
 
-def _own_lenses(columns: Table, source: Source) -> tuple[Lens, ...]:
+def _own_lenses(columns: Table, frame: Lens) -> tuple[Lens, ...]:
     """Return the lens of each row from RealityCapture's columns, with the size of a sensor."""
-    path = sensor_file(source)
-    if path is None:
-        raise checks.no_sensor(columns.path)
-    frame = read_sensor(path)
     width, height = frame.width, frame.height
     side, lenses = max(width, height), []
     distortion = np.nan_to_num(columns.where_there(DISTORTION))

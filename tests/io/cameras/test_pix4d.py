@@ -170,7 +170,8 @@ GOOD = {"parameters": HEADER + block("a.jpg", (1, 2, 3)), "offset": "0 0 0"}
     ("files", "code"),
     [
         ({"parameters": GOOD["parameters"][:-30]}, "cameras.damaged"),
-        ({"parameters": HEADER}, "cameras.damaged"),
+        ({"parameters": HEADER}, "cameras.no_pose"),
+        ({"external": external()}, "cameras.no_pose"),
         ({**GOOD, "offset": "1 2"}, "cameras.damaged"),
         ({**GOOD, "wkt": "PROJCS[nothing"}, "cameras.crs"),
     ],

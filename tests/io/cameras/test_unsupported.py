@@ -58,17 +58,16 @@ def test_part_of_an_export(tmp_path, name, what):
 
 
 @pytest.mark.parametrize(
-    ("inside", "what"),
+    ("inside", "data", "what"),
     [
-        ("DJI_0001.JPG", "a folder of images"),
-        ("1_initial", "Pix4D"),
-        ("AutoCal_Foc-8800.xml", "MicMac"),
-        ("cameras.json", "OpenDroneMap"),
+        ("DJI_0001.JPG", b"\xff\xd8\xff\xe0\0\x10JFIF", "an image"),
+        ("AutoCal_Foc-8800.xml", b"<ExportAPERO><CalibrationInternConique>", "MicMac"),
+        ("cameras.json", b'{"v2 dji": {"projection_type": "brown"}}', "OpenDroneMap"),
     ],
 )
-def test_folder(tmp_path, inside, what):
-    (tmp_path / inside).touch()
-    (tmp_path / "readme.txt").touch()
+def test_folder(tmp_path, inside, data, what):
+    (tmp_path / inside).write_bytes(data)
+    (tmp_path / "a page.html").write_text("<html>")
     with refused("cameras.not_read") as caught:
         pcfix.read_cameras(tmp_path)
     assert what in caught.value.values["what"]
