@@ -49,7 +49,6 @@ COLMAP = "Export a COLMAP model (cameras, images, points3D)"
 GCPS = "a list of ground control points (ODM)", POSES
 BARE = "a table without a header", "Write one, for example label,x,y,z,omega,phi,kappa"
 MICMAC = "a calibration of MicMac", "Give the folder with its orientations"
-LENSES = "a list of lenses (OpenDroneMap), without poses", "Give reconstruction.json"
 NERF = "a scene of nerfstudio or instant-ngp", "Give the model from which it was converted"
 PIX4D_PART = ["a part of the parameters of Pix4D", "Give calibrated_camera_parameters.txt"]
 REFUSED: tuple[tuple[bytes, str, str], ...] = (
@@ -68,7 +67,7 @@ REFUSED: tuple[tuple[bytes, str, str], ...] = (
     (rb"^\s*(SENSOR_TYPE|TRIANGULATION_TYPE)\s", "a support file of SOCET SET", OPK),
     (rb"^\s*(ORI[AE]|PRO[JI]|GEOI|BILD)\s+\S+\s+\S", "a file of BINGO", OPK),
     (rb"<(CalibrationInternConique|InternalCalibration)>", *MICMAC),
-    (rb'"projection_type"', *LENSES),
+    (rb'"projection_type"', "a list of lenses without poses (ODM)", "Give reconstruction.json"),
     (rb'"sfm_data_version"', "a scene of OpenMVG", COLMAP),
     (rb'"viewId"|"featuresFolders"|"pipelineVersion"', "a scene of AliceVision (Meshroom)", COLMAP),
     (rb'"transform_matrix"|"camera_angle_x"|"fl_x"', *NERF),
@@ -187,11 +186,22 @@ def _recognised(path: File, sensor: File | None, angles: Angles | None) -> tuple
     )
     if form := _format_of(source):
         return source, form
-    for file in sorted(filter(Path.is_file, where.glob("*"))):
+    is_folder = where.is_dir()
+    files = sorted(filter(Path.is_file, where.iterdir())) if is_folder else [where]
+    for file in files:
         if form := _format_of(Source(file)):
             sentence = f"is a folder with a camera file ({FORMATS[form]}). Give {file}."
             raise bad_file(where, "cameras.folder", sentence, file=file.name)
-    _refuse_known(where)
+    for file in files:
+        head, found = b"", [PIX4D_PART] if _is_part(file) else []
+        with suppress(InputError):  # in a folder
+            head = Source(file).head
+        found += [of for pattern, *of in REFUSED if re.search(pattern, head, re.MULTILINE)]
+        if found:
+            what, remedy = found[0]
+            sentence = f"has {file.name}, {what}" if is_folder else f"is {what}"
+            sentence += f", which pcfix does not read as cameras. {remedy}."
+            raise bad_file(where, "cameras.not_read", sentence, what=what)
     sentence = "is not a camera file that pcfix knows. Give a file that pcfix/io/cameras/README.md"
     sentence += " lists, or a CSV table with label, x, y, z and, if known, yaw, pitch, roll."
     raise bad_file(where, "cameras.unknown", sentence)
@@ -219,18 +229,3 @@ def _format_of(source: Source) -> str | None:
 def _is_part(path: Path) -> bool:
     """Whether a file is by its name a part of an export; standard errors look like poses."""
     return path.is_file() and bool(PART.fullmatch(path.name))
-
-
-def _refuse_known(path: Path) -> None:
-    """Raise InputError if a file, or one in a folder, is known by its content or its name."""
-    is_folder = path.is_dir()
-    for file in sorted(filter(Path.is_file, path.iterdir())) if is_folder else [path]:
-        head, found = b"", [PIX4D_PART] if _is_part(file) else []
-        with suppress(InputError):  # in a folder
-            head = Source(file).head
-        found += [of for pattern, *of in REFUSED if re.search(pattern, head, re.MULTILINE)]
-        if found:
-            what, remedy = found[0]
-            sentence = f"has {file.name}, {what}" if is_folder else f"is {what}"
-            sentence += f", which pcfix does not read as cameras. {remedy}."
-            raise bad_file(path, "cameras.not_read", sentence, what=what)

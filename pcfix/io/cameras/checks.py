@@ -40,8 +40,6 @@ from pcfix.model import (
 )
 
 ZIP_MAGIC = b"PK\x03\x04"
-LARGEST_RATIO = 200
-"""Of an archive: XML packs 10 to 30 times smaller, a bomb a thousand times."""
 ROUNDING = 1e-3
 """Of a rotation's elements: files with four decimals pass, a mirrored or scaled one does not."""
 
@@ -140,15 +138,6 @@ def reading(path: object) -> Iterator[None]:
         raise damaged(path, error or type(error).__name__) from error
 
 
-def unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
-    """Return the content of an entry."""
-    with reading(archive.filename):
-        entry = archive.getinfo(name)
-        if entry.file_size > LARGEST_RATIO * (entry.compress_size + 1):
-            raise damaged(archive.filename, f"{name} unpacks to an impossible size")
-        return archive.read(entry)
-
-
 def read_document(path: Path) -> bytes:
     """Return a file, or of an archive its ``doc.xml`` or else the first XML document."""
     with reading(path):
@@ -158,7 +147,7 @@ def read_document(path: Path) -> bytes:
             return path.read_bytes()
         with zipfile.ZipFile(path) as archive:
             listed = [name for name in archive.namelist() if name.lower().endswith(".xml")]
-            return unpacked(archive, "doc.xml" if "doc.xml" in listed else [*listed, "XML"][0])
+            return archive.read("doc.xml" if "doc.xml" in listed else [*listed, "XML"][0])
 
 
 def read_xml(path: Path, data: bytes | None = None) -> Element:

@@ -441,7 +441,7 @@ def _tie_points(frame: Document, images: list[Image]) -> Iterator[checks.Observa
 
 def _vertices(archive: zipfile.ZipFile, name: str | None, axes: str) -> tuple[FloatArray, IntArray]:
     """Return the coordinates and tracks (id) of a binary PLY in an archive."""
-    where, data = f"{archive.filename}: {name}", checks.unpacked(archive, name or "")
+    where, data = f"{archive.filename}: {name}", archive.read(name or "")
     header = parse_header(where, data)
     kinds = {p.name: header.order + p.item for p in header.properties if not p.length}
     if not header.order or header.skipped or not {*axes, "id"} <= kinds.keys():

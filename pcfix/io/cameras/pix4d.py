@@ -78,6 +78,8 @@ def read(source: Source) -> Cameras:
     files = _find(source)
     images = read_parameters(files["parameters"]) if "parameters" in files else []
     names, posed = [image.label for image in images], [*range(len(images))]
+    turns = np.array([image.fields["rotation"] for image in images])
+    turns = checks.rotations(files.get("parameters", source.path), names, turns)
     if "external" in files:
         path = files["external"]
         listed = [line.rsplit(None, 6) for line in read_lines(path)[1:] if line.strip()]
@@ -90,7 +92,7 @@ def read(source: Source) -> Cameras:
             for row, label in enumerate(labels):
                 rows_of[label].append(row)
             rows = []
-            for name, turn in zip(names, _rotations(files["parameters"], images), strict=True):
+            for name, turn in zip(names, turns, strict=True):
                 off = np.linalg.norm(rotations[rows_of[name]] - turn, axis=(1, 2))
                 rows.append(rows_of[name].pop(int(np.argmin(off))) if len(off) else -1)
             posed = [i for i in posed if rows[i] >= 0]
@@ -98,7 +100,7 @@ def read(source: Source) -> Cameras:
                 raise damaged(path, f"names none of the images of {PARAMETERS}")
             centres, rotations = (each[rows][posed] for each in (centres, rotations))
     else:
-        labels, rotations = names, _rotations(files["parameters"], images)
+        labels, rotations = names, turns
         centres = np.array([image.fields["centre"] for image in images]).reshape(-1, 3)
         centres += _offset(files)
     given = [*names, *labels]
@@ -205,11 +207,6 @@ def read_parameters(path: Path) -> list[Image]:
         fields = {name: part for (name, _), part in zip(layout, parts, strict=True) if name}
         images.append(Image(label.strip(), (width, height), fields))
     return images
-
-
-def _rotations(path: Path, images: list[Image]) -> FloatArray:
-    matrices = np.array([image.fields["rotation"] for image in images])
-    return checks.rotations(path, [image.label for image in images], matrices)
 
 
 def _lens(image: Image) -> Lens | None:

@@ -310,7 +310,6 @@ OPENCV_NAMES = {"d1": "k4", "d2": "k5", "d3": "k6", "p2": "p1", "p1": "p2"}
 """What OpenCV calls the parameters that have another name in `checks`."""
 OPENCV = {"OpenCV": LensModel("f cx cy k1 k2 k3 d1 d2 d3 p2 p1")}
 TERMS = OPENCV["OpenCV"].names.split()[1:]
-CENTRED = {"centred": LensModel("f")}
 DISTORTION = ("k1", "k2", "k3", "k4", "t1", "t2")
 FILM_MM = 36.0
 """Larger side of the film that 35 mm focal lengths mean."""
@@ -383,7 +382,7 @@ def write_table(folder: File, cameras: Cameras) -> None:
         sentence = f"a table has one lens, but the images have {1 + len(others)}. Use another"
         raise bad_file(target, "output.lens", f"{sentence} format.")
     is_px = given.unit == "px"
-    _, values = model_of(target, given, OPENCV if is_px else CENTRED)
+    _, values = model_of(target, given, OPENCV if is_px else {"centred": LensModel("f")})
     frame = (values.pop("f"), given.width, given.height)
     sensor = dict(zip(PIXELS if is_px else MILLIMETRES, map(float, frame), strict=True))
     sensor |= {OPENCV_NAMES.get(name, name): float(value) for name, value in values.items()}
