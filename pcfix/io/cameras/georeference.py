@@ -43,12 +43,18 @@ class Frame(NamedTuple):
     topocentric: bool = False
 
     def check(self, xyz: FloatArray, labels: Sequence[str], name: str) -> None:
-        """Raise InputError for degrees that are none."""
+        """Raise InputError for numbers that are not on the earth."""
+        if self.topocentric or self.crs.is_projected:
+            return
+        code, kind = "cameras.degrees", "longitude and latitude"
         bad = (np.abs(xyz[:, :2]) > [LARGEST_DEG, LARGEST_DEG / 4.0]).any(axis=1)
-        if self.direct and self.crs.is_geographic and bad.any():
-            sentence = f"the coordinates of image {labels[int(np.argmax(bad))]} are not longitude"
-            sentence += " and latitude. Give --cameras-crs."
-            raise bad_file(name, "cameras.degrees", sentence, crs=self.crs.name)
+        if not self.direct:
+            code, kind = "cameras.geocentric", "geocentric coordinates"
+            bad = np.abs(np.linalg.norm(xyz, axis=1) - EARTH_RADIUS_M) > 0.6e6
+        if bad.any():
+            label = labels[int(np.argmax(bad))]
+            sentence = f"the coordinates of image {label} are not {kind}. Give --cameras-crs."
+            raise bad_file(name, code, sentence, image=label, crs=self.crs.name)
 
 
 def frame_of(text: str, name: str) -> Frame:

@@ -74,26 +74,20 @@ def binary_folder(path):
 
 @pytest.mark.parametrize("make", [folder, binary_folder])
 def test_a_small_model(tmp_path, make):
-    cameras = read(make(tmp_path))
+    path = make(tmp_path)
+    cameras = read(path)
     assert cameras.labels == ("south wing/b 2.jpg", "a.jpg", "c.jpg")
     turn = Rotation.from_quat([-0.5, 0.5, 0.5, 0.5])
     assert cameras.rotations[0] == pytest.approx(turn.as_matrix())
     assert cameras.centres[0] == pytest.approx(-turn.inv().apply([1, 2, 3]))
     assert cameras.centres[1] == pytest.approx([1, 2, 3])
-    assert [(x.focal, x.b1, x.width) for x in cameras.lenses] == [
-        (400, 0, 640),
-        (510, -10, 800),
-        (510, -10, 800),
-    ]
+    lenses = [(x.focal, x.b1, x.width) for x in cameras.lenses]
+    assert lenses == [(400, 0, 640), (510, -10, 800), (510, -10, 800)]
     assert cameras.lenses[0].radial == (0.1,)
     assert cameras.crs is None
     assert cameras.notes == ()
     assert cameras.gnss is None
-
-
-@pytest.mark.parametrize("make", [folder, binary_folder])
-def test_its_tie_points(tmp_path, make):
-    points = read_ties(make(tmp_path))
+    points = read_ties(path)
     assert points.xyz.tolist() == [[1.5, 2.5, 3.5], [-1, -2, 10], [0, 0, 1]]
     assert points.views.start.tolist() == [0, 2, 3, 3]
     assert points.views.camera.tolist() == [0, 2, 0]

@@ -246,6 +246,7 @@ def test_heights(at, crs, project, cloud, given, z, codes):
         (VALENCIA_LON_LAT, "EPSG:4326", None, None, "cloud.no_crs"),
         (ALICANTE_ECEF, "EPSG:4936", None, None, "cloud.no_crs"),
         (VALENCIA, "EPSG:4326", None, UTM30, "cameras.degrees"),
+        (VALENCIA, "EPSG:4978", None, UTM30, "cameras.geocentric"),
         ([1e30, 1e30, 5.0], "EPSG:32631", None, UTM30, "cameras.not_transformed"),
         (VALENCIA, "EPSG:32630+5773", None, UTM30_ALICANTE, "crs.heights"),
         (VALENCIA, "nonsense", None, UTM30, "crs.unknown"),

@@ -10,11 +10,8 @@ from pcfix.io.cameras import table
 from pcfix.io.cameras.table import read_sensor
 from tests.utils.camera_files import read
 from tests.utils.codes import refused
-from tests.utils.shared import needs
 
-pytestmark = pytest.mark.quick_but("test_river_keeps_cameras_that_share_a_label")
-
-RIVER, river = needs("river")
+pytestmark = pytest.mark.quick
 
 
 def write(tmp_path, text, sensor="focal,sensor_x,sensor_y\n8.8,13.2,8.8\n"):
@@ -69,12 +66,6 @@ def test_yaw_pitch_roll(tmp_path, kind, angles, forward, top, right):
 def test_dialects(tmp_path, text):
     cameras = pcfix.read_cameras(write(tmp_path, text, sensor=None))
     assert cameras.centres.tolist() == [[1, 2, 3]]
-
-
-@river
-def test_river_keeps_cameras_that_share_a_label():
-    cameras = pcfix.read_cameras(RIVER / "cameras.csv")
-    assert (len(cameras), len(set(cameras.labels))) == (31, 24)
 
 
 # Columns
