@@ -7,9 +7,6 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
-from pcfix.io.cameras import metashape
-from pcfix.io.cameras.checks import Source, recognises
-from pcfix.io.cameras.metashape import read_calibration
 from pcfix.lens.imaging import project
 from pcfix.model import Lens
 from tests.utils.camera_files import brown, notes, read, read_ties
@@ -284,22 +281,6 @@ def test_additional_corrections_are_ignored(tmp_path):
     corrections = '<corrections type="fourier"><coeffs>3 4 0 0</coeffs></corrections>'
     cameras = read_chunk(tmp_path, sensors=sensor(calibration("<f>9</f>" + corrections)))
     assert notes(cameras) == ["cameras.corrections"]
-
-
-def test_calibration_file(tmp_path):
-    path = tmp_path / "calibration.xml"
-    path.write_text(
-        "<calibration><projection>fisheye</projection><width>60</width><height>40</height>"
-        "<f>100</f><cx>1</cx><b1>2</b1><k2>0.5</k2><p2>0.25</p2><date>2020</date></calibration>"
-    )
-    assert read_calibration(path) == Lens(
-        *(100.0, 60.0, 40.0, 31.0, 20.0, 2.0),
-        projection="equidistant",
-        radial=(0.0, 0.5),
-        tangential=(0.0, 0.25),
-        sensor="calibration",
-    )
-    assert not recognises(metashape, Source(path))
 
 
 # GNSS
