@@ -392,7 +392,7 @@ READERS: dict[str, Reader] = {
     "micmac": block(
         one=text("Orientation-a.jpg.xml", micmac.embedded(micmac.RADIAL)), two=micmac.version_2
     ),
-    "bundler": block(points=lambda folder: nvm.write_bundle(folder, nvm.bundle()[0])),
+    "bundler": block(points=lambda folder: nvm.write_bundle(folder, nvm.bundle())),
     "nvm": block(points=nvm_file),
     "blocksexchange": block(
         ties=text("block.xml", BLOCKS_EXCHANGE), local=text("block.xml", LOCAL_FRAME),
