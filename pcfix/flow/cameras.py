@@ -181,9 +181,8 @@ def _fit(
     visible = np.minimum(cameras_in_sight(xyz, cameras), 3)
     shares = np.bincount(visible, minlength=4) / len(xyz)
     found = plausible(cameras, xyz, ties, **flight)
-    verdict = likely_mistake(cameras.centres, xyz.min(axis=0), xyz.max(axis=0), view.crs)
-    differ = [one for one in cameras.notes if one.code == "cameras.heights_differ"]
-    verdict = verdict or " ".join(map(str, [*found.doubts, *differ]))
+    verdict = likely_mistake(cameras.centres, xyz.min(axis=0), xyz.max(axis=0))
+    verdict = verdict or " ".join(map(str, found.doubts))
     return {
         "cloud": view.name,
         "points_sampled": len(xyz),

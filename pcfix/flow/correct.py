@@ -248,7 +248,7 @@ def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
         f" plan from the middle of the {figures.submerged:,} submerged points. Check that cameras"
         " and cloud have the same CRS, and that pitch 0 is straight down."
     )
-    mistake = likely_mistake(plan.cameras.centres, figures.low, figures.high, plan.view.crs)
+    mistake = likely_mistake(plan.cameras.centres, figures.low, figures.high)
     return f"{sentence} {mistake or ''}".strip()
 
 

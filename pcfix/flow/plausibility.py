@@ -16,7 +16,8 @@ from scipy.spatial import cKDTree
 
 from pcfix.errors import InputError, PcfixWarning
 from pcfix.flow.surfaces import Points
-from pcfix.io.cameras.georeference import adjusted_minus_gnss
+from pcfix.io.cameras.georeference import adjusted_minus_gnss, frame_of, is_tied
+from pcfix.io.crs import heights_of
 from pcfix.io.tides import read_altitudes
 from pcfix.lens.frames import cameras_in_sight
 from pcfix.lens.imaging import straight_images
@@ -38,7 +39,7 @@ LEAST_STEPS, STEADY, MOST_TURN_DEG = 10, 0.9, 45.0
 STEEP_COSINE = 0.9
 """Of the tilt of images whose top has a clear direction in plan, about 25 degrees."""
 MOST_OFF_M = 15.0
-"""In plan, from positions of the GNSS, in the median; without corrections these are 5 m off."""
+"""In plan, or in height, from positions of the GNSS, in the median; these are often 5 m off."""
 TAKE_OFF_M, MOST_SHARE = (-15.0, 25.0), 0.1
 """How high above the water drones take off, and the share of their height that barometers err."""
 
@@ -253,16 +254,28 @@ def _directions(cameras: Cameras) -> Plausible:
 
 def _positions(cameras: Cameras, name: str) -> Plausible:
     """Compare the places of cameras with those that their GNSS recorded."""
+    found, has_datum = np.zeros((0, 3)), False
     try:
-        found = np.zeros((0, 2))
         if cameras.gnss is not None:
-            found = adjusted_minus_gnss(cameras, name)[0][:, :2]
+            found = adjusted_minus_gnss(cameras, name)[0]
+            has_datum = is_tied(cameras.crs, name) and (
+                heights_of(frame_of(cameras.crs or "", name).crs) == "gravity"
+            )
     except InputError:
         return Plausible()
-    off_m = np.hypot(*found[np.isfinite(found).all(axis=1)].T)
+    off_m = np.hypot(*found[np.isfinite(found[:, :2]).all(axis=1), :2].T)
     if not len(off_m):
         return Plausible()
     middle = float(np.median(off_m))
+    # GNSS heights are above the geoid as stated only where cameras and GNSS have a vertical datum
+    up_m = found[np.isfinite(found[:, 2]), 2] if has_datum else np.zeros(0)
+    above_m = float(np.median(up_m)) if len(up_m) else 0.0
+    if middle <= MOST_OFF_M < abs(above_m):
+        sentence = (
+            f"The cameras are {abs(above_m):.1f} m {'above' if above_m > 0.0 else 'below'} their"
+            " GNSS positions. Check the heights of --cameras-crs, or install the grid of the geoid."
+        )
+        return Plausible(doubts=(PcfixWarning("cameras.heights_differ", sentence, off_m=above_m),))
     if middle <= MOST_OFF_M:
         return Plausible(fits=(f"positions {middle:.1f} m in plan from their GNSS",))
     sentence = (

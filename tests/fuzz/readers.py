@@ -16,7 +16,7 @@ from pyogrio import raw
 import pcfix
 from pcfix.io.cameras import read_tie_points
 from pcfix.io.cameras.colmap import FILE as FILE_OF_PLACE
-from pcfix.io.cameras.colmap import place_text, write_colmap
+from pcfix.io.cameras.colmap import write_colmap
 from pcfix.io.clouds import read_cloud
 from pcfix.io.files import ENSEMBLE, find_members, write_members
 from pcfix.io.gnss_positions import read_gnss
@@ -171,7 +171,8 @@ def colmap_lenses(folder: Path) -> Path:
 
 def colmap_text(folder: Path) -> Path:
     made = colmap.folder(folder / "sparse")
-    (made / FILE_OF_PLACE).write_text(place_text(np.array([1.0, 2.0, 3.0]), "EPSG:32636"))
+    place = {"crs": "EPSG:32636", "offset_m": [1.0, 2.0, 3.0], "written_by": "pcfix"}
+    (made / FILE_OF_PLACE).write_text(json.dumps(place))
     return made
 
 
@@ -391,7 +392,7 @@ READERS: dict[str, Reader] = {
     "micmac": block(
         one=text("Orientation-a.jpg.xml", micmac.embedded(micmac.RADIAL)), two=micmac.version_2
     ),
-    "bundler": block(points=lambda folder: nvm.write_bundle(folder, nvm.bundle()[0])),
+    "bundler": block(points=lambda folder: nvm.write_bundle(folder, nvm.bundle())),
     "nvm": block(points=nvm_file),
     "blocksexchange": block(
         ties=text("block.xml", BLOCKS_EXCHANGE), local=text("block.xml", LOCAL_FRAME),

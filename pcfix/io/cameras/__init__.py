@@ -9,6 +9,7 @@ sentence is clearer. README.md of this folder says how to add a format.
 
 from __future__ import annotations
 
+import re
 import warnings
 from contextlib import suppress
 from dataclasses import replace
@@ -18,19 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning, SettingError, bad_file
-from pcfix.io.cameras import checks, unsupported
+from pcfix.errors import InputError, PcfixWarning, SettingError, bad_file
+from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Angles, Source, reading
 from pcfix.io.cameras.table import read_sensor, sensor_file
 from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
-
-LISTS = (
-    *(".xml", ".csv", ".txt", ".json", ".geojson", ".psx", ".psz", ".xmlz", ".opf", ".out", ".nvm"),
-)
-"""Suffixes of possible camera files."""
-
 
 FORMATS = {
     "metashape": "Agisoft Metashape, PhotoScan",
@@ -47,6 +42,44 @@ FORMATS = {
 """The modules of this folder and their software, in the order in which they are asked."""
 TAKE_SENSOR = ("table", "realitycapture")
 """Modules that look for the sensor themselves."""
+
+POSES = "Give the file or folder with the camera poses"
+OPK = "Write a table with the header label,x,y,z,omega,phi,kappa and give its lens by --sensor"
+COLMAP = "Export a COLMAP model (cameras, images, points3D)"
+GCPS = "a list of ground control points (ODM)", POSES
+BARE = "a table without a header", "Write one, for example label,x,y,z,omega,phi,kappa"
+MICMAC = "a calibration of MicMac", "Give the folder with its orientations"
+NERF = "a scene of nerfstudio or instant-ngp", "Give the model from which it was converted"
+PIX4D_PART = ["a part of the parameters of Pix4D", "Give calibrated_camera_parameters.txt"]
+REFUSED: tuple[tuple[bytes, str, str], ...] = (
+    (rb"\A(\xff\xd8\xff|II[*+]\0|MM\0[*+]|\x89PNG)", "an image", POSES),
+    (rb"\ALASF", "a point cloud (LAS, LAZ)", POSES),
+    (rb"\Aply\r?\n", "a point cloud or mesh (PLY)", POSES),
+    (rb"\A(SQLite format 3\0|\0\0\x27\x0a)", "a vector file", POSES),
+    (rb"\A(\x1f\x8b|PK[\x03\x05])", "an archive", POSES),
+    (rb"\AMVS[I\0]", "a scene of OpenMVS", COLMAP),
+    (rb"<!DOCTYPE Pix4D", "a project of Pix4D", "Give its folder 1_initial/params"),
+    (rb"<Reality(Capture|Scan)", "a project of RealityCapture", "Export XMP files"),
+    (rb"<kml[\s>]", "a map of Google Earth (KML)", POSES),
+    (rb"\A(EPSG:|\+proj=|WGS84 UTM )[^\n]*\n\s*([-+.\d]+[ \t]+){2}", *GCPS),
+    (rb"\A(\xef\xbb\xbf)?focal", "a table of the sensor", "Give it by --sensor"),
+    (rb"\A\s*\$PROJECT\b|^\s*\$(PHOTO_NUM|EXT_ORI)\b", "a project of Inpho (Trimble)", OPK),
+    (rb"^\s*(SENSOR_TYPE|TRIANGULATION_TYPE)\s", "a support file of SOCET SET", OPK),
+    (rb"^\s*(ORI[AE]|PRO[JI]|GEOI|BILD)\s+\S+\s+\S", "a file of BINGO", OPK),
+    (rb"<(CalibrationInternConique|InternalCalibration)>", *MICMAC),
+    (rb'"projection_type"', "a list of lenses without poses (ODM)", "Give reconstruction.json"),
+    (rb'"sfm_data_version"', "a scene of OpenMVG", COLMAP),
+    (rb'"viewId"|"featuresFolders"|"pipelineVersion"', "a scene of AliceVision (Meshroom)", COLMAP),
+    (rb'"transform_matrix"|"camera_angle_x"|"fl_x"', *NERF),
+    # numbers, after one name at most
+    (rb"\A\s*([^\s,;]+[,;\s]+)?[-+.\d]+([,; \t]+[-+.\d]+)+\s*$", *BARE),
+)
+"""Known files that are not read: patterns of the first bytes, what the file is, and what to do."""
+PART = re.compile(
+    r"(?i)(.*_)?(calibrated_images_position\.txt|pmatrix\.txt|offset\.xyz"
+    r"|internal_camera_parameters\.cam|camera_parameters(_wgs84)?_error\.txt)"
+)
+"""Files of Pix4D's parameters without poses."""
 
 
 def read_cameras(
@@ -103,7 +136,9 @@ def read_cameras(
                     sentence = f"has {why}, so --sensor {sensor} has no effect. Omit it."
                     raise bad_file(source.path, "cameras.sensor_unused", sentence, sensor=sensor)
             elif cameras.lenses is None and form == "table":
-                raise checks.no_sensor(source.path)
+                sentence = "has angles but no sensor. Give --sensor a table with"
+                sentence += " focal,sensor_x,sensor_y (mm)."
+                raise bad_file(source.path, "cameras.sensor_missing", sentence)
             cameras = checks.checked(source.path, cameras)
     except SettingError as error:  # numbers that are finite in the file and not in the world
         raise checks.damaged(path, str(error).rstrip(".")) from error
@@ -151,11 +186,22 @@ def _recognised(path: File, sensor: File | None, angles: Angles | None) -> tuple
     )
     if form := _format_of(source):
         return source, form
-    for file in sorted(p for p in where.glob("*") if p.suffix.lower() in LISTS and p.is_file()):
+    is_folder = where.is_dir()
+    files = sorted(filter(Path.is_file, where.iterdir())) if is_folder else [where]
+    for file in files:
         if form := _format_of(Source(file)):
             sentence = f"is a folder with a camera file ({FORMATS[form]}). Give {file}."
             raise bad_file(where, "cameras.folder", sentence, file=file.name)
-    unsupported.refuse(source)
+    for file in files:
+        head, found = b"", [PIX4D_PART] if _is_part(file) else []
+        with suppress(InputError):  # in a folder
+            head = Source(file).head
+        found += [of for pattern, *of in REFUSED if re.search(pattern, head, re.MULTILINE)]
+        if found:
+            what, remedy = found[0]
+            sentence = f"has {file.name}, {what}" if is_folder else f"is {what}"
+            sentence += f", which pcfix does not read as cameras. {remedy}."
+            raise bad_file(where, "cameras.not_read", sentence, what=what)
     sentence = "is not a camera file that pcfix knows. Give a file that pcfix/io/cameras/README.md"
     sentence += " lists, or a CSV table with label, x, y, z and, if known, yaw, pitch, roll."
     raise bad_file(where, "cameras.unknown", sentence)
@@ -173,8 +219,13 @@ def reader_of(form: str) -> Any:
 
 def _format_of(source: Source) -> str | None:
     """Return the first format that recognises the content."""
-    for form in () if unsupported.is_part(source) else FORMATS:
+    for form in () if _is_part(source.path) else FORMATS:
         with suppress(Exception), np.errstate(all="ignore"):
             if checks.recognises(reader_of(form), source):
                 return form
     return None
+
+
+def _is_part(path: Path) -> bool:
+    """Whether a file is by its name a part of an export; standard errors look like poses."""
+    return path.is_file() and bool(PART.fullmatch(path.name))

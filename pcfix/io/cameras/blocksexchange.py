@@ -39,11 +39,10 @@ import numpy as np
 
 from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Source, number, read_xml, text_of
-from pcfix.io.cameras.lenses import lens_by_name
+from pcfix.io.cameras.checks import Source, lens_by_name, number, read_xml, text_of
 from pcfix.io.crs import Topocentric
 from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
-from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
+from pcfix.model import Cameras, FloatArray, Lens, TiePoints
 
 CONTENT = "<BlocksExchange"
 COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
@@ -64,6 +63,7 @@ DIRECTIONS = {"Right": (1, 0, 0), "Left": (-1, 0, 0), "Down": (0, 1, 0), "Up": (
 class Photo(NamedTuple):
     """A photo with at least a position; `key` is its block and id, `prior` its GNSS position."""
 
+    is_main: bool  # in the main component
     key: tuple[int, str]
     label: str
     lens: Lens | None
@@ -80,13 +80,18 @@ def read(source: Source) -> Cameras:
     photos, unposed = _photos(path, root)
     turns = [photo.rotation for photo in photos if photo.rotation is not None]
     lenses = [photo.lens for photo in photos if photo.lens is not None]
+    priors = {photo.key: photo.prior for photo in photos if photo.prior is not None}
+    of = next(
+        (srs for srs, _ in priors.values()), ""
+    )  # GNSS positions of other systems are skipped
+    places = {key: (xyz, np.full(3, np.nan)) for key, (srs, xyz) in priors.items() if srs == of}
     return Cameras(
         labels=tuple(photo.label for photo in photos),
         centres=np.array([photo.centre for photo in photos]),
         rotations=np.array(turns) if turns else None,
         lenses=tuple(lenses) if turns and len(lenses) == len(photos) else None,
         crs=_crs_of(path, root, photos[0].srs),
-        gnss=_gnss(path, root, photos),
+        gnss=checks.measured([photo.key for photo in photos], places, _crs_of(path, root, of)),
         unposed=tuple(unposed),
     )
 
@@ -98,8 +103,7 @@ def _read_bytes(path: Path) -> bytes:
 
 def _photos(path: Path, root: Element) -> tuple[list[Photo], list[str]]:
     """Read the photos of the main component, if possible with rotations; and all other labels."""
-    main, outside = list[Photo](), list[Photo]()  # outside of the main component
-    unposed, ignored = list[str](), list[str]()
+    listed, unposed, ignored = list[Photo](), list[str](), list[str]()
     for i, block in enumerate(root.iter("Block")):
         for group in block.iter("Photogroup"):
             axes, lens = _photogroup(path, group)
@@ -116,11 +120,10 @@ def _photos(path: Path, root: Element) -> tuple[list[Photo], list[str]]:
                 turn = _rotation(path, label, pose.find("Rotation"), axes)
                 prior = _prior(path, label, element, srs)
                 is_main = text_of(element, "Component") in ("", MAIN_COMPONENT)
-                photo = Photo(key, label, lens, centre, turn, srs, prior)
-                (main if is_main else outside).append(photo)
+                listed.append(Photo(is_main, key, label, lens, centre, turn, srs, prior))
         unposed += [_label(element) for element in block.iterfind("BulkPhotos/Photo")]
-    turned = [photo for photo in main or outside if photo.rotation is not None]
-    photos = turned or main or outside
+    main = [photo for photo in listed if photo.is_main] or listed
+    photos = [photo for photo in main if photo.rotation is not None] or main
     if not photos:
         raise checks.no_pose(path)
     if len({(photo.key[0], photo.srs) for photo in photos}) > 1:
@@ -130,7 +133,7 @@ def _photos(path: Path, root: Element) -> tuple[list[Photo], list[str]]:
         sentence = f"photogroup {', '.join(ignored[:10])} is skipped (its ManualPose is false)."
         checks.warn(path, "cameras.poses_ignored", sentence, photogroups=ignored)
     chosen = {photo.key for photo in photos}
-    unposed += [photo.label for photo in main + outside if photo.key not in chosen]
+    unposed += [photo.label for photo in listed if photo.key not in chosen]
     return photos, unposed
 
 
@@ -163,16 +166,6 @@ def _rotation(
         what = f"the rotation of {label} by yaw (or heading), pitch and roll"
         raise checks.unsupported(path, what, "Export rotations as matrices", image=label)
     return None
-
-
-def _gnss(path: Path, root: Element, photos: list[Photo]) -> GnssPositions | None:
-    """Return the GNSS positions in the CRS that the first of them has."""
-    priors = {photo.key: photo.prior for photo in photos if photo.prior is not None}
-    if not priors:
-        return None
-    of = next(iter(priors.values()))[0]
-    places = {k: (xyz, np.full(3, np.nan)) for k, (srs, xyz) in priors.items() if srs == of}
-    return checks.measured([photo.key for photo in photos], places, _crs_of(path, root, of))
 
 
 def _crs_of(path: Path, root: Element, srs_id: str) -> str:
@@ -282,11 +275,12 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
                 if max(rows, default=-1) >= 0:
                     place, srs = element.find("Position"), text_of(element, "SRSId") or srs_of_all
                     is_known = place is not None and srs == photos[0].srs
-                    for row, mark in zip(rows, marks, strict=True):
-                        if row >= 0:
-                            point.append(len(xyz))
-                            camera.append(row)
-                            uv.append([float(text_of(mark, axis)) + FIRST_PIXEL for axis in "xy"])
+                    point += [len(xyz)] * len(rows)
+                    camera += rows
+                    uv += [
+                        [float(text_of(mark, axis)) + FIRST_PIXEL for axis in "xy"]
+                        for mark in marks
+                    ]
                     axes = [text_of(place, a) for a in "xyz"] if is_known else ["nan"] * 3
                     xyz.append([float(text) for text in axes])
                 element.clear()

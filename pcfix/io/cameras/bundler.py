@@ -37,8 +37,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Observations, Source, damaged
-from pcfix.io.cameras.lenses import lens_by_name
+from pcfix.io.cameras.checks import Observations, Source, damaged, lens_by_name
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_photogrammetric
 from pcfix.model import Cameras, FloatArray, TiePoints

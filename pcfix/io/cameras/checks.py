@@ -1,10 +1,19 @@
-"""Shared by the readers: input, errors, numbers, XML, JSON, rotations, lenses, CRS, tie points."""
+"""Shared by the readers: input, errors, numbers, XML, JSON, rotations, lenses, CRS, tie points.
+
+Lenses are made of parameters by name, as all packages have the same few. Here they are called
+``f``, or ``fx`` across and ``fy`` down the image; ``cx``, ``cy``, the principal point from the
+upper left corner of the image; ``skew`` and ``b3``, the affine terms off the diagonal; ``k1``, ...
+radial and ``d1``, ... in the denominator; ``p1``, ``p2``, ... in Brown's order, so OpenCV's p1 is
+``p2``; ``s1``, ... of thin prisms; and the parameters of a projection, see `SHAPES`.
+`pcfix.model.Lens` has the formulas.
+"""
 
 from __future__ import annotations
 
 import re
 import warnings
 import zipfile
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import astuple, dataclass, replace
@@ -25,13 +34,12 @@ from pcfix.model import (
     GnssPositions,
     IntArray,
     Lens,
+    Projection,
     TiePoints,
     Views,
 )
 
 ZIP_MAGIC = b"PK\x03\x04"
-LARGEST_RATIO = 200
-"""Of an archive: XML packs 10 to 30 times smaller, a bomb a thousand times."""
 ROUNDING = 1e-3
 """Of a rotation's elements: files with four decimals pass, a mirrored or scaled one does not."""
 
@@ -96,12 +104,6 @@ def unsupported(path: Path, what: str, remedy: str, **values: Any) -> InputError
     return bad_file(path, "cameras.unsupported", f"{what} is not supported. {remedy}.", **values)
 
 
-def no_sensor(path: Path) -> InputError:
-    """Return the error for a table of poses without a lens."""
-    sentence = "has angles but no sensor. Give --sensor a table with focal,sensor_x,sensor_y (mm)."
-    return bad_file(path, "cameras.sensor_missing", sentence)
-
-
 def note(path: object, code: str, sentence: str, **values: Any) -> PcfixWarning:
     """Return a warning about a camera file."""
     return PcfixWarning(code, f"{path}: {sentence}", path=path, **values)
@@ -136,15 +138,6 @@ def reading(path: object) -> Iterator[None]:
         raise damaged(path, error or type(error).__name__) from error
 
 
-def unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
-    """Return the content of an entry."""
-    with reading(archive.filename):
-        entry = archive.getinfo(name)
-        if entry.file_size > LARGEST_RATIO * (entry.compress_size + 1):
-            raise damaged(archive.filename, f"{name} unpacks to an impossible size")
-        return archive.read(entry)
-
-
 def read_document(path: Path) -> bytes:
     """Return a file, or of an archive its ``doc.xml`` or else the first XML document."""
     with reading(path):
@@ -154,7 +147,7 @@ def read_document(path: Path) -> bytes:
             return path.read_bytes()
         with zipfile.ZipFile(path) as archive:
             listed = [name for name in archive.namelist() if name.lower().endswith(".xml")]
-            return unpacked(archive, "doc.xml" if "doc.xml" in listed else [*listed, "XML"][0])
+            return archive.read("doc.xml" if "doc.xml" in listed else [*listed, "XML"][0])
 
 
 def read_xml(path: Path, data: bytes | None = None) -> Element:
@@ -305,6 +298,80 @@ class AffineFrame(NamedTuple):
         """Return world to camera rotations in `crs`: the nearest ones, as the map scales a bit."""
         u, _, v = np.linalg.svd(rotations @ np.linalg.inv(self.matrix))
         return np.asarray(u @ v)
+
+
+# ---- lenses ----
+
+
+SHAPES: Mapping[Projection, str] = {
+    "fov": "omega",
+    "division": "k",
+    "eucm": "alpha beta",
+    "dual": "transition",
+}
+LETTERS = {"radial": "k", "denominator": "d", "tangential": "p", "thin_prism": "s"}
+EXACT = 1e-11
+"""Of the image of a lens that is written, in focal lengths."""
+
+
+class LensModel(NamedTuple):
+    """A model of a package: the names of its parameters, in the order of its files."""
+
+    names: str
+    projection: Projection = "perspective"
+    in_turn: bool = False
+
+
+def lens_by_name(given: Mapping[str, float], width: float, height: float, **more: Any) -> Lens:
+    """Return the lens with the given parameters; `more` are other fields of a `Lens`.
+
+    Without ``cx`` and ``cy`` the principal point is in the middle of the frame.
+    """
+    value = defaultdict(float, given)
+    focal = given.get("fy", value["f"])
+    most = max((int(name[1:]) for name in given if name[1:].isdecimal()), default=0)
+    orders = range(1, most + 1)
+    terms = {
+        field: tuple(np.trim_zeros([given.get(f"{letter}{i}", 0.0) for i in orders], "b"))
+        for field, letter in LETTERS.items()
+    }
+    shape = tuple(value[name] for name in SHAPES.get(more.get("projection", ""), "").split())
+    middle = given.get("cx", width / 2.0), given.get("cy", height / 2.0)
+    affine = given.get("fx", focal) - focal, value["skew"], value["b3"]
+    return Lens(focal, width, height, *middle, *affine, **{"shape": shape} | terms | more)
+
+
+def model_of(
+    path: Path, lens: Lens, models: Mapping[str, LensModel], *, whole: bool = False
+) -> tuple[str, dict[str, float]]:
+    """Return the simplest model that is exactly this lens, and its parameters in their order.
+
+    With `whole` the frame must be whole pixels. An `InputError` if there is no model for `path`.
+    """
+    from pcfix.lens.imaging import project
+
+    values = {
+        f"{letter}{i}": value
+        for field, letter in LETTERS.items()
+        for i, value in enumerate(getattr(lens, field), start=1)
+    }
+    values |= {"f": lens.focal, "fx": lens.focal + lens.b1, "fy": lens.focal}
+    values |= {"cx": lens.principal_x, "cy": lens.principal_y, "skew": lens.b2, "b3": lens.b3}
+    values |= dict(zip(SHAPES.get(lens.projection, "").split(), lens.shape, strict=False))
+    x, y = np.meshgrid(*(np.linspace(-0.5, 0.5, 8) * side for side in (lens.width, lens.height)))
+    rays = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, lens.focal)])
+    exact = project(lens, rays)
+    fits = not whole or (lens.unit == "px" and lens.width % 1.0 == lens.height % 1.0 == 0.0)
+    alike = [one for one in models if models[one].projection == lens.projection] if fits else []
+    for name in sorted(alike, key=lambda one: models[one].names.count(" ")):
+        given = {one: values.get(one, 0.0) for one in models[name].names.split()}
+        more = {"projection": lens.projection, "in_turn": models[name].in_turn}
+        held = project(lens_by_name(given, lens.width, lens.height, **more), rays)
+        if np.allclose(held, exact, rtol=0.0, atol=EXACT * lens.focal, equal_nan=True):
+            return name, given
+    kind = f"{lens.sensor or 'of the images'} ({lens.projection} in {lens.unit})"
+    sentence = f"the format cannot hold the lens {kind} exactly. Use another format."
+    raise bad_file(path, "output.lens", sentence, lens=lens.sensor)
 
 
 # ---- tie points ----

@@ -33,8 +33,7 @@ import numpy as np
 
 from pcfix.errors import InputError, bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Source, damaged
-from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
+from pcfix.io.cameras.checks import LensModel, Source, damaged, lens_by_name, model_of
 from pcfix.io.crs import is_topocentric
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 from pcfix.options.declare import File
@@ -59,7 +58,7 @@ def read(source: Source) -> Cameras:
     labels = tuple(image.name for image in images)
     rotations = checks.quaternions(path, labels, poses[:, :4])
     used = dict.fromkeys(image.camera for image in images)
-    lenses = {number: lens_of(listed, number, cameras[number]) for number in used}
+    lenses = {number: lens_of(number, cameras[number]) for number in used}
     offset, crs = read_place(folder)
     checks.warn_several(folder, len(others) + 1, len(images))
     return Cameras(
@@ -117,12 +116,6 @@ def read_place(folder: Path) -> tuple[FloatArray, str | None]:
         return offset, crs if crs is None or is_topocentric(crs) else checks.crs(path, crs)
 
 
-def place_text(offset_m: FloatArray, crs: str | None) -> str:
-    """Return the content of the file."""
-    place = {"crs": crs, "offset_m": [float(value) for value in offset_m], "written_by": WRITER}
-    return json.dumps(place, indent=2) + "\n"
-
-
 BY_NAME = {
     "SIMPLE_PINHOLE": LensModel("f cx cy"),
     "PINHOLE": LensModel("fx fy cx cy"),
@@ -143,9 +136,8 @@ BY_NAME = {
     "SIMPLE_FISHEYE": LensModel("f cx cy", "equidistant"),
     "FISHEYE": LensModel("fx fy cx cy", "equidistant"),
     "EUCM": LensModel("fx fy cx cy alpha beta", "eucm"),
-    "EQUIRECTANGULAR": LensModel("w h", None),
 }
-"""In the order of their numbers in binary files, from 0; the names are those of `lenses`."""
+"""In the order of their numbers in binary files, from 0; the names are those of `checks`."""
 MODELS = tuple(BY_NAME)
 
 
@@ -153,14 +145,12 @@ Camera = tuple[str, float, float, tuple[float, ...]]
 """A row of the camera list: model, width, height, parameters."""
 
 
-def lens_of(path: Path, identifier: int, camera: Camera) -> Lens:
+def lens_of(identifier: int, camera: Camera) -> Lens:
     """Return the lens of a camera."""
     name, width, height, values = camera
     model = BY_NAME[name]
-    if model.projection is None:
-        raise _no_model(path, identifier, name)
-    given = dict(zip(model.names.split(), values, strict=True))
     more = {"in_turn": model.in_turn, "sensor": f"{identifier} {name}"}
+    given = dict(zip(model.names.split(), values, strict=True))
     return lens_by_name(given, width, height, projection=model.projection, **more)
 
 
@@ -340,10 +330,11 @@ def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = 
         posed.append(struct.pack("<I7dI", i + 1, *turns[i], *shifts[i], number_of[lens]))
         posed.append(label.encode() + b"\0" + struct.pack("<Q", len(seen[i])))
         posed.append(np.array(seen[i], OBSERVATION).tobytes())
+    place = {"crs": cameras.crs, "offset_m": offset.tolist(), "written_by": WRITER}
     contents = {
         "cameras.bin": struct.pack("<Q", len(number_of)) + b"".join(listed),
         "images.bin": struct.pack("<Q", len(cameras)) + b"".join(posed),
         "points3D.bin": struct.pack("<Q", len(points)) + b"".join(points),
-        FILE: place_text(offset, cameras.crs).encode(),
+        FILE: (json.dumps(place, indent=2) + "\n").encode(),
     }
     checks.write_new(target, contents)

@@ -11,8 +11,7 @@ Heights are transformed only if both sides state their vertical datum. Otherwise
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -29,8 +28,6 @@ if TYPE_CHECKING:
 LARGEST_DEG = 360.0 + 1e-6
 STEP_M, EARTH_RADIUS_M = 10.0, 6.4e6
 """About half the distance over which directions are compared."""
-LEAST_UNDULATION_M = 15.0
-"""Difference from the GNSS above which heights above ellipsoid and geoid are likely mixed."""
 
 
 class Frame(NamedTuple):
@@ -106,16 +103,16 @@ class Georeference:
     def cameras(self, cameras: Cameras) -> Cameras:
         """Return the cameras in the target; `gnss` stays in its own CRS."""
         centres, rotations = self.points(cameras.centres), cameras.rotations
+        numbers = cameras.centres + self.offset
         lost = ~np.isfinite(centres).all(axis=1)
         if lost.any():
             i = int(np.argmax(lost))
-            x, y, z = cameras.centres[i] + self.offset
+            x, y, z = numbers[i]
             sentence = f"image {cameras.labels[i]}: {x:.10g}, {y:.10g}, {z:.6g} is outside"
             sentence += f" {systems.shortened(self.crs or '')}. Check --cameras-crs."
             raise bad_file(self.name, "cameras.not_transformed", sentence, image=cameras.labels[i])
         if rotations is not None and self.frame is not None:
-            turns = self._turns(self.frame, cameras.centres + self.offset)
-            rotations = rotations @ turns.transpose(0, 2, 1)
+            rotations = rotations @ self._turns(self.frame, numbers).transpose(0, 2, 1)
         found = replace(cameras, centres=centres, rotations=rotations, crs=self.crs)
         return replace(found, project_crs=None, notes=cameras.notes + self.notes)
 
@@ -218,8 +215,6 @@ def _into(
     if frame.direct and frame.crs.is_geographic and offset.any():
         sentence = f"an offset in metres cannot be added to degrees ({frame.crs.name}). Omit it."
         raise bad_file(name, "cameras.offset", sentence, value=offset.tolist())
-    at = cameras.centres + offset
-    frame.check(at, cameras.labels, name)
     target = cloud
     if systems.heights_of(cloud) == "unstated":  # then the heights are those that the software uses
         vertical = systems.parts(frame.crs if project is None else project)[1]
@@ -236,29 +231,19 @@ def _into(
     elif own == "ellipsoidal" and there == "unstated" and is_guess and not trusted:
         assumed = f"the cloud's CRS ({target.name}) names no vertical datum; ellipsoidal is assumed"
     notes = (note(name, "cameras.heights_assumed", f"{assumed}."),) if assumed else ()
-    by_user = trusted and not frame.direct
-    heights = not (by_user or systems.heights_agree(frame.crs, target))
+    heights = not ((trusted and not frame.direct) or systems.heights_agree(frame.crs, target))
     if frame.direct and not heights and systems.is_same_numbers(frame.crs, target):
         return Georeference(name, offset, crs, notes)
     plan = systems.crs_text(systems.parts(frame.crs if frame.direct else target)[0])
     given = "ENU:latitude,longitude,height" if frame.topocentric else systems.shortened(plan)
     instead = f"or, if the heights of cameras and cloud agree, give --cameras-crs {given}"
+    at = cameras.centres + offset
+    frame.check(at, cameras.labels, name)
     forward, of_step = systems.transformation(
         frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
     )
     notes = (*(PcfixWarning("crs.transformation", str(one), path=name) for one in of_step), *notes)
-    found = Georeference(name, offset, crs, notes, frame, lambda xyz: forward(frame.enter(xyz)))
-    # heights that --cameras-crs declares can be tested if the GNSS heights are above the geoid too
-    if by_user and not frame.topocentric and systems.heights_of(target) == "gravity":
-        up = adjusted_minus_gnss(found.cameras(cameras), name)[0][:, 2]
-        off = float(np.median(up[np.isfinite(up)])) if np.isfinite(up).any() else 0.0
-        if abs(off) >= LEAST_UNDULATION_M:
-            side = "above" if off > 0.0 else "below"
-            sentence = f"with the heights of --cameras-crs the cameras are {abs(off):.1f} m {side}"
-            sentence += " their GNSS positions. Install the grid of the geoid instead."
-            differ = note(name, "cameras.heights_differ", sentence, metres=off)
-            return replace(found, notes=(*found.notes, differ))
-    return found
+    return Georeference(name, offset, crs, notes, frame, lambda xyz: forward(frame.enter(xyz)))
 
 
 def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatArray, str]:
@@ -308,18 +293,14 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatA
 # ---- cameras that are not over their cloud ----
 
 
-FOOT_M = 0.3048
 MARGIN_M = 100.0
 """Distance from the cloud, beyond half of its sides, at which a block can still belong to it."""
 ABSURD_HEIGHTS = 3.0
 """Largest height of cameras above the cloud, in widths of the cloud."""
-_SAMPLE = 200
 
 
-def likely_mistake(
-    centres: FloatArray, low: FloatArray, high: FloatArray, cloud_crs: str | CRS | None
-) -> str | None:
-    """Return what is likely wrong if a block does not match its cloud; None if it does.
+def likely_mistake(centres: FloatArray, low: FloatArray, high: FloatArray) -> str | None:
+    """Return how a block does not match its cloud; None if it does.
 
     Parameters
     ----------
@@ -327,52 +308,20 @@ def likely_mistake(
         Projection centres, assumed to be in the cloud's CRS.
     low, high : array, shape (3,)
         Corners of the cloud, metres.
-    cloud_crs : str, CRS or None
     """
-    centres = centres[:: max(1, len(centres) // _SAMPLE)]
-    width, margin = max((high - low)[:2].max(), MARGIN_M), 0.5 * (high - low)[:2] + MARGIN_M
-    middle = np.median(centres, axis=0)
-
-    def is_over(moved: FloatArray) -> bool:
-        """Whether the middle of a block is over the cloud, or not far from it."""
-        x, y = np.median(moved[:, :2], axis=0)
-        return bool((([x, y] >= low[:2] - margin) & ([x, y] <= high[:2] + margin)).all())
-
-    if is_over(centres):
-        if low[2] <= middle[2] <= high[2] + ABSURD_HEIGHTS * width:
-            return None
-        what = f"{middle[2] - high[2]:.0f} m above the cloud, which is {width:.0f} m wide"
-        if middle[2] < low[2]:
-            what = f"{low[2] - middle[2]:.0f} m below the lowest point of the cloud"
-        why = "check the unit and the vertical datum of both, or see --cameras-offset"
-        return f"The cameras are {what}: {why}."
-    for words, moved in _readings(centres, cloud_crs):
-        if is_over(moved):
-            return f"The cameras would be over the cloud {words}."
+    size, middle = (high - low)[:2], np.median(centres, axis=0)
     x, y = (low + high)[:2] / 2.0 - middle[:2]
-    away = float(np.hypot(x, y))
-    far = f"{away / 1000.0:,.1f} km" if away >= 1e4 else f"{away:.0f} m"
-    advice = f"check the CRS of both, or give an offset of {x:.0f}, {y:.0f} m by --cameras-offset"
-    return f"The cameras are {far} from the cloud in plan; {advice}."
-
-
-def _readings(centres: FloatArray, crs: str | CRS | None) -> Iterator[tuple[str, FloatArray]]:
-    """Yield other meanings of the numbers, the simplest first; to the metre or so."""
-    from pyproj import Transformer
-    from pyproj.exceptions import ProjError
-
-    yield "with x and y exchanged: their axes are likely swapped", centres[:, [1, 0, 2]]
-    yield "multiplied by 0.3048: they are likely in feet, it in metres", centres * FOOT_M
-    yield "divided by 0.3048: they are likely in metres, it in feet", centres / FOOT_M
-    plan = None if crs is None else systems.parts(systems.parse_crs(crs, "the cloud"))[0]
-    if plan is None or not plan.is_projected:
-        return
-    own = plan.utm_zone
-    codes = [("longitude and latitude in degrees", 4326), ("web Mercator", 3857)]
-    for zone in [(int(own[:-1]) + step - 1) % 60 + 1 for step in (0, -1, 1)] if own else []:
-        codes += [(f"UTM zone {zone}N", 32600 + zone), (f"UTM zone {zone}S", 32700 + zone)]
-    for words, code in codes:
-        with suppress(ProjError):  # of a CRS that is not a single map, such as EPSG:32600
-            to_cloud = Transformer.from_crs(code, plan, always_xy=True)
-            moved = np.column_stack(to_cloud.transform(centres[:, 0], centres[:, 1]))
-            yield f"read as {words}; set it with --cameras-crs EPSG:{code}", moved
+    if (np.abs([x, y]) > size + MARGIN_M).any():
+        away = float(np.hypot(x, y))
+        far = f"{away / 1000.0:,.1f} km" if away >= 1e4 else f"{away:.0f} m"
+        advice = "check the CRS, the unit and the order of x and y of both, or give an offset of"
+        advice += f" {x:.0f}, {y:.0f} m by --cameras-offset"
+        return f"The cameras are {far} from the cloud in plan; {advice}."
+    width = max(size.max(), MARGIN_M)
+    if low[2] <= middle[2] <= high[2] + ABSURD_HEIGHTS * width:
+        return None
+    what = f"{middle[2] - high[2]:.0f} m above the cloud, which is {width:.0f} m wide"
+    if middle[2] < low[2]:
+        what = f"{low[2] - middle[2]:.0f} m below the lowest point of the cloud"
+    why = "check the unit and the vertical datum of both, or see --cameras-offset"
+    return f"The cameras are {what}: {why}."

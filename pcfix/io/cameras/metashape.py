@@ -41,7 +41,6 @@ import numpy as np
 from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, damaged, number, numbers, read_xml, text_of, warn
-from pcfix.io.cameras.lenses import lens_by_name
 from pcfix.io.crs import LOCAL, crs_text, is_local, parse_crs, shortened, unbound
 from pcfix.io.ply import parse_header
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
@@ -304,8 +303,8 @@ def _kind(sensor: Element) -> str:
 def _lens(path: Path, sensor: Element) -> Lens:
     """Return the adjusted calibration, else the initial one."""
     label, found = name_of(sensor), _calibration(sensor)
-    sizes = [one.find("resolution") for one in (found, sensor) if one is not None]
-    resolution = next((one for one in sizes if one is not None), None)
+    resolution = None if found is None else found.find("resolution")
+    resolution = sensor.find("resolution") if resolution is None else resolution
     if resolution is None or found is None:
         raise damaged(path, f"sensor {label} has no calibration or no size")
     sides = (resolution.get(side) for side in ("width", "height"))
@@ -331,7 +330,7 @@ def _calibrated(
         given |= {"cx": width / 2.0 + value["cx"], "cy": height / 2.0 + value["cy"]}
     else:  # PhotoScan's
         given |= {"fy": given.get("fy", value["fx"]), "p1": value["p2"], "p2": value["p1"]}
-    return lens_by_name(given, width, height, projection=PROJECTIONS[kind], sensor=sensor)
+    return checks.lens_by_name(given, width, height, projection=PROJECTIONS[kind], sensor=sensor)
 
 
 # ---- what was measured ----
@@ -419,22 +418,16 @@ def _tie_points(frame: Document, images: list[Image]) -> Iterator[checks.Observa
     """Yield the points of every component that has a place; their archive may be missing."""
     clouds = (*frame.root.iterfind("point_cloud"), *frame.root.iterfind("tie_points"))
     there = [one for one in clouds if (path := frame.path_to(one)) is None or path.is_file()]
-    for document in map(frame.follow, there):
-        listed = document.root.findall("projections")
-        if listed:
-            break
-    else:
+    found = (one for one in map(frame.follow, there) if one.root.find("projections") is not None)
+    if (document := next(found, None)) is None:
         return
+    listed = document.root.iterfind("projections")
     files = {entry.get("camera_id") or "": entry.get("path") or "" for entry in listed}
     with checks.reading(document.path), zipfile.ZipFile(document.path) as archive:
         for points in document.root.iterfind("points"):
             component = points.get("component_id")
-            rows = [
-                i
-                for i, image in enumerate(images)
-                if image.id in files
-                and (component == image.component or None in (component, image.component))
-            ]
+            inside = [component in (one.component, None) or one.component is None for one in images]
+            rows = [i for i, image in enumerate(images) if inside[i] and image.id in files]
             if not rows:
                 continue
             xyz, tracks = _vertices(archive, points.get("path"), "xyz")
@@ -448,7 +441,7 @@ def _tie_points(frame: Document, images: list[Image]) -> Iterator[checks.Observa
 
 def _vertices(archive: zipfile.ZipFile, name: str | None, axes: str) -> tuple[FloatArray, IntArray]:
     """Return the coordinates and tracks (id) of a binary PLY in an archive."""
-    where, data = f"{archive.filename}: {name}", checks.unpacked(archive, name or "")
+    where, data = f"{archive.filename}: {name}", archive.read(name or "")
     header = parse_header(where, data)
     kinds = {p.name: header.order + p.item for p in header.properties if not p.length}
     if not header.order or header.skipped or not {*axes, "id"} <= kinds.keys():

@@ -32,9 +32,7 @@ import numpy as np
 
 from pcfix.errors import InputError
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Source, damaged, number, numbers, read_xml
-from pcfix.io.cameras.checks import text_of as _text
-from pcfix.io.cameras.lenses import lens_by_name
+from pcfix.io.cameras.checks import Source, damaged, number, numbers, read_xml, text_of
 from pcfix.model import Cameras, FloatArray, Lens
 
 PREFIX, PREFIX_2, SUFFIX = "Orientation-", "Ori-PerspCentral-", ".xml"
@@ -65,16 +63,16 @@ def read(source: Source) -> Cameras:
 def _orientation(path: Path) -> tuple[FloatArray, FloatArray, Lens]:
     """Return centre, rotation world to camera, and lens."""
     root = read_xml(path)
-    if named := _text(root, ".//NameInternalCalib"):  # MMVII
+    if named := text_of(root, ".//NameInternalCalib"):  # MMVII
         tags = ("AxeI", "AxeJ", "AxeK")
         axes = [numbers(path, tag, root.findtext(f".//RotMatrix/{tag}"), 3) for tag in tags]
         centre = numbers(path, "Center", root.findtext(".//Center"), 3)
         where = path.with_name(f"{PurePosixPath(named).name}{SUFFIX}")
         return centre, np.array(axes), _calibration_2(where, read_xml(where))
     conic = _first(path, root, "OrientationConique")
-    projection = _text(conic, "TypeProj") or "eProjStenope"
+    projection = text_of(conic, "TypeProj") or "eProjStenope"
     outer = _first(path, conic, "Externe")
-    convention, matrix = _text(outer, "KnownConv"), outer.find("ParamRotation/CodageMatr")
+    convention, matrix = text_of(outer, "KnownConv"), outer.find("ParamRotation/CodageMatr")
     if projection != "eProjStenope" or convention not in _IS_INVERSE or matrix is None:
         what = f"the projection {projection} with rotations by {convention or 'angles'}"
         raise checks.unsupported(path, what, "Write the orientations again with OriConvert")
@@ -82,7 +80,7 @@ def _orientation(path: Path) -> tuple[FloatArray, FloatArray, Lens]:
     centre = numbers(path, "Centre", outer.findtext("Centre"), 3)
     inner, where = conic.find("Interne"), path
     if inner is None:
-        name = PurePosixPath(_text(conic, "FileInterne").replace("\\", "/"))
+        name = PurePosixPath(text_of(conic, "FileInterne").replace("\\", "/"))
         where = path.parent / name.name
         where = where if where.is_file() else path.resolve().parent.parent / name
         inner = _first(where, read_xml(where), "CalibrationInternConique")
@@ -96,13 +94,13 @@ def _orientation(path: Path) -> tuple[FloatArray, FloatArray, Lens]:
 
 def _calibration(path: Path, element: Element) -> Lens:
     """Return the lens of an `Interne` or `CalibrationInternConique`."""
-    convention = _text(element, "KnownConv")
+    convention = text_of(element, "KnownConv")
     if convention not in _IS_INVERSE:
         raise _not_held(path, f"convention {convention}")
     focal = number(path, "F", element.findtext("F"))
     principal, size = (numbers(path, tag, element.findtext(tag), 2) for tag in ("PP", "SzIm"))
     found = [model for entry in element.iter("CalibDistortion") for model in entry]
-    named = [(_text(model, "TypeModele") or str(model.tag), model) for model in found]
+    named = [(text_of(model, "TypeModele") or str(model.tag), model) for model in found]
     models = [(name, model) for name, model in named if name not in NO_DISTORTION]
     if len(models) > 1:
         raise _not_held(path, " after ".join(name for name, _ in models))
@@ -145,12 +143,12 @@ def _lens(
     values |= {"cx": x + b1 * (x - cx) + b2 * (y - cy), "cy": y}
     middle = ((cx - x) / focal, (cy - y) / focal)
     more = {"distortion_centre": middle, "inverse": is_inverse, "sensor": path.stem}
-    return lens_by_name(values, width, height, **more)
+    return checks.lens_by_name(values, width, height, **more)
 
 
 def _calibration_2(path: Path, root: Element) -> Lens:
     """Return the lens of a calibration of MMVII."""
-    projection = _text(root, ".//Projection")
+    projection = text_of(root, ".//Projection")
     if projection != "Stenope":
         raise _not_held(path, f"projection {projection}")
     focal = number(path, "F", root.findtext(".//PerfectProj/F"))
@@ -171,7 +169,7 @@ def _not_held(path: Path, what: str) -> InputError:
 
 def _first(path: Path, root: Element, tag: str) -> Element:
     """Return the element of this name, the root or inside it."""
-    found = root if root.tag == tag else root.find(f".//{tag}")
+    found = next(root.iter(tag), None)
     if found is None:
         raise damaged(path, f"{tag} is missing")
     return found

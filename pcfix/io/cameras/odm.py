@@ -43,8 +43,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import AffineFrame, Source, damaged, load_json, triple
-from pcfix.io.cameras.lenses import LensModel, lens_by_name
+from pcfix.io.cameras.checks import AffineFrame, LensModel, Source, damaged, lens_by_name, triple
 from pcfix.io.crs import Topocentric
 from pcfix.io.labels import unnamed
 from pcfix.io.tables import read_lines
@@ -106,14 +105,6 @@ def read(source: Source) -> Cameras:
     )
 
 
-def tie_points(source: Source, cameras: Cameras) -> TiePoints:
-    """Read points and tracks, in the frame of the poses."""
-    files = _files_of(source.path)
-    found = read_reconstruction(files["poses"])
-    points, placed = read_tie_points(found), _frame(files, found)
-    return points if placed is None else replace(points, xyz=placed.points(points.xyz))
-
-
 def _files_of(path: Path) -> Files:
     """Return the files of the project that a file or folder belongs to.
 
@@ -150,7 +141,7 @@ def _frame(files: Files, found: Reconstruction) -> AffineFrame | None:
     if not (whole or files.keys() & {*_OF_CRS, SHOTS, TOPOCENTRIC}):
         return None
     unmoved = AffineFrame(np.eye(3), np.zeros(3), found.cameras.crs or "", crs)
-    if reference is None or found.path.name == TOPOCENTRIC:
+    if reference is None or files["poses"].name == TOPOCENTRIC:
         return unmoved
     if path := files.get(TRANSFORMATION):
         with checks.reading(path):
@@ -230,7 +221,9 @@ def _read_shots(files: Files) -> Cameras:
     known = {}
     if lenses_file := files.get("cameras.json"):
         with checks.reading(lenses_file):
-            known = {k: lens(lenses_file, k, entry) for k, entry in load_json(lenses_file).items()}
+            known = {
+                k: lens(lenses_file, k, entry) for k, entry in checks.load_json(lenses_file).items()
+            }
     lenses, plain = [], 0
     for shot in each:
         width, height = float(shot["width"]), float(shot["height"])
@@ -266,7 +259,7 @@ def read_images(
         return None, []
     places = {}
     with checks.reading(path):
-        images = {str(image.get("filename")): image for image in load_json(path)}
+        images = {str(image.get("filename")): image for image in checks.load_json(path)}
         for label in labels:
             image = images.get(label) or images.get(PurePath(label).stem) or {}
             if image.get("latitude") is not None:
@@ -277,7 +270,7 @@ def read_images(
 
 def _shots(path: Path) -> dict[str, dict[str, Any]]:
     """Return the properties of every feature by file name, with its `geometry`."""
-    features = load_json(path)["features"]
+    features = checks.load_json(path)["features"]
     shots = {
         str(one["properties"]["filename"]): one["properties"] | {"geometry": one.get("geometry")}
         for one in features
@@ -298,7 +291,6 @@ class Reconstruction(NamedTuple):
     has none, or the zeros that OpenSfM writes for images without positions.
     """
 
-    path: Path
     cameras: Cameras
     reference: tuple[float, float, float] | None
     points: dict[str, Any]
@@ -343,20 +335,24 @@ def read_reconstruction(path: Path) -> Reconstruction:
             gnss=checks.measured([*shots], places, crs) if reference else None,
             unposed=unnamed(others, shots),
         )
-        return Reconstruction(path, cameras, reference, chosen.get("points", {}))
+        return Reconstruction(cameras, reference, chosen.get("points", {}))
 
 
 CHUNK_BYTES = 1 << 24
 
 
-def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
-    """Return the points in the frame of the file, and where its images saw them."""
-    path, cameras, _, points = reconstruction
+def tie_points(source: Source, cameras: Cameras) -> TiePoints:
+    """Read points and tracks, in the frame of the poses."""
+    files = _files_of(source.path)
+    path = files["poses"]
+    found = read_reconstruction(path)
+    points, placed = found.points, _frame(files, found)
     tracks = path.with_name("tracks.csv")
     if not points or not tracks.is_file():
         why = "it has no points" if not points else "there is no tracks.csv next to it"
         raise checks.no_tie_points(path, why)
     xyz = np.array([point["coordinates"] for point in points.values()], float).reshape(-1, 3)
+    xyz = xyz if placed is None else placed.points(xyz)
     camera_of, point_of = (
         {name.encode(errors="replace"): i for i, name in enumerate(names)}
         for names in (cameras.labels, points)
@@ -368,8 +364,7 @@ def read_tie_points(reconstruction: Reconstruction) -> TiePoints:
             point = np.array([point_of.get(fields[1], -1) for fields in lines], dtype=np.int64)
             camera = np.array([camera_of.get(fields[0], -1) for fields in lines], dtype=np.int64)
             values = np.array([fields[3:5] for fields in lines], dtype=float).reshape(-1, 2)
-            known = (point >= 0) & (camera >= 0)
-            parts.append((point[known], camera[known], values[known]))
+            parts.append((point, camera, values))
     point, camera, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.lexsort((camera, point))
     size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]
@@ -388,10 +383,11 @@ _MODELS = {
     "fisheye624": LensModel("fx fy cx cy k1 k2 k3 k4 k5 k6 p2 p1 s1 s2 s3 s4", "equidistant"),
     "dual": LensModel("f k1 k2 transition", "dual"),
 }
-"""By names of `lenses`; not every version of OpenSfM knows simple_radial and radial."""
+"""By names of `checks`; not every version of OpenSfM knows simple_radial and radial."""
 _PARAMETERS = {"f": "focal", "fx": "focal_x", "fy": "focal_y", "cx": "c_x", "cy": "c_y"}
 _PARAMETERS |= {"p1": "p2", "p2": "p1", "s1": "s0", "s2": "s1", "s3": "s2", "s4": "s3"}
-"""What OpenSfM calls what has another name in `lenses`."""
+"""What OpenSfM calls what has another name in `checks`."""
+_DEFAULTS = {"transition": 0.5}
 
 
 def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
@@ -402,16 +398,17 @@ def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
         what = f"the projection_type '{model}' of camera {name}"
         raise checks.unsupported(path, what, remedy, model=model, camera=name)
 
-    def value(key: str, default: float = 0.0) -> float:
+    def value(key: str, default: Any = 0.0) -> float:
         return float(camera.get(key, default))
 
     width, height = value("width"), value("height")
     scale = max(width, height)
-    given = {one: value(_PARAMETERS.get(one, one)) for one in _MODELS[model].names.split()}
-    if "transition" in given:
-        given["transition"] = value("transition", 0.5)
-    across = float(camera["focal_x" if "focal_x" in camera else "focal"])
-    down = value("focal_y", across) if "focal_x" in camera else across
+    given = {
+        one: value(_PARAMETERS.get(one, one), _DEFAULTS.get(one, 0.0))
+        for one in _MODELS[model].names.split()
+    }
+    across = value("focal_x", camera.get("focal"))
+    down = value("focal_y", across)
     given |= {"fx": across * scale, "fy": down * scale}
     given |= {"cx": width / 2.0 + value("c_x") * scale, "cy": height / 2.0 + value("c_y") * scale}
     projection = _MODELS[model].projection

@@ -30,9 +30,7 @@ import numpy as np
 
 from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import AffineFrame, Source, load_json, triple
-from pcfix.io.cameras.lenses import lens_by_name
-from pcfix.io.cameras.pix4d import fisheye
+from pcfix.io.cameras.checks import AffineFrame, Source, lens_by_name, load_json, triple
 from pcfix.io.crs import crs_text, parse_crs, plan_unit
 from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import Cameras, GnssPositions, Lens, TiePoints
@@ -151,7 +149,8 @@ def _lens(path: Path, sensor: Part, given: Part) -> Lens:
         lens = lens_by_name(values, *frame)
     elif inner.get("type") == "fisheye":
         values |= zip(("fx", "skew", "b3", "fy"), map(float, inner["affine"]), strict=True)
-        lens = fisheye(values, [float(one) for one in inner["polynomial"]], *frame)
+        shape = tuple(map(float, inner["polynomial"]))
+        lens = lens_by_name(values, *frame, projection="polynomial", shape=shape)
     else:
         what = f"the type {inner.get('type')!r:.40} of sensor {name}"
         remedy = "Remove its images and calibrate again"

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Sequence
 from pathlib import Path, PurePath
 from typing import NamedTuple
 
@@ -30,8 +29,7 @@ import numpy as np
 
 from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Source, damaged, numbers
-from pcfix.io.cameras.lenses import lens_by_name
+from pcfix.io.cameras.checks import Source, damaged, lens_by_name, numbers
 from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import Cameras, FloatArray, Lens, TiePoints
@@ -64,7 +62,7 @@ FIELDS = {
     "position": "centre",
     "rotation": "rotation",
 }
-"""Words in the header of the camera parameters, and the names of the numbers in `lenses`."""
+"""Words in the header of the camera parameters, and the names of the numbers in `checks`."""
 SHAPE = re.compile(r"^(.*?)\s*\[\s*(\d{1,2})\s*x\s*(\d{1,2})\s*\]\s*$")
 
 
@@ -80,17 +78,31 @@ def read(source: Source) -> Cameras:
     files = _find(source)
     images = read_parameters(files["parameters"]) if "parameters" in files else []
     names, posed = [image.label for image in images], [*range(len(images))]
+    turns = np.array([image.fields["rotation"] for image in images])
+    turns = checks.rotations(files.get("parameters", source.path), names, turns)
     if "external" in files:
-        labels, centres, rotations = read_external(files["external"])
+        path = files["external"]
+        listed = [line.rsplit(None, 6) for line in read_lines(path)[1:] if line.strip()]
+        labels = [row[0].strip() for row in listed]
+        texts = [(f"image {row[0]}", " ".join(row[1:])) for row in listed]
+        poses = np.array([numbers(path, where, text, 6) for where, text in texts]).reshape(-1, 6)
+        centres, rotations = poses[:, :3], from_omega_phi_kappa(*poses[:, 3:].T)
         if images:
-            rows = _rows(names, _rotations(files["parameters"], images), labels, rotations)
+            rows_of = defaultdict[str, list[int]](list)
+            for row, label in enumerate(labels):
+                rows_of[label].append(row)
+            rows = []
+            for name, turn in zip(names, turns, strict=True):
+                off = np.linalg.norm(rotations[rows_of[name]] - turn, axis=(1, 2))
+                rows.append(rows_of[name].pop(int(np.argmin(off))) if len(off) else -1)
             posed = [i for i in posed if rows[i] >= 0]
             if not posed:
-                raise damaged(files["external"], f"names none of the images of {PARAMETERS}")
+                raise damaged(path, f"names none of the images of {PARAMETERS}")
             centres, rotations = (each[rows][posed] for each in (centres, rotations))
     else:
-        labels, rotations = names, _rotations(files["parameters"], images)
-        centres = np.array([image.fields["centre"] for image in images]) + _offset(files)
+        labels, rotations = names, turns
+        centres = np.array([image.fields["centre"] for image in images]).reshape(-1, 3)
+        centres += _offset(files)
     given = [*names, *labels]
     labels = [names[i] for i in posed] or labels
     lenses = tuple(lens for i in posed if (lens := _lens(images[i])) is not None)
@@ -157,33 +169,7 @@ def _offset(files: dict[str, Path]) -> FloatArray:
     return numbers(path, "the offset", offsets.pop(), 3)
 
 
-def _rows(labels: list[str], turns: FloatArray, names: list[str], others: FloatArray) -> list[int]:
-    """Return the row of each label among names, -1 if there is none; no row is used twice.
-
-    Of equal names it is that with the most similar rotation; `turns` are those of the labels, and
-    `others` those of the names.
-    """
-    left: dict[str, list[int]] = defaultdict(list)
-    for row, name in enumerate(names):
-        left[name].append(row)
-    found = []
-    for label, turn in zip(labels, turns, strict=True):
-        rows = left[label]
-        difference = np.linalg.norm(others[rows] - turn, axis=(1, 2))
-        found.append(rows.pop(int(np.argmin(difference))) if rows else -1)
-    return found
-
-
 # ---- tables ----
-
-
-def read_external(path: Path) -> tuple[list[str], FloatArray, FloatArray]:
-    """Read the absolute table: labels, centres (k, 3) and rotations (k, 3, 3)."""
-    rows = [line.rsplit(None, 6) for line in read_lines(path)[1:] if line.strip()]
-    if not rows:
-        raise damaged(path, "has a header but no images")
-    values = np.array([numbers(path, f"image {row[0]}", " ".join(row[1:]), 6) for row in rows])
-    return [row[0].strip() for row in rows], values[:, :3], from_omega_phi_kappa(*values[:, 3:].T)
 
 
 class Image(NamedTuple):
@@ -220,14 +206,7 @@ def read_parameters(path: Path) -> list[Image]:
         parts = np.split(numbers(path, where, " ".join(words_of), ends[-1]), ends[:-1])
         fields = {name: part for (name, _), part in zip(layout, parts, strict=True) if name}
         images.append(Image(label.strip(), (width, height), fields))
-    if not images:
-        raise damaged(path, "has a header but no images")
     return images
-
-
-def _rotations(path: Path, images: list[Image]) -> FloatArray:
-    matrices = np.array([image.fields["rotation"] for image in images])
-    return checks.rotations(path, [image.label for image in images], matrices)
 
 
 def _lens(image: Image) -> Lens | None:
@@ -237,17 +216,10 @@ def _lens(image: Image) -> Lens | None:
         given |= zip(names.split(), values.tolist(), strict=False)
     if "fx" not in given:
         return None
-    if "polynomial" in given:
-        return fisheye(given, image.fields["polynomial"].tolist(), *image.size)
-    return lens_by_name(given, *image.size)
-
-
-def fisheye(given: dict[str, float], shape: Sequence[float], *frame: float) -> Lens:
-    """Return the lens (u, v) = (cx, cy) + [c d; e f] rho, rho a polynomial of 2 theta / pi.
-
-    The matrix is given as fx, skew, b3, fy.
-    """
-    return lens_by_name(given, *frame, projection="polynomial", shape=tuple(shape))
+    if "polynomial" not in given:
+        return lens_by_name(given, *image.size)
+    shape = tuple(image.fields["polynomial"].tolist())
+    return lens_by_name(given, *image.size, projection="polynomial", shape=shape)
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:

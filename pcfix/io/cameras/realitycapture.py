@@ -23,14 +23,12 @@ converters of AliceVision and EasyVolcap, agree. No file with measurements was t
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Source, image_size, number, numbers, read_xml
-from pcfix.io.cameras.lenses import lens_by_name
+from pcfix.io.cameras.checks import Source, image_size, lens_by_name, number, numbers, read_xml
 from pcfix.io.cameras.table import FILM_MM, read_sensor, sensor_file
 from pcfix.model import Cameras, Lens
 
@@ -40,18 +38,16 @@ MODELS = {
     "perspective": "",
     "brown3": "k1 k2 k3",
     "brown4": "k1 k2 k3 k4",
-    "brown3t2": "k1 k2 k3 p1 p2",
+    "brown3t2": "k1 k2 k3 - p1 p2",
     "brown4t2": "k1 k2 k3 k4 p1 p2",
-    "division": "k1",
+    "division": "d1",
 }
-"""The coefficients of each model, of the six that its files list."""
+"""The coefficients of each model, in the order of its files, which list six."""
 IMAGES = (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".webp", ".bmp", ".exr", ".jp2")
 
 
 def recognises(source: Source) -> bool:
     """Whether a file, or one of the .xmp files of a folder, uses RealityCapture's namespace."""
-    if not source.path.is_dir():
-        return NAMESPACE.encode() in source.head
     return bool(_files(source.path))
 
 
@@ -90,12 +86,11 @@ def read(source: Source) -> Cameras:
 
 
 def _files(path: Path) -> list[Path]:
-    """Return the one file, or those of a folder that use RealityCapture's namespace."""
-    if not path.is_dir():
-        return [path]
-    listed = sorted(p for p in path.iterdir() if p.suffix.lower() == ".xmp" and p.is_file())
+    """Return the one file, or those of a folder, if they use RealityCapture's namespace."""
+    inside = (p for p in path.glob("*") if p.suffix.lower() == ".xmp" and p.is_file())
+    listed = sorted(inside) if path.is_dir() else [path]
     named = [file for file in listed if file.stem != "_common"]  # which is of no image
-    return [file for file in named if NAMESPACE.encode() in file.read_bytes()]
+    return [file for file in named if NAMESPACE.encode() in Source(file).head]
 
 
 def _lens(path: Path, fields: dict[str, str], width: float, height: float) -> Lens:
@@ -114,19 +109,13 @@ def _lens(path: Path, fields: dict[str, str], width: float, height: float) -> Le
         raise checks.unsupported(path, what, f"Export with one of {', '.join(MODELS)}", model=model)
     words = fields.get("DistortionCoeficients", "")  # misspelt in the files too
     found = numbers(path, "xcr:DistortionCoeficients", words, len(words.split())).tolist()
-    k = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), found, strict=False))
-    values = {name: k[name] for name in MODELS[model].split() if name in k}
+    values = dict(zip(MODELS[model].split(), found, strict=False))
     values |= {"fx": across, "fy": focal, "skew": value("Skew") * scale}
     values |= {"cx": width / 2.0 + x, "cy": height / 2.0 + y}
-    lens = lens_by_name(values, width, height)
     if model != "division":
-        return lens
+        return lens_by_name(values, width, height)
     # In plane coordinates the centre of the image is at minus the principal point over the focal
     # length, and a length there is a share of the image divided by that of the focal length.
-    return replace(
-        lens,
-        radial=(),
-        denominator=(k.get("k1", 0.0) * (across / scale) ** 2,),
-        distortion_centre=(-x / across, -y / focal),
-        inverse=True,
-    )
+    values["d1"] = values.get("d1", 0.0) * (across / scale) ** 2
+    centre = (-x / across, -y / focal)
+    return lens_by_name(values, width, height, distortion_centre=centre, inverse=True)

@@ -45,8 +45,7 @@ import numpy as np
 from pcfix.errors import InputError, bad_file
 from pcfix.io import tables
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import Angles, Source
-from pcfix.io.cameras.lenses import LensModel, lens_by_name, model_of
+from pcfix.io.cameras.checks import Angles, LensModel, Source, lens_by_name, model_of
 from pcfix.io.crs import is_topocentric, shortened
 from pcfix.io.tables import Table
 from pcfix.lens import rotations
@@ -127,12 +126,13 @@ def read(source: Source) -> Cameras:
     if by_gnss:
         sentence = "its positions are those of the GNSS, not adjusted ones."
         checks.warn(source.path, "cameras.not_adjusted", sentence)
+    sensor = sensor_file(source)
     has_lens = turns is not None and columns.has("f", "px", "py")
     return Cameras(
         labels=tuple(columns.labels),
         centres=centres(columns, needed=True),
         rotations=turns,
-        lenses=_own_lenses(columns, source) if has_lens else None,
+        lenses=_own_lenses(columns, read_sensor(sensor)) if has_lens and sensor else None,
         crs=system,
         gnss=gnss_positions(measured) if has_both else None,
         unposed=tuple(unposed),
@@ -289,12 +289,8 @@ def _degrees(columns: Table, roles: tuple[str, ...]) -> FloatArray:
     return values.T
 
 
-def _own_lenses(columns: Table, source: Source) -> tuple[Lens, ...]:
+def _own_lenses(columns: Table, frame: Lens) -> tuple[Lens, ...]:
     """Return the lens of each row from RealityCapture's columns, with the size of a sensor."""
-    path = sensor_file(source)
-    if path is None:
-        raise checks.no_sensor(columns.path)
-    frame = read_sensor(path)
     width, height = frame.width, frame.height
     side, lenses = max(width, height), []
     distortion = np.nan_to_num(columns.where_there(DISTORTION))
@@ -311,10 +307,9 @@ def _own_lenses(columns: Table, source: Source) -> tuple[Lens, ...]:
 MILLIMETRES = ("focal", "sensor_x", "sensor_y")
 PIXELS = ("focal_px", "width_px", "height_px")
 OPENCV_NAMES = {"d1": "k4", "d2": "k5", "d3": "k6", "p2": "p1", "p1": "p2"}
-"""What OpenCV calls the parameters that have another name in `lenses`."""
+"""What OpenCV calls the parameters that have another name in `checks`."""
 OPENCV = {"OpenCV": LensModel("f cx cy k1 k2 k3 d1 d2 d3 p2 p1")}
 TERMS = OPENCV["OpenCV"].names.split()[1:]
-CENTRED = {"centred": LensModel("f")}
 DISTORTION = ("k1", "k2", "k3", "k4", "t1", "t2")
 FILM_MM = 36.0
 """Larger side of the film that 35 mm focal lengths mean."""
@@ -387,7 +382,7 @@ def write_table(folder: File, cameras: Cameras) -> None:
         sentence = f"a table has one lens, but the images have {1 + len(others)}. Use another"
         raise bad_file(target, "output.lens", f"{sentence} format.")
     is_px = given.unit == "px"
-    _, values = model_of(target, given, OPENCV if is_px else CENTRED)
+    _, values = model_of(target, given, OPENCV if is_px else {"centred": LensModel("f")})
     frame = (values.pop("f"), given.width, given.height)
     sensor = dict(zip(PIXELS if is_px else MILLIMETRES, map(float, frame), strict=True))
     sensor |= {OPENCV_NAMES.get(name, name): float(value) for name, value in values.items()}

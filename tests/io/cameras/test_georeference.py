@@ -9,7 +9,7 @@ import pytest
 from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
-from pcfix.io.cameras.georeference import adjusted_minus_gnss, georeference
+from pcfix.io.cameras.georeference import adjusted_minus_gnss, georeference, likely_mistake
 from pcfix.model import Cameras, GnssPositions
 from tests.utils import geodesy
 from tests.utils.codes import refused
@@ -158,22 +158,6 @@ def test_left_handed_axes_are_refused():
 # ---- heights ----
 
 
-@pytest.mark.parametrize(("undulation_m", "agree"), [(51.5, False), (0.2, True)])
-def test_heights_that_were_vouched_for_are_compared_with_the_gnss(undulation_m, agree):
-    """The GNSS is in the cloud's heights; those of the cameras are above it by the undulation."""
-    ecef = geocentric(*VALENCIA_LON_LAT)
-    read = cameras(ecef, "EPSG:4936", project_crs=UTM30_ALICANTE)
-    east, north, up = bring_to(read, UTM30_ALICANTE, cameras_crs=UTM30).centres[0]
-    stated = np.array([[east, north, up - undulation_m]])
-    gnss = GnssPositions(stated, np.full((1, 3), 0.02), UTM30_ALICANTE)
-    found = bring_to(replace(read, gnss=gnss), UTM30_ALICANTE, cameras_crs=UTM30, name="a.xml")
-    if agree:
-        assert found.notes == ()
-    else:
-        assert found.notes[0].code == "cameras.heights_differ"
-        assert found.notes[0].values["metres"] == pytest.approx(51.5, abs=1e-3)
-
-
 GEOID = """
 import sys, numpy as np, pyproj, rasterio
 from rasterio.transform import from_origin
@@ -187,7 +171,7 @@ with rasterio.open(folder + "/es_ign_egm08-rednap.tif", "w", driver="GTiff", cou
     out.update_tags(TYPE="VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL", AREA_OR_POINT="Point")
     out.set_band_description(1, "geoid_undulation")
 pyproj.datadir.append_data_dir(folder)
-from pcfix.io.cameras.georeference import adjusted_minus_gnss, georeference
+from pcfix.io.cameras.georeference import georeference
 from pcfix.model import Cameras
 ecef = [[float(w) for w in sys.argv[2:5]]]
 read = Cameras(("a",), np.array(ecef), np.eye(3)[None], crs="EPSG:4936",
@@ -372,3 +356,25 @@ def test_heights_that_cannot_be_compared_leave_the_plan(crs, gnss_crs, reason):
     assert np.isnan(enu_m[:, 2]).all()
     lengths = np.hypot(*enu_m[:2, :2].T)
     assert lengths == pytest.approx(np.hypot(*ENU_M[:2, :2].T), rel=5e-4)
+
+
+# ---- cameras that are not over their cloud ----
+
+LOW, HIGH = np.array([725300.0, 4369000.0, 8.0]), np.array([725600.0, 4369250.0, 30.0])
+FITS = np.random.default_rng(1).uniform([725320, 4369020, 138], [725580, 4369230, 144], (60, 3))
+AWAY = (LOW + HIGH)[:2] / 2 - np.median(FITS[:, :2], axis=0)
+
+
+@pytest.mark.parametrize(
+    ("centres", "words"),
+    [
+        (FITS[:, [1, 0, 2]], "km from the cloud in plan; check the CRS, the unit"),
+        (FITS - [-3000.0, 4000.0, 0.0], "offset of {:.0f}, {:.0f} m".format(*AWAY - [3e3, -4e3])),
+        (FITS - [0.0, 0.0, 150.0], "below the lowest point of the cloud"),
+        (FITS * [1, 1, 20 / 0.3048], "above the cloud"),
+    ],
+)
+def test_mistake(centres, words):
+    assert words in likely_mistake(centres, LOW, HIGH)
+    assert likely_mistake(FITS, LOW, HIGH) is None
+    assert likely_mistake(FITS - [250.0, 0.0, 60.0], LOW, HIGH) is None  # obliques

@@ -7,9 +7,6 @@ import numpy as np
 import pytest
 from pyproj import CRS
 
-from pcfix.io.cameras import metashape
-from pcfix.io.cameras.checks import Source, recognises
-from pcfix.io.cameras.metashape import read_calibration
 from pcfix.lens.imaging import project
 from pcfix.model import Lens
 from tests.utils.camera_files import brown, notes, read, read_ties
@@ -209,17 +206,19 @@ def test_slave_sits_on_its_master(tmp_path):
     assert [lens.sensor for lens in cameras.lenses] == ["S1", "S0"]
 
 
-def test_groups_keyframes_disabled_and_repeated_labels(tmp_path):
+def test_groups_keyframes_disabled_spherical_and_repeated_labels(tmp_path):
     images = (
         f'<group id="0" type="folder">{camera(0)}<group id="1">{camera(1)}</group></group>'
         + camera(2, attributes='sensor_id="0" enabled="false"')
         + camera(3, "", 'sensor_id="0" enabled="false"')
         + camera(4, attributes='sensor_id="0" type="keyframe"')
         + camera(5, label="img0.jpg", attributes='sensor_id="0" enabled="true"')
+        + camera(6, attributes='sensor_id="1"')
     )
-    cameras = read_chunk(tmp_path, cameras=images)
+    spherical = sensor(calibration(kind="spherical"), 1, 'type="spherical"')
+    cameras = read_chunk(tmp_path, sensors=sensor() + spherical, cameras=images)
     assert cameras.labels == ("img0.jpg", "img1.jpg", "img0.jpg")
-    assert cameras.unposed == ("img2.jpg", "img3.jpg")
+    assert cameras.unposed == ("img2.jpg", "img3.jpg", "img6.jpg")
     assert notes(cameras) == ["cameras.left_out"]
 
 
@@ -282,33 +281,6 @@ def test_additional_corrections_are_ignored(tmp_path):
     corrections = '<corrections type="fourier"><coeffs>3 4 0 0</coeffs></corrections>'
     cameras = read_chunk(tmp_path, sensors=sensor(calibration("<f>9</f>" + corrections)))
     assert notes(cameras) == ["cameras.corrections"]
-
-
-def test_images_without_a_central_projection_are_skipped(tmp_path):
-    kind = "spherical"
-    cameras = read_chunk(
-        tmp_path,
-        sensors=sensor() + sensor(calibration(kind=kind), 1, f'type="{kind}"'),
-        cameras=camera(0) + camera(1, attributes='sensor_id="1"'),
-    )
-    assert cameras.unposed == ("img1.jpg",)
-    assert notes(cameras) == ["cameras.left_out"]
-
-
-def test_calibration_file(tmp_path):
-    path = tmp_path / "calibration.xml"
-    path.write_text(
-        "<calibration><projection>fisheye</projection><width>60</width><height>40</height>"
-        "<f>100</f><cx>1</cx><b1>2</b1><k2>0.5</k2><p2>0.25</p2><date>2020</date></calibration>"
-    )
-    assert read_calibration(path) == Lens(
-        *(100.0, 60.0, 40.0, 31.0, 20.0, 2.0),
-        projection="equidistant",
-        radial=(0.0, 0.5),
-        tangential=(0.0, 0.25),
-        sensor="calibration",
-    )
-    assert not recognises(metashape, Source(path))
 
 
 # GNSS

@@ -43,16 +43,6 @@ def read(tmp_path, text, name="Orientation-a.jpg.xml"):
     return pcfix.read_cameras(path)
 
 
-def test_matrix_is_camera_to_world(tmp_path):
-    cameras = read(tmp_path, embedded(NO_DISTORTION))
-    seen = np.array([0.5, -0.25, 4.0])
-    world = np.array(TURN) @ seen + [10.0, 20.0, 30.0]
-    assert cameras.rotations[0] @ (world - cameras.centres[0]) == pytest.approx(seen)
-    assert cameras.labels == ("a.jpg",)
-    place = project(cameras.lenses[0], seen[None])[0]
-    assert place == pytest.approx([PP[0] + F * 0.125, PP[1] - F * 0.0625])
-
-
 TERMS = "<CDist>1980 1520</CDist><CoeffDist>2e-8</CoeffDist><CoeffDist>-1e-15</CoeffDist>"
 RADIAL = f"<ModRad>{TERMS}</ModRad>"
 STANDARD = (

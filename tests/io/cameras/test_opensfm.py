@@ -32,23 +32,6 @@ def read(tmp_path, *reconstructions):
     return read_file(write(tmp_path, *reconstructions))
 
 
-def test_pose_is_world_to_camera(tmp_path):
-    cameras = read(tmp_path, scene())
-    point = np.array([3.0, -4.0, 5.0])
-    x, y, z = SHOT["rotation"]
-    angle = math.sqrt(x * x + y * y + z * z)
-    axis = np.array([x, y, z]) / angle
-    turned = (  # Rodrigues
-        point * math.cos(angle)
-        + np.cross(axis, point) * math.sin(angle)
-        + axis * (axis @ point) * (1.0 - math.cos(angle))
-    )
-    expected = turned + SHOT["translation"]
-    assert cameras.rotations[0] @ (point - cameras.centres[0]) == pytest.approx(expected)
-    assert cameras.crs == "ENU:47.0,8.0,400.0"
-    assert cameras.labels == ("a.jpg",)
-
-
 def seen_by(model, camera, direction):
     """The place in the image as OpenSfM's formulas give it, one direction at a time."""
     x, y, z = direction

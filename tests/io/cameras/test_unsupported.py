@@ -1,12 +1,14 @@
 """The table of formats, and files that are known but not read: each is refused by its name."""
 
 import json
+import re
 
 import pytest
 
 import pcfix
 from pcfix.io.cameras import table
 from pcfix.io.cameras.checks import Source
+from tests.io.cameras.test_blocksexchange import photo, simple
 from tests.utils.codes import refused
 
 pytestmark = pytest.mark.quick
@@ -58,17 +60,16 @@ def test_part_of_an_export(tmp_path, name, what):
 
 
 @pytest.mark.parametrize(
-    ("inside", "what"),
+    ("inside", "data", "what"),
     [
-        ("DJI_0001.JPG", "a folder of images"),
-        ("1_initial", "Pix4D"),
-        ("AutoCal_Foc-8800.xml", "MicMac"),
-        ("cameras.json", "OpenDroneMap"),
+        ("DJI_0001.JPG", b"\xff\xd8\xff\xe0\0\x10JFIF", "an image"),
+        ("AutoCal_Foc-8800.xml", b"<ExportAPERO><CalibrationInternConique>", "MicMac"),
+        ("cameras.json", b'{"v2 dji": {"projection_type": "brown"}}', "without poses"),
     ],
 )
-def test_folder(tmp_path, inside, what):
-    (tmp_path / inside).touch()
-    (tmp_path / "readme.txt").touch()
+def test_folder(tmp_path, inside, data, what):
+    (tmp_path / inside).write_bytes(data)
+    (tmp_path / "a page.html").write_text("<html>")
     with refused("cameras.not_read") as caught:
         pcfix.read_cameras(tmp_path)
     assert what in caught.value.values["what"]
@@ -92,16 +93,9 @@ def test_unknown(tmp_path, data):
 @pytest.mark.parametrize("angles", [True, False])
 def test_a_sensor_of_positions_alone_is_refused(tmp_path, angles):
     """BlocksExchange without a lens: with rotations the sensor counts, without it says nothing."""
-    turn = "".join(f"<M_{i}{j}>{float(i == j)}</M_{i}{j}>" for i in range(3) for j in range(3))
-    rotation = f"<Rotation>{turn}</Rotation>" if angles else ""
-    photo = (
-        f"<Photo><Id>0</Id><ImagePath>a.jpg</ImagePath><Pose>{rotation}"
-        "<Center><x>1</x><y>2</y><z>3</z></Center></Pose></Photo>"
-    )
-    (tmp_path / "b.xml").write_text(
-        '<BlocksExchange version="3.2"><Block><Photogroups><Photogroup><Name>g</Name>'
-        f"{photo}</Photogroup></Photogroups></Block></BlocksExchange>"
-    )
+    text = simple(photo(), head="<Name>g</Name>")
+    text = text if angles else re.sub("<Rotation>.*</Rotation>", "", text)
+    (tmp_path / "b.xml").write_text(text)
     sensor = tmp_path / "s.csv"
     sensor.write_text("focal,sensor_x,sensor_y\n8.8,13.2,8.8\n")
     if angles:
