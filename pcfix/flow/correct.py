@@ -156,7 +156,6 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     notes = [
         *plan.input_notes,
         *([] if tally.views is None else tally.views.notes()),
-        *coded("cloud.labels", plan.labelling.notes),
         *(() if tested is None else tested.doubts),
         *plan.notes,
         *coded("water.extent", water_notes),

@@ -24,7 +24,7 @@ from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.heights import fill_holes, grid_window, margin_cells
 from pcfix.grid.lattice import Lattice, lattice_over, round_resolution
 from pcfix.io import rasters
-from pcfix.io.atomic import scratch_folder, temporary_output
+from pcfix.io.atomic import all_or_none
 from pcfix.io.crs import crs_words, parts
 from pcfix.io.files import check_output, scratch_arrays, write_text
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
@@ -103,11 +103,7 @@ def grid_dsm(
         if progress is not None:
             progress(round(share * count), count)
 
-    with ExitStack() as stack:
-        outputs = {"dsm": task.target, **more}
-        drafts = {n: stack.enter_context(temporary_output(path)) for n, path in outputs.items()}
-        folder = stack.enter_context(scratch_folder(task.target))
-        stack.enter_context(scratch_arrays(task.target))
+    with all_or_none(), scratch_arrays(task.target):
         with open_cloud(task.source) as source:
             crs, count = metric_crs(source), len(source)
             corrected = any(is_ours(vlr) for vlr in source.vlrs)
@@ -121,11 +117,9 @@ def grid_dsm(
         # the widest circle around a triangle
         reach = TIN_REACH_SPACINGS * apart_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
         reach_m = max(reach)
-        paths = {name: folder / f"{name}.tif" for name in drafts}
+        paths = {"dsm": task.target, **more}
         tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
         counted = _write_rasters(tiles, lattice, reach_m, apart_m, rules, paths, crs, tags, report)
-        for name, path in paths.items():
-            rasters.copy_as_cog(path, drafts[name])
     if given.style:
         write_text(style, raster_style(task.target, rules.what), overwrite=given.overwrite)
     result = Figures(
@@ -172,7 +166,7 @@ def _write_rasters(
     # the number of cells around a window whose points decide on it
     beyond = int(np.ceil(reach)) + 1 if method == "tin" else 0
     plan = None if crs is None else parts(crs)[0]
-    new = partial(rasters.new_raster, lattice=lattice, tags={"PCFIX": json.dumps(tags)})
+    new = partial(rasters.new_raster, cells=lattice, tags={"PCFIX": json.dumps(tags)})
     # the width of holes to fill, in cells; a TIN has filled its own
     widest = 0.0 if method == "tin" else (rules.fill or 0.0) / size_m
     margin = margin_cells(widest) if widest else 0

@@ -281,8 +281,7 @@ def mask_of(path: File | None, cloud_crs: str | CRS | None) -> WaterMask | None:
     if path is None:
         return None
     polygons = read_water_polygons(path, cloud_crs)
-    _warn(polygons.notes)
-    return WaterMask(polygons.geometries[0], polygons.name, tuple(map(str, polygons.notes)))
+    return WaterMask(polygons.geometries[0], polygons.name)
 
 
 def labelling_of(options: Any, view: CloudView) -> Labelling:

@@ -115,7 +115,7 @@ DEEP_M = 10.0
 def _finish(plan: LabelPlan, task: FileTask, counts: LabelCounts) -> Figures:
     """Check the counts of a cloud, and return the summary."""
     check(plan, counts)
-    notes = list[Any](plan.labelling.notes)
+    notes = list[PcfixWarning]()
     if DEEP_M < counts.least_m < np.inf:
         sentence = f"{plan.name}: every point is more than {counts.least_m:.0f} m below the water"
         sentence += f" ({plan.water}). Check the height of the water and its vertical datum."

@@ -15,7 +15,7 @@ from pcfix.flow.photos import PhotoBlock, block_of, check_kind, finished
 from pcfix.flow.runner import Progress, check_summary
 from pcfix.grid.lattice import Lattice, lattice_over
 from pcfix.io import rasters
-from pcfix.io.atomic import scratch_folder, temporary_output
+from pcfix.io.atomic import scratch_folder
 from pcfix.io.clouds import is_cloud
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.model import WaterPlane
@@ -62,7 +62,7 @@ def ortho_photo(
     known = [*paths_in(given), *([given.dsm] if given.dsm else []), *paths]
     target = rasters.check_tif(output, overwrite=given.overwrite, inputs=known)
     check_summary(given, [*known, target])
-    with threads(given.jobs), temporary_output(target) as draft, scratch_folder(target) as folder:
+    with threads(given.jobs), scratch_folder(target) as folder:
         # without water, its level is below all ground
         water = NO_WATER if given.water is None else given.water
         coarse_m = None
@@ -77,8 +77,7 @@ def ortho_photo(
         high = np.array([bed.left_m + columns * bed.cell_m, bed.top_m])
         side = given.resolution or float(f"{block.gsd_m:.1e}")
         lattice = lattice_over(low, high - 1e-6 * side, side, str(given.dsm))
-        covered, ground = _write(block, lattice, given, folder / "plain.tif", progress)
-        rasters.copy_as_cog(folder / "plain.tif", draft)
+        covered, ground = _write(block, lattice, given, target, progress)
     return finished(
         given,
         started,

@@ -139,7 +139,7 @@ def _write_shaded(folder: Path) -> None:
         down, right = lattice.first_row - below.first_row, lattice.first_column - below.first_column
         bands = dict.fromkeys(("red", "green", "blue", "alpha"), "")
         plan = None if depth.crs is None else depth.crs.to_wkt()
-        with rasters.new_cog(target, lattice, plan, bands, dtype="uint8", nodata=None) as out:
+        with rasters.new_raster(target, lattice, plan, bands, dtype="uint8", nodata=None) as out:
             for window in lattice.window.parts(BLOCK_CELLS):
                 wide = window.grown(edge)
                 height = rasters.read_within(surface, wide)

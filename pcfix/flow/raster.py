@@ -144,7 +144,7 @@ def _new_raster(path: Path, name: str, source: RasterSource, tags: dict[str, str
         new |= {"dtype": source.dtype.name, "scale_offset": (source.scale, source.offset)}
     elif not unit:
         new |= {"dtype": "uint8", "nodata": NO_CODE, "resampling": "nearest"}
-    return rasters.new_cog(path, source.raster, bands=dict.fromkeys(bands, unit), **new)
+    return rasters.new_raster(path, source.raster, bands=dict.fromkeys(bands, unit), **new)
 
 
 def _has_changed(cell: Cells) -> BoolArray:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from functools import partial
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, SettingError, coded
+from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.runner import read_ahead
 from pcfix.io.clouds import CloudView as CloudView
 from pcfix.io.clouds import Points as Points
@@ -243,17 +242,14 @@ def _found(view: CloudView | None) -> FoundSurface:
 
 
 def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundSurface:
-    """Return the surface fitted to shoreline points; those without a height get that of the cloud.
-
-    Each of the notes on the points is a warning too.
-    """
+    """Return the surface fitted to shoreline points; those without a height get the cloud's."""
     from pcfix.water.fit import fit_water, heights_from_cloud
     from pcfix.water.river import fit_river
 
     shore = read_shoreline(path, None if view is None else view.crs, crs=options.water_crs)
     if view is not None:
         _check_near(shore.name, shore.xyz, view, max(FAR_M, *(view.high - view.low)))
-    xyz, notes = shore.xyz.copy(), list[Any](shore.notes)
+    xyz = shore.xyz.copy()
     lacking = np.isnan(xyz[:, 2])
     if lacking.any():
         if view is None:
@@ -261,18 +257,14 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
             raise InputError("cloud.missing", text, path=shore.name)
         chunks = (one.xyz for one in view.chunks())
         xyz[lacking, 2] = heights_from_cloud(xyz[lacking, :2], chunks, SHORE_RADIUS_M)
-        notes.append(
+        words = (
             f"{shore.name}: {int(lacking.sum()):,} points have no height and get that of the cloud"
             f" within {SHORE_RADIUS_M:g} m; {int(np.isnan(xyz[:, 2]).sum()):,} have none and are"
             " ignored."
         )
-    found: FoundSurface
+        warnings.warn(PcfixWarning("water.points", words), stacklevel=2)
     if options.water_model == "river":
         low, high = corners(*xyz[:, :2].T)
         bounds = (*low.tolist(), *high.tolist()) if view is None else view.bounds
-        found = fit_river(xyz, bounds, name=shore.name, counts=shore.counts)
-    else:
-        found = fit_water(xyz, model=options.water_model, counts=shore.counts)
-    for note in coded("water.points", notes):
-        warnings.warn(note, stacklevel=2)
-    return replace(found, notes=(*map(str, notes), *found.notes))
+        return fit_river(xyz, bounds, name=shore.name, counts=shore.counts)
+    return fit_water(xyz, model=options.water_model, counts=shore.counts)

@@ -345,29 +345,34 @@ def is_same_numbers(source: CRS, target: CRS, *, heights: bool = True) -> bool:
 
 def way_to_cloud(
     crs: str | CRS | None, cloud_crs: str | CRS | None, at: FloatArray, name: str, *, heights: bool
-) -> tuple[Points | None, Notes]:
-    """Return the transformation from a file's CRS to the cloud's, None for none, and notes.
+) -> Points | None:
+    """Return the transformation from a file's CRS to the cloud's, None for none; warn of guesses.
 
     A CRS that is None is not stated; that of the file is ``local`` to use its numbers unchanged.
     The cloud's is projected, in metres. With `heights` z matters.
     """
+
+    def assume(code: str, sentence: str) -> None:
+        warnings.warn(PcfixWarning(code, f"{name}: {sentence}"), stacklevel=4)
+
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
     if isinstance(crs, str) and crs.strip().lower() == LOCAL:
-        return None, ()
+        return None
     source = None if crs is None else parse_crs(crs, name)
     if all(one is None or is_local(one) for one in (source, cloud)):
-        return None, ()
+        return None
     if source is None:
         known = "" if cloud is None else cloud.name
-        sentence = f"{name}: names no CRS; that of the cloud is assumed ({known})."
-        return None, (PcfixWarning("crs.assumed", sentence),)
+        assume("crs.assumed", f"names no CRS; that of the cloud is assumed ({known}).")
+        return None
     if cloud is None:
         unit = plan_unit(source)[0] if source.is_projected else "degrees"
         if not source.is_projected or plan_unit(source)[1] != 1.0:
             sentence = f"is in {unit} ({source.name}), the cloud names no CRS. Set the cloud's CRS."
             raise bad_file(name, "crs.cloud_missing", sentence, unit=unit)
-        sentence = f"{name}: the cloud names no CRS; that of the file is assumed ({source.name})."
-        return None, (PcfixWarning("crs.assumed", sentence),)
+        words = f"the cloud names no CRS; that of the file is assumed ({source.name})."
+        assume("crs.assumed", words)
+        return None
     if is_local(cloud) or is_local(source):
         sentence = f"is in {source.name}, the cloud in {cloud.name}, of which one is local. Use one"
         raise bad_file(name, "crs.local", f"{sentence} CRS, or give that of the file as 'local'.")
@@ -376,16 +381,18 @@ def way_to_cloud(
         sentence = f"{source.name} is neither a map projection nor in degrees."
         raise bad_file(name, "crs.not_projected", sentence, crs=source.name)
     agree = not heights or heights_agree(source, cloud)
-    kinds, notes = (heights_of(source), heights_of(cloud)), list[PcfixWarning]()
+    kinds = heights_of(source), heights_of(cloud)
     missing = "the file" if kinds[0] == "unstated" != kinds[1] else ""
     if kinds == ("ellipsoidal", "unstated"):
         missing = f"the cloud's CRS ({cloud.name})"
     if heights and missing:
-        sentence = f"{name}: {missing} names no vertical datum; that of the other is assumed."
-        notes.append(PcfixWarning("crs.heights_assumed", sentence))
+        words = f"{missing} names no vertical datum; that of the other is assumed."
+        assume("crs.heights_assumed", words)
     if agree and is_same_numbers(source, cloud, heights=heights):
-        return None, tuple(notes)
+        return None
     plan = shortened(crs_text(parts(source)[0]))
     instead = f"or, if the heights agree with the cloud's, give the file's CRS as {plan}"
-    forward, more = transformation(source, cloud, at, name, heights=not agree, instead=instead)
-    return forward, (*more, *notes)
+    forward, notes = transformation(source, cloud, at, name, heights=not agree, instead=instead)
+    for note in notes:
+        warnings.warn(note, stacklevel=3)
+    return forward

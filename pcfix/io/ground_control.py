@@ -127,13 +127,11 @@ def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None)
         if not same or on[row] != on[first]:
             words = f"it is described differently in line {table.line[first]}. Use other names."
             raise _error(table, row, "gcps.contradiction", words)
-    camera, notes = _cameras_of(table, cameras)
+    camera = _cameras_of(table, cameras)
     posed = np.flatnonzero(camera >= 0)
     own = np.array([row_of[name] for name in names])
     rows = np.unique(own[posed])  # the first mark of each point that is used
-    moved, more = _to_cameras(table, xyz[rows], rows, cameras, crs or stated_crs)
-    for note in (*notes, *more):
-        warnings.warn(note, PcfixWarning, stacklevel=2)
+    moved = _to_cameras(table, xyz[rows], rows, cameras, crs or stated_crs)
     sigma_px = np.sqrt((sigma[posed, 3:5] ** 2).mean(axis=1))
     sigma_m, sigma_on, sigma_px = (
         np.where(np.isnan(values), default, values)
@@ -175,8 +173,8 @@ def _few(names: list[str]) -> str:
     return ", ".join(names[:_NAMED]) + more
 
 
-def _cameras_of(table: Table, cameras: Cameras) -> tuple[IntArray, list[PcfixWarning]]:
-    """Return the camera of each mark, -1 for images without a pose, and a warning about these.
+def _cameras_of(table: Table, cameras: Cameras) -> IntArray:
+    """Return the camera of each mark, -1 for images without a pose, and warn of these.
 
     Refuse marks in unknown images or outside their image, and two marks of a point in an image.
     """
@@ -210,19 +208,20 @@ def _cameras_of(table: Table, cameras: Cameras) -> tuple[IntArray, list[PcfixWar
             words = f"{u:g}, {v:g} is outside the image of {lens.width:g} x {lens.height:g} pixels."
             words += " Count pixels from its upper left corner, to the right and down."
             raise _error(table, row, "gcps.outside", words, uv=[u, v])
-    if not lost:
-        return camera, []
-    words = f"{table.path}: {(camera < 0).sum()} of {len(camera)} marks are in images without a"
-    words += f" pose ({_few(lost)}) and were skipped."
-    return camera, [PcfixWarning("gcps.unposed", words, path=table.path, images=lost)]
+    if lost:
+        words = f"{table.path}: {(camera < 0).sum()} of {len(camera)} marks are in images without a"
+        words += f" pose ({_few(lost)}) and were skipped."
+        note = PcfixWarning("gcps.unposed", words, path=table.path, images=lost)
+        warnings.warn(note, stacklevel=3)
+    return camera
 
 
 def _to_cameras(
     table: Table, xyz: FloatArray, rows: IntArray, cameras: Cameras, source: str | None
-) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
-    """Return points in the CRS of the cameras, and notes; refuse points far from the block."""
+) -> FloatArray:
+    """Return points in the CRS of the cameras; refuse points far from the block."""
     target = cameras.crs
-    forward, notes = way_to_cloud(source, target, xyz, str(table.path), heights=True)
+    forward = way_to_cloud(source, target, xyz, str(table.path), heights=True)
     moved = xyz if forward is None else forward(xyz)
     lost = ~np.isfinite(moved).all(axis=1) & np.isfinite(xyz).all(axis=1)
     if lost.any():
@@ -231,7 +230,7 @@ def _to_cameras(
         words = f"{place} is outside the cloud's CRS. Check that of the points."
         raise _error(table, rows[i], "crs.outside", words)
     if target is None or target.strip().lower() == LOCAL:
-        return moved, notes
+        return moved
     # points that no image of the block can show
     middle = np.median(cameras.centres[:, :2], axis=0)
     reach_m = FARTHEST_M + np.hypot(*(cameras.centres[:, :2] - middle).T).max()
@@ -240,7 +239,7 @@ def _to_cameras(
         i = int(np.argmax(apart_m))
         words = f"it is {apart_m[i] / 1e3:,.0f} km from the block. Check the CRS of the points, and"
         raise _error(table, rows[i], "gcps.far", f"{words} the order of x and y.")
-    return moved, notes
+    return moved
 
 
 # Formats

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError, bad_file
 from pcfix.grid.lattice import Lattice, Window
-from pcfix.io.atomic import is_full_disk, scratch_folder, temporary_output
+from pcfix.io.atomic import is_full_disk, temporary_output, temporary_path
 from pcfix.io.files import check_input, check_output, refusing
 from pcfix.libraries import analysis_library
 from pcfix.model import FloatArray
@@ -34,7 +34,8 @@ NO_HEIGHT = -9999.0
 METRE = "metre"
 TO_95 = 1.959964
 """Half-width of 95 % of a normal distribution, in standard deviations."""
-TILE = 256
+TILE, BLOCK_CELLS = 256, 1024
+"""Sides of the tiles of a file, and of the windows that are worked on."""
 check_tif = partial(check_output, suffixes=(".tif", ".tiff"))
 """Return the path of a GeoTIFF that may be written."""
 
@@ -76,6 +77,14 @@ def lattice_of(source: DatasetReader) -> Lattice:
     return Lattice(size, *first, source.width, source.height)
 
 
+def transform_of(lattice: Lattice) -> Affine:
+    """Return the geotransform of the cells of a lattice."""
+    from rasterio.transform import from_origin
+
+    size = lattice.resolution_m
+    return from_origin(lattice.left_m, lattice.top_m, size, size)
+
+
 def read_masked(raster: Any, band: int = 1, **how: Any) -> FloatArray:
     """Return a band as float64, NaN for no value; `how` goes to rasterio."""
     return np.asarray(raster.read(band, masked=True, **how).astype(np.float64).filled(np.nan))
@@ -84,14 +93,11 @@ def read_masked(raster: Any, band: int = 1, **how: Any) -> FloatArray:
 def read_onto(path: Path, lattice: Lattice) -> FloatArray:
     """Return the mean of the first band in each cell of a lattice, NaN for no value and beyond."""
     from rasterio.enums import Resampling
-    from rasterio.transform import from_origin
     from rasterio.vrt import WarpedVRT
 
-    size = lattice.resolution_m
     how = {
-        "transform": from_origin(lattice.left_m, lattice.top_m, size, size),
-        "width": lattice.width, "height": lattice.height, "dtype": "float64", "nodata": NO_HEIGHT,
-        "resampling": Resampling.average,
+        "transform": transform_of(lattice), "width": lattice.width, "height": lattice.height,
+        "dtype": "float64", "nodata": NO_HEIGHT, "resampling": Resampling.average,
     }  # fmt: skip
     with open_raster(path) as source, WarpedVRT(source, crs=source.crs, **how) as same:
         return read_masked(same)
@@ -130,8 +136,8 @@ def slices(window: Window) -> tuple[tuple[int, int], tuple[int, int]]:
 
 @contextmanager
 def new_raster(
-    path: Path,
-    lattice: Lattice | DatasetReader,
+    target: Path,
+    cells: Lattice | DatasetReader,
     crs: CRS | str | None,
     bands: Mapping[str, str],
     *,
@@ -139,61 +145,45 @@ def new_raster(
     nodata: float | None = NO_HEIGHT,
     tags: Mapping[str, str] | None = None,
     scale_offset: tuple[float, float] = (1.0, 0.0),
+    resampling: str = "average",
 ) -> Iterator[DatasetWriter]:
-    """Open a new tiled, compressed GeoTIFF for `write_bands`.
+    """Open a new cloud optimised GeoTIFF (COG) for `write_bands`.
 
-    Its cells are those of `lattice`, which may be another raster. `bands` maps the description of
-    each band to its unit; `dtype` and `nodata` are those of all bands, `tags` the metadata of the
-    file. Bands with names of colours, alpha too, are such.
+    It is written as a plain GeoTIFF, which is then copied. `bands` maps the description of each
+    band to its unit; those with names of colours, alpha too, are such. `dtype` and `nodata` are
+    those of all bands, `tags` the metadata of the file, `resampling` is for its overviews.
     """
     import rasterio
     from rasterio.enums import ColorInterp
-    from rasterio.transform import from_origin
+    from rasterio.shutil import copy
 
-    if isinstance(lattice, Lattice):
-        size = lattice.resolution_m
-        transform = from_origin(lattice.left_m, lattice.top_m, size, size)
-    else:
-        transform = lattice.transform
+    packed = {"compress": "deflate", "predictor": 3 if dtype.startswith("float") else 2}
+    packed["bigtiff"] = "IF_SAFER"
     profile = {
-        "driver": "GTiff", "width": lattice.width, "height": lattice.height, "count": len(bands),
+        "driver": "GTiff", "width": cells.width, "height": cells.height, "count": len(bands),
         "dtype": dtype, "nodata": nodata, "interleave": "band", "tiled": True,
-        "blockxsize": TILE, "blockysize": TILE, **_compression(dtype),
+        "blockxsize": TILE, "blockysize": TILE, **packed,
         "crs": None if crs is None else rasterio.CRS.from_user_input(crs),
-        "transform": transform,
+        "transform": transform_of(cells) if isinstance(cells, Lattice) else cells.transform,
     }  # fmt: skip
-    with _written(path), rasterio.open(path, "w", **profile) as target:
-        for number, (name, unit) in enumerate(bands.items(), start=1):
-            target.set_band_description(number, name)
-            target.set_band_unit(number, unit)
-        known = ColorInterp.__members__
-        if bands.keys() & known.keys():
-            target.colorinterp = [known.get(name, ColorInterp.undefined) for name in bands]
-        target.update_tags(**(tags or {}))
-        if scale_offset != (1.0, 0.0):
-            target.scales, target.offsets = ([one] * len(bands) for one in scale_offset)
-        yield target
-
-
-@contextmanager
-def new_cog(
-    target: Path,
-    lattice: Lattice | DatasetReader,
-    crs: CRS | str | None,
-    bands: Mapping[str, str],
-    *,
-    resampling: str = "average",
-    **how: Any,
-) -> Iterator[DatasetWriter]:
-    """Open a new cloud optimised GeoTIFF (COG) for `write_bands`; see `new_raster`.
-
-    It is a copy of a plain one. `resampling` is for its overviews.
-    """
-    with temporary_output(target) as temporary, scratch_folder(target) as folder:
-        plain = folder / target.name
-        with new_raster(plain, lattice, crs, bands, **how) as out:
+    near = target.with_name(f"{target.name}.plain.tif")
+    with temporary_output(target) as temporary, temporary_path(near) as plain:
+        with _written(plain), rasterio.open(plain, "w", **profile) as out:
+            for number, (name, unit) in enumerate(bands.items(), start=1):
+                out.set_band_description(number, name)
+                out.set_band_unit(number, unit)
+            known = ColorInterp.__members__
+            if bands.keys() & known.keys():
+                out.colorinterp = [known.get(name, ColorInterp.undefined) for name in bands]
+            out.update_tags(**(tags or {}))
+            if scale_offset != (1.0, 0.0):
+                out.scales, out.offsets = ([one] * len(bands) for one in scale_offset)
             yield out
-        copy_as_cog(plain, temporary, resampling)
+        with _written(temporary):
+            copy(
+                plain, temporary, driver="COG", blocksize=TILE, overview_resampling=resampling,
+                statistics="YES", **packed,
+            )  # fmt: skip
 
 
 @contextmanager
@@ -220,39 +210,6 @@ def _written(path: Path) -> Iterator[None]:
         raise OSError(str(error)) from error
 
 
-def add_overviews(path: Path) -> None:
-    """Add overviews to a GeoTIFF, until one fits a tile."""
-    import rasterio
-    from rasterio.enums import Resampling
-
-    with rasterio.open(path) as raster:
-        dtype, longest = raster.dtypes[0], max(raster.width, raster.height)
-    levels = math.ceil(math.log2(max(longest / TILE, 1.0)))
-    if levels:
-        settings = {f"{k}_OVERVIEW".upper(): str(v).upper() for k, v in _compression(dtype).items()}
-        settings["GDAL_TIFF_OVR_BLOCKSIZE"] = str(TILE)
-        with _written(path), rasterio.Env(**settings), rasterio.open(path, "r+") as raster:
-            raster.build_overviews([2**k for k in range(1, levels + 1)], Resampling.average)
-
-
-def _compression(dtype: str) -> dict[str, Any]:
-    predictor = 3 if dtype.startswith("float") else 2
-    return {"compress": "deflate", "predictor": predictor, "bigtiff": "IF_SAFER"}
-
-
-def copy_as_cog(source: Path, target: Path, resampling: str = "average") -> None:
-    """Copy a GeoTIFF as a cloud optimised one (COG); `resampling` is for its overviews."""
-    from rasterio.shutil import copy
-
-    with open_raster(source) as raster:
-        options = _compression(raster.dtypes[0])
-    with _written(target):
-        copy(
-            source, target, driver="COG", blocksize=TILE, overview_resampling=resampling,
-            statistics="YES", **options,
-        )  # fmt: skip
-
-
 def write_dod(dsm: Path, reference: Path, output: Path) -> None:
     """Write the first band of one raster minus that of another, metres; replace an older file.
 
@@ -270,17 +227,15 @@ def write_dod(dsm: Path, reference: Path, output: Path) -> None:
             source, src_crs=crs, crs=one.crs or crs, transform=one.transform, width=one.width,
             height=one.height, resampling=Resampling.bilinear, dtype="float64", nodata=NO_HEIGHT,
         )  # fmt: skip
-        with temporary_output(target) as temporary:
-            with same, new_raster(temporary, one, one.crs, {"difference": "metre"}) as sink:
-                for _, window in sink.block_windows(1):
-                    difference = read_masked(one, window=window) - read_masked(same, window=window)
-                    known += int(np.isfinite(difference).sum())
-                    filled = np.where(np.isfinite(difference), difference, NO_HEIGHT)
-                    sink.write(filled.astype(np.float32), 1, window=window)
+        with same, new_raster(target, one, one.crs, {"difference": METRE}) as sink:
+            for window in Window(0, one.height, 0, one.width).parts(BLOCK_CELLS):
+                part = slices(window)
+                difference = read_masked(one, window=part) - read_masked(same, window=part)
+                known += int(np.isfinite(difference).sum())
+                write_bands(sink, [difference], window)
             if known == 0:
                 sentence = f"{dsm} and {reference} have no cell in common. Check their CRS."
                 raise GeometryError("raster.no_overlap", sentence, dsm=dsm, reference=reference)
-            add_overviews(temporary)
 
 
 def open_array(path: Path) -> DataArray:

@@ -62,7 +62,6 @@ class Vectors:
     geometries: Geometries
     crs: str | None
     name: str
-    notes: tuple[PcfixWarning, ...] = ()
 
     @cached_property
     def coordinates(self) -> FloatArray:
@@ -117,10 +116,8 @@ def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool
     """Transform geometries to the cloud's CRS; see `way_to_cloud`. Without `heights` z stays."""
     at = vectors.coordinates
     heights = heights and bool(np.isfinite(at[:, 2]).any())
-    forward, notes = way_to_cloud(
-        vectors.crs, cloud_crs, np.nan_to_num(at), vectors.name, heights=heights
-    )
-    vectors = replace(vectors, notes=(*vectors.notes, *notes))
+    at = np.nan_to_num(at)
+    forward = way_to_cloud(vectors.crs, cloud_crs, at, vectors.name, heights=heights)
     if forward is None:
         return vectors
     geometries = vectors.geometries
@@ -197,7 +194,6 @@ class Shoreline(NamedTuple):
 
     xyz: FloatArray
     name: str
-    notes: tuple[PcfixWarning, ...]
     counts: FloatArray
 
 
@@ -236,13 +232,13 @@ def read_shoreline(
         apart = max(line.length / (2.0 * SHORE_RADIUS_M), 1.0)
         worth = 2.0 / 3.0 * vertices if vertices < total else vertices
         counts.append(np.full(total, min(1.0, min(worth, apart) / total)))
-    xyz, notes = np.vstack(found), vectors.notes
+    xyz = np.vstack(found)
     known = xyz[np.isfinite(xyz[:, 2]), 2]
     if len(known) >= FEW and not known.any():  # a flat drawing
         xyz[:, 2] = np.nan
         sentence = f"{vectors.name}: all {len(known)} heights are exactly 0; they are ignored."
-        notes = (*notes, PcfixWarning("water.zero_heights", sentence, count=len(known)))
-    return Shoreline(xyz, vectors.name, notes, np.concatenate(counts))
+        warnings.warn(PcfixWarning("water.zero_heights", sentence, count=len(known)), stacklevel=2)
+    return Shoreline(xyz, vectors.name, np.concatenate(counts))
 
 
 def _single_parts(geometries: Geometries) -> Geometries:
@@ -268,7 +264,7 @@ def read_water_polygons(path: File, cloud_crs: str | CRS | None = None) -> Vecto
     vectors = in_cloud_crs(read_vectors(path), cloud_crs, heights=False)
     parts = shapely.force_2d(_single_parts(vectors.geometries))
     polygons = parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON]
-    crossed, notes = ~shapely.is_valid(polygons), vectors.notes
+    crossed = ~shapely.is_valid(polygons)
     if crossed.any():
         polygons[crossed] = shapely.make_valid(
             polygons[crossed], method="structure", keep_collapsed=False
@@ -276,13 +272,14 @@ def read_water_polygons(path: File, cloud_crs: str | CRS | None = None) -> Vecto
         count, area_m2 = int(crossed.sum()), float(shapely.area(polygons[crossed]).sum())
         sentence = f"{vectors.name}: {count} of {len(polygons)} polygons crossed themselves."
         sentence += f" Repaired, they cover {area_m2:.1f} m2."
-        notes = (*notes, PcfixWarning("mask.repaired", sentence, count=count, area_m2=area_m2))
+        note = PcfixWarning("mask.repaired", sentence, count=count, area_m2=area_m2)
+        warnings.warn(note, stacklevel=2)
     area = shapely.union_all(polygons)
     if not area.area > 0.0:
         kinds = sorted({geometry.geom_type for geometry in vectors.geometries})
         sentence = f"holds no polygon with an area ({', '.join(kinds)}). A mask needs polygons."
         raise bad_file(vectors.name, "mask.no_area", sentence, kinds=kinds)
-    return replace(vectors, geometries=np.array([area]), notes=notes)
+    return replace(vectors, geometries=np.array([area]))
 
 
 OLDER = {"VERSION": "1.2"}

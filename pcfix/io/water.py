@@ -209,14 +209,14 @@ def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRa
         share = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.5)])
         size = source.width, source.height
         at = np.column_stack([*place_of(t, *(share * size).T), np.zeros(5)])
-        to_cloud, notes = systems.way_to_cloud(crs, cloud_crs, at, name, heights=True)
+        to_cloud = systems.way_to_cloud(crs, cloud_crs, at, name, heights=True)
         is_grid = to_cloud is None and t.b == t.d == 0.0 and t.a > 0.0 > t.e  # north-up
         cells, most = size[0] * size[1], MOST_CELLS if is_grid else MOST_MESHED
         if min(size) < 2 or cells > most:
             sentence = f"has {size[0]:,} x {size[1]:,} cells, {most:,} at most. Cut it to the"
             sentence += " cloud, or make the cells larger, in the cloud's CRS."
             raise bad_file(name, "water.raster_size", sentence, cells=cells)
-        heights, more = _heights(source, crs, name)
+        heights = _heights(source, crs, name)
     # noise of the cells, against their neighbours: waves are smooth over a few cells
     around = (heights[:-2, 1:-1] + heights[2:, 1:-1] + heights[1:-1, :-2] + heights[1:-1, 2:]) / 4
     noise = np.abs(heights[1:-1, 1:-1] - around)
@@ -225,9 +225,7 @@ def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRa
     if slope_deg > ROUGH_DEG:
         sentence = f"{name}: the water surface is rough ({noise_m:.2f} m, slopes of {slope_deg:.0f}"
         sentence += " degrees). Smooth it, or fit a level to it."
-        more.append(PcfixWarning("water.rough", sentence, noise_m=noise_m))
-    for note in (*notes, *more):
-        warnings.warn(note, stacklevel=3)
+        warnings.warn(PcfixWarning("water.rough", sentence, noise_m=noise_m), stacklevel=3)
     short = name.replace("\\", "/").rpartition("/")[2]
     if is_grid and np.isfinite(heights).any():
         return WaterRaster(heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), short)
@@ -239,11 +237,9 @@ def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRa
     return mesh
 
 
-def _heights(
-    source: DatasetReader, crs: CRS | None, name: str
-) -> tuple[FloatArray, list[PcfixWarning]]:
-    """Read a raster, metres, NaN for no height; also return notes on what is assumed."""
-    unit, notes = (source.units[0] or "").strip(), list[PcfixWarning]()
+def _heights(source: DatasetReader, crs: CRS | None, name: str) -> FloatArray:
+    """Read a raster, metres, NaN for no height; warn of impossible ones."""
+    unit = (source.units[0] or "").strip()
     # the unit of heights is that of the band, else that of the CRS
     own_m = 1.0 if unit or crs is None or systems.is_local(crs) else systems.metres_up(crs)
     if unit.lower() not in METRES or own_m != 1.0:
@@ -256,9 +252,11 @@ def _heights(
         unknown = int(np.isnan(heights).sum())
         if unknown:
             sentence = f"{name}: has no nodata value. {unknown:,} impossible heights are ignored."
-            notes.append(PcfixWarning("water.raster_nodata", sentence, count=unknown))
+            warnings.warn(
+                PcfixWarning("water.raster_nodata", sentence, count=unknown), stacklevel=4
+            )
     heights[np.isinf(heights)] = np.nan
-    return heights, notes
+    return heights
 
 
 def _mesh_of(heights: FloatArray, transform: Affine, to_cloud: Points, name: str) -> WaterMesh:

@@ -33,7 +33,6 @@ class WaterMask:
 
     area: Any  # shapely Polygon or MultiPolygon, valid, in the cloud's CRS, metres
     name: str = "mask"  # for messages
-    notes: tuple[str, ...] = ()  # of the reader, for the summary
 
     def inside(self, x: FloatArray, y: FloatArray) -> BoolArray:
         """Return which of n plan positions, metres, world frame, are inside."""
@@ -96,11 +95,6 @@ class Labelling:
     settings: LandRules
     mask: WaterMask | None = None
     pools: Pools | None = None
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Notes on reading the mask."""
-        return () if self.mask is None else self.mask.notes
 
     @property
     def is_plain(self) -> bool:

@@ -338,7 +338,7 @@ def read_lists(path: Path) -> Iterator[Any]:
 
 def read_lines(path: Path) -> Iterator[Any]:
     shore = read_shoreline(path, "EPSG:32632")
-    yield shore.xyz[:, :2], shore.counts, shore.notes
+    yield shore.xyz[:, :2], shore.counts
     yield read_water_polygons(path, "EPSG:32632")
 
 
