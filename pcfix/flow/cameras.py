@@ -18,7 +18,7 @@ from pcfix.io.cameras.georeference import adjusted_minus_gnss, likely_mistake
 from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.crs import shortened
 from pcfix.io.files import check_input
-from pcfix.io.gnss_positions import read_gnss
+from pcfix.io.ground_control import read_gnss
 from pcfix.lens.frames import cameras_in_sight
 from pcfix.model import Cameras, FloatArray, TiePoints, WaterDimension
 from pcfix.options.correct import CamerasCheckOptions

@@ -14,8 +14,7 @@ from pcfix.adjust.diagnosis import EXPORT, MOST_STATED_M, Diagnosis, diagnosed, 
 from pcfix.errors import InputError, PcfixError, PcfixWarning
 from pcfix.flow.inputs import Inputs, ties_of
 from pcfix.flow.surfaces import CloudView
-from pcfix.io.gnss_positions import gnss_in_frame_of
-from pcfix.io.ground_control import read_ground_control
+from pcfix.io.ground_control import gnss_in_frame_of, read_ground_control
 from pcfix.model import Cameras, GnssPositions, TiePoints, WaterSurface
 from pcfix.options.declare import File, OptionSet, options_of
 from pcfix.options.shared import (

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -79,9 +79,7 @@ class Inputs(MaskOption, InputOptions):
             sentence = "tide needs image-times, the time of each image."
             raise SettingError("option.needs", sentence, options=["tide", "image_times"])
         times = read_image_times(given, cameras.labels)
-        offset, notes = level_offsets(read_tide(self.tide), times, cameras.labels)
-        _warn(notes)
-        return offset
+        return level_offsets(*read_tide(self.tide), times, cameras.labels)
 
     def read(self) -> Cameras:
         """Return the cameras in the frame of their file."""
@@ -102,7 +100,8 @@ class Inputs(MaskOption, InputOptions):
             read = self.read() if read is None else read
             placement = self._georeferenced(read, cloud_crs)
             cameras, to_cloud = placement.cameras(read), placement.points
-            _warn(placement.notes)
+            for note in placement.notes:
+                warnings.warn(note, stacklevel=2)
         if self.views is None:
             return cameras, None
         if read is not None and Path(self.views) == Path(str(self.cameras)):
@@ -288,11 +287,6 @@ def labelling_of(options: Any, view: CloudView) -> Labelling:
     """Return the rules by which points count as submerged, with the mask in the cloud's CRS."""
     mask = mask_of(options.water_mask, view.crs)
     return Labelling(options.part(LandRules), mask)
-
-
-def _warn(notes: Iterable[str | PcfixWarning]) -> None:
-    for note in notes:
-        warnings.warn(note, PcfixWarning, stacklevel=3)
 
 
 def paths_in(options: OptionSet, but: tuple[str, ...] = ()) -> list[Path]:

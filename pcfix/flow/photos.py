@@ -188,9 +188,8 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
     check_above_water(cameras, surface)
     ground, waters = Ground(heights, *origin), dict[str, Path]()
     if given.water_per_image is not None:
-        found, few = rasters_of_images(given.water_per_image, [path.name for path in paths])
+        found = rasters_of_images(given.water_per_image, [path.name for path in paths])
         waters = {paths[at].stem: path for at, path in found.items()}
-        notes += [PcfixWarning("water.images_missing", note) for note in few]
     low = float(np.nanmin(ground.height_m))
     sizes = [(photo.centre[2] - low) / photo.lens.focal for photo in photos]
     if not min(sizes) > 0.0:

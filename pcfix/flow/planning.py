@@ -96,11 +96,11 @@ def plan_of(
     check_above_water(cameras, found.surface, offset)
     folder = options.water_per_image
     settings = learning.resolved(options, cameras, kind, own_water=folder is not None)
-    own, notes = own_water_of(folder, cameras, found.surface, view, offset)
+    own = own_water_of(folder, cameras, found.surface, view, offset)
     survey = Survey(found.surface, cameras, settings, offset, Learned(line), own_water=own)
     return Plan(
         options, inputs, view, survey, found, labelling, None, kind, some_unlisted, blocks.transfer,
-        input_notes=(*coded("water.surface", found.notes), *coded("water.images", notes)),
+        input_notes=tuple(coded("water.surface", found.notes)),
     )  # fmt: skip
 
 

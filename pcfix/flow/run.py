@@ -32,7 +32,7 @@ from pcfix.flow.surfaces import view_of
 from pcfix.io import rasters, vectors
 from pcfix.io.clouds import is_cloud
 from pcfix.io.files import ENSEMBLE, read_json
-from pcfix.io.gnss_positions import read_gnss
+from pcfix.io.ground_control import read_gnss
 from pcfix.io.las.source import RasterBand
 from pcfix.io.tiles import Tiles, check_one_file
 from pcfix.libraries import analysis_library

@@ -180,14 +180,14 @@ def own_water_of(
     water: WaterSurface,
     view: CloudView,
     level_offset_m: FloatArray | None = None,
-) -> tuple[Field | None, tuple[str, ...]]:
-    """Return the separate water surfaces of images, and notes on them.
+) -> Field | None:
+    """Return the separate water surfaces of images.
 
     The folder has rasters named after the images. `water` is that of the other images, and
     `level_offset_m`, shape (k,), how much higher the water stood at each image.
     """
     if folder is None:
-        return None, ()
+        return None
     if isinstance(water, WaterMesh):
         raise SettingError(
             "option.exclusive",
@@ -196,7 +196,7 @@ def own_water_of(
             options=["water_per_image", "water"],
         )
     west, south, east, north = view.bounds
-    paths, notes = rasters_of_images(folder, cameras.labels)
+    paths = rasters_of_images(folder, cameras.labels)
     offset = np.zeros(len(cameras)) if level_offset_m is None else level_offset_m
     heights = dict[int, WaterRaster]()
     overlaps, differs = [], list[float]()
@@ -226,7 +226,7 @@ def own_water_of(
             path=folder, difference_m=off_m,
         )  # fmt: skip
     k, rest = len(cameras), water if isinstance(water, WaterRaster) else None
-    return build_fields(heights, k, rest), notes
+    return build_fields(heights, k, rest)
 
 
 def _found(view: CloudView | None) -> FoundSurface:

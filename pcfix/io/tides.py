@@ -10,6 +10,7 @@ The heights above the take-off place are those that drones recorded in their ima
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -34,24 +35,15 @@ to A (2 pi 1 h / 12.4 h)^2 / 8 = 6 cm off, that over two hours 26 cm."""
 _USE_TABLE = "Give a CSV table label,time instead."
 
 
-class ImageTimes(NamedTuple):
-    """When k images were taken."""
+class Times(NamedTuple):
+    """Times of k images, or of the rows of a tide table."""
 
     time_s: FloatArray  # (k,), seconds since 1970, UTC if `zoned`, else of a local clock
     zoned: bool
     name: str  # of the source, for messages
 
 
-class TideTable(NamedTuple):
-    """Water levels over m times; above any datum, as only differences are used."""
-
-    time_s: FloatArray  # (m,), increasing, as in `ImageTimes`
-    level_m: FloatArray  # (m,)
-    zoned: bool
-    name: str
-
-
-def read_image_times(path: File, labels: Sequence[str]) -> ImageTimes:
+def read_image_times(path: File, labels: Sequence[str]) -> Times:
     """Find out when images were taken.
 
     Parameters
@@ -72,7 +64,7 @@ def read_image_times(path: File, labels: Sequence[str]) -> ImageTimes:
     return _times(found, where, [texts[row] for row in rows])
 
 
-def _from_exif(folder: Path, labels: Sequence[str]) -> ImageTimes:
+def _from_exif(folder: Path, labels: Sequence[str]) -> Times:
     from PIL import Image
 
     files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in IMAGES)
@@ -101,7 +93,7 @@ def _rows(names: Sequence[str], labels: Sequence[str], source: Path) -> list[int
     return rows
 
 
-def _times(source: Path, where: Sequence[str], texts: Sequence[str]) -> ImageTimes:
+def _times(source: Path, where: Sequence[str], texts: Sequence[str]) -> Times:
     """Parse times; all must have zones, or none."""
     moments = []
     for at, text in zip(where, texts, strict=True):
@@ -120,11 +112,11 @@ def _times(source: Path, where: Sequence[str], texts: Sequence[str]) -> ImageTim
         sentence = f"{where[odd]}: only some times have a zone ('{texts[odd]}'). Write all alike."
         raise bad_file(source, "time.zone", sentence, value=texts[odd])
     utc = [moment if zoned[0] else moment.replace(tzinfo=UTC) for moment in moments]
-    return ImageTimes(np.array([moment.timestamp() for moment in utc]), zoned[0], str(source))
+    return Times(np.array([moment.timestamp() for moment in utc]), zoned[0], str(source))
 
 
-def read_tide(path: File) -> TideTable:
-    """Read a table with the columns ``time`` (ISO 8601) and ``level_m``."""
+def read_tide(path: File) -> tuple[Times, FloatArray]:
+    """Read a table of increasing ``time`` (ISO 8601) and ``level_m``, above any datum."""
     source = check_input(path)
     table = read_table(source, ("time", "level_m"))
     level = table.of(("level_m",))[:, 0]
@@ -136,13 +128,13 @@ def read_tide(path: File) -> TideTable:
         raise bad_file(source, "tide.order", sentence, line=line)
     if len(level) < 2:
         raise bad_file(source, "tide.one_row", "has one row. Give at least two.")
-    return TideTable(times.time_s, level, times.zoned, times.name)
+    return times, level
 
 
 def level_offsets(
-    tide: TideTable, times: ImageTimes, labels: Sequence[str]
-) -> tuple[FloatArray, tuple[PcfixWarning, ...]]:
-    """Return how much higher than on average the water was at each of k images, metres, and notes.
+    tide: Times, level_m: FloatArray, times: Times, labels: Sequence[str]
+) -> FloatArray:
+    """Return how much higher than on average the water was at each of k images, metres.
 
     The level is linear between the rows of the table. The average over the images is the level that
     the user gives.
@@ -159,14 +151,14 @@ def level_offsets(
         sentence = f"does not cover image {image}, taken at {taken} ({outside.size} of"
         sentence += f" {len(labels)} images are outside). Add rows, or check the zones."
         raise bad_file(name, "tide.not_covered", sentence, image=image, count=int(outside.size))
-    level = np.interp(times.time_s, clock, tide.level_m)
+    level = np.interp(times.time_s, clock, level_m)
     row = np.clip(np.searchsorted(clock, times.time_s) - 1, 0, len(clock) - 2)
-    longest_s, notes = float(np.diff(clock)[row].max()), list[PcfixWarning]()
+    longest_s = float(np.diff(clock)[row].max())
     if longest_s > LONG_GAP_S:
         hours = longest_s / 3600.0
         sentence = f"{name}: its rows are up to {hours:.1f} h apart; give one each hour."
-        notes.append(PcfixWarning("tide.sparse", sentence, hours=hours))
-    return level - level.mean(), tuple(notes)
+        warnings.warn(PcfixWarning("tide.sparse", sentence, hours=hours), stacklevel=2)
+    return np.asarray(level - level.mean())
 
 
 FOLDERS = ("", "images")

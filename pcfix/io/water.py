@@ -283,13 +283,8 @@ def read_image_raster(path: File, cloud_crs: str | CRS | None) -> WaterRaster:
     return found
 
 
-def rasters_of_images(
-    folder: File, names: Sequence[str]
-) -> tuple[dict[int, Path], tuple[str, ...]]:
-    """Find the rasters of the water that have the names of images, by the rows of these.
-
-    The notes are on images without one.
-    """
+def rasters_of_images(folder: File, names: Sequence[str]) -> dict[int, Path]:
+    """Find the rasters of the water that have the names of images, by the rows of these."""
     files = sorted(Path(folder).glob("*.tif"))
     row, unclear = match_labels(names, [one.stem for one in files])
     if unclear:
@@ -299,8 +294,10 @@ def rasters_of_images(
     if not found:
         sentence = f"has no raster named after an image, such as {Path(names[0]).stem}.tif."
         raise bad_file(folder, "water.no_image_rasters", sentence)
-    lost = len(names) - len(found)
-    return found, (f"{lost} images have no water raster in {folder}.",) * (lost > 0)
+    if lost := len(names) - len(found):
+        sentence = f"{lost} images have no water raster in {folder}."
+        warnings.warn(PcfixWarning("water.images_missing", sentence), stacklevel=3)
+    return found
 
 
 def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:

@@ -19,8 +19,7 @@ from pcfix.io.cameras.colmap import FILE as FILE_OF_PLACE
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.io.clouds import read_cloud
 from pcfix.io.files import ENSEMBLE, find_members, write_members
-from pcfix.io.gnss_positions import read_gnss
-from pcfix.io.ground_control import read_ground_control
+from pcfix.io.ground_control import read_gnss, read_ground_control
 from pcfix.io.photographs import read_photograph, size_of
 from pcfix.io.tables import read_check_depths
 from pcfix.io.tides import read_image_times, read_tide

@@ -8,7 +8,7 @@ import pytest
 
 import pcfix
 from pcfix.io.clouds import read_reference
-from pcfix.io.gnss_positions import read_gnss
+from pcfix.io.ground_control import read_gnss
 from pcfix.io.las.source import LasSource, metric_crs, stated_crs
 from pcfix.io.tables import read_check_depths
 from pcfix.io.vectors import read_vectors

@@ -1,6 +1,7 @@
 """Tide tables, the times of images, the water level of each, and recorded flying heights."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from pcfix.io.tides import ImageTimes, TideTable, level_offsets, read_image_times, read_tide
+from pcfix.io.tides import Times, level_offsets, read_image_times, read_tide
 from tests.utils.codes import refused
 from tests.utils.shared import needs
 
@@ -56,20 +57,23 @@ def test_zones_and_spellings(tmp_path):
     ],
 )
 def test_offsets(tmp_path, text, times, level, codes):
-    tide = read_tide(table(tmp_path, text))
+    tide, heights = read_tide(table(tmp_path, text))
     found, labels = times_of(tmp_path, *(f"2026-05-01{time}" for time in times))
-    offset, notes = level_offsets(tide, found, labels)
+    with warnings.catch_warnings(record=True) as notes:
+        warnings.simplefilter("always")
+        offset = level_offsets(tide, heights, found, labels)
     assert offset == pytest.approx(np.array(level) - np.mean(level), abs=1e-9)
-    assert [note.code for note in notes] == codes
+    assert [note.message.code for note in notes] == codes
 
 
 @given(shift=st.floats(-5, 5), share=st.lists(st.floats(0, 1), min_size=2, max_size=9))
 def test_any_gauge_zero(shift, share):
     at, labels = np.linspace(0.0, 44_712.0, 60), [str(i) for i in range(len(share))]
     level = np.sin(at / 44_712.0 * 2.0 * math.pi)
-    times = ImageTimes(np.array(share) * at[-1], True, "images")
-    one, _ = level_offsets(TideTable(at, level, True, "tide"), times, labels)
-    other, _ = level_offsets(TideTable(at, level + shift, True, "tide"), times, labels)
+    times = Times(np.array(share) * at[-1], True, "images")
+    tide = Times(at, True, "tide")
+    one = level_offsets(tide, level, times, labels)
+    other = level_offsets(tide, level + shift, times, labels)
     assert one == pytest.approx(other, abs=1e-12)
     # of a sine over steps of 12.6 min the chord is at most (2 pi / 59)^2 / 8 = 1.4 mm off
     true = np.sin(times.time_s / 44_712.0 * 2.0 * math.pi)
@@ -77,13 +81,13 @@ def test_any_gauge_zero(shift, share):
 
 
 def test_table_that_does_not_fit(tmp_path):
-    tide = read_tide(table(tmp_path, TIDE))
+    tide, level = read_tide(table(tmp_path, TIDE))
     late = times_of(tmp_path, "2026-05-01T10:00:00Z", "2026-05-01T11:00:01Z")
     with refused("tide.not_covered", path=tide.name, image="IMG_1", count=1):
-        level_offsets(tide, *late)
+        level_offsets(tide, level, *late)
     local = times_of(tmp_path, "2026-05-01T10:00:00", "2026-05-01T10:30:00")
     with refused("time.zone", path=tmp_path / "times.csv"):
-        level_offsets(tide, *local)
+        level_offsets(tide, level, *local)
 
 
 @pytest.mark.parametrize(
