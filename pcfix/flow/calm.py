@@ -57,10 +57,10 @@ def calm_frames(
     Parameters
     ----------
     frames : path
-        Folder of photographs of one size, in the order of their names, or a video.
+        Folder of photographs of one size, in the order of their names.
     out : path
-        Image in the format of the frames, with the metadata of the first; PNG for a video. The
-        spread is written next to it, and with `surface` a folder of rasters of the water.
+        Image in the format of the frames, with the metadata of the first. The spread is written
+        next to it, and with `surface` a folder of rasters of the water.
     options, progress
         See `pcfix.correct_file`; progress is in frames, each of which is read twice, with `surface`
         three times.
@@ -69,7 +69,7 @@ def calm_frames(
     check_summary(given)
     started = time.perf_counter()
     found = read_frames(frames, given.every)
-    interval = given.interval * given.every if given.interval else found.interval_s
+    interval = given.interval * given.every if given.interval else None
     if given.surface and interval is None:
         sentence = "--surface needs the time between the frames. Give --interval."
         raise SettingError("option.missing", sentence, option="interval")

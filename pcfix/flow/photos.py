@@ -24,7 +24,7 @@ from pcfix.io.files import check_output
 from pcfix.io.labels import match_labels
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
 from pcfix.io.rasters import filled_heights, open_raster
-from pcfix.io.water import rasters_of_images, read_image_raster
+from pcfix.io.water import rasters_of_images, read_water_raster
 from pcfix.model import Cameras, FloatArray, Lens, WaterDimension
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import PhotosOptions
@@ -143,7 +143,7 @@ class PhotoBlock:
         """Return the scene of an image, with its own water where that is known."""
         if path.stem not in self.waters:
             return self.scene
-        return replace(self.scene, water=read_image_raster(self.waters[path.stem], self.crs))
+        return replace(self.scene, water=read_water_raster(self.waters[path.stem], self.crs))
 
 
 def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlock:

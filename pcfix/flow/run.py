@@ -34,7 +34,7 @@ from pcfix.io.clouds import is_cloud
 from pcfix.io.files import ENSEMBLE, read_json
 from pcfix.io.ground_control import read_gnss
 from pcfix.io.las.source import RasterBand
-from pcfix.io.tiles import Tiles, check_one_file
+from pcfix.io.tiles import Tiles
 from pcfix.libraries import analysis_library
 from pcfix.model import WaterDimension
 from pcfix.options.correct import AdjustOptions, CorrectOptions, RunOptions
@@ -105,7 +105,6 @@ def run(
     inputs = [path for some in given.files().values() for path in some]
     if options.m3c2:
         load_py4dgeo()
-    check_one_file(given.source, options)
     if isinstance(given.source, Tiles):
         check_folder(given.path_of("corrected"), given.source.paths)
     record = _opened(given)
@@ -376,26 +375,26 @@ class RunResults:
     @property
     def depth(self) -> DataArray:
         """Depth of the bed, shape (y, x), metres below the water, positive down; NaN on land."""
-        return rasters.open_array(self._file(results.DEPTH))
+        return self._raster(results.DEPTH)
 
     @property
     def bed(self) -> DataArray:
         """Heights of the bed, shape (y, x), metres; NaN on land."""
-        return rasters.open_array(self._file(results.BED))
+        return self._raster(results.BED)
 
     @property
     def surface(self) -> DataArray:
         """Heights of land and bed, shape (y, x), metres."""
-        return rasters.open_array(self._file(SURFACE))
+        return self._raster(SURFACE)
 
     @property
     def uncertainty(self) -> DataArray:
         """Vertical uncertainty of the bed at 95 %, shape (y, x), metres, predicted."""
-        return rasters.open_array(self._file(results.UNCERTAINTY))
+        return self._raster(results.UNCERTAINTY)
 
     def layer(self, name: str) -> GeoDataFrame:
         """Return a layer of ``map.gpkg``: depth_contours, waterline, corrected_area, cameras ..."""
-        return vectors.read_frame(self._file("map.gpkg"), name)
+        return analysis_library("geopandas").read_file(self._file("map.gpkg"), layer=name)
 
     @property
     def tables(self) -> dict[str, DataFrame]:
@@ -406,6 +405,10 @@ class RunResults:
         """
         files = sorted((self.folder / COMPARED).glob("*.csv")) if self.compared else []
         return {one.stem: analysis_library("pandas").read_csv(one) for one in files}
+
+    def _raster(self, name: str) -> DataArray:
+        array = analysis_library("rioxarray").open_rasterio(self._file(name), masked=True)
+        return array.squeeze("band", drop=True).rename(name.partition(".")[0])
 
     def _file(self, name: str) -> Path:
         path = self.folder / name

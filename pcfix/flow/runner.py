@@ -37,7 +37,7 @@ from pcfix.io.files import write_bytes, write_text
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix, corrected_identity, las_writer
 from pcfix.io.rasters import check_tif
-from pcfix.io.tiles import Clouds, Tiles, band_of, check_one_file, inputs_of, open_cloud, tiles_of
+from pcfix.io.tiles import Clouds, Tiles, band_of, inputs_of, open_cloud, tiles_of
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.libraries import optional_library
 from pcfix.options.declare import File, options_of
@@ -158,7 +158,6 @@ def run_command(
         return result
     folder = files.path_of(output)
     task = FileTask(tiles, folder)
-    check_one_file(tiles, options)
     check_folder(folder, tiles.paths)
     named = Path(tiles.name)
     if named.is_dir() and folder.resolve().is_relative_to(named.resolve()):
@@ -489,7 +488,6 @@ def file_task(
     further outputs, checked like the output, by `check`.
     """
     started = time.perf_counter()
-    check_one_file(input, options)
     source: Any = input if isinstance(input, Tiles) else files.check_input(input)
     known = [one for one in (*inputs_of(input), *reads) if isinstance(one, str | PathLike)]
     for path in (output, *more):

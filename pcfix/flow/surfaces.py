@@ -18,7 +18,7 @@ from pcfix.io.clouds import points_of as points_of
 from pcfix.io.las.source import metric_crs, stated_crs
 from pcfix.io.tiles import CloudFiles, open_cloud
 from pcfix.io.vectors import SHORE_RADIUS_M, is_vector_file, read_shoreline
-from pcfix.io.water import rasters_of_images, read_image_raster, read_water
+from pcfix.io.water import rasters_of_images, read_water, read_water_raster
 from pcfix.label.labelling import Part
 from pcfix.model import (
     NOISE_CLASSES,
@@ -202,7 +202,7 @@ def own_water_of(
     overlaps, differs = [], list[float]()
     with warnings.catch_warnings():  # those of the first raster are enough
         for image, path in paths.items():
-            heights[image] = raster = read_image_raster(path, view.crs)
+            heights[image] = raster = read_water_raster(path, view.crs)
             warnings.simplefilter("ignore", PcfixWarning)
             # the rasters must overlap the cloud, and have the vertical datum of the common water
             rows, columns = np.nonzero(np.isfinite(raster.height_m))

@@ -300,16 +300,12 @@ def find_members(cameras: File) -> tuple[Path, Members] | None:
     from pcfix.adjust.precision import Members  # not quick to load
 
     sentence = "is not an ensemble of an adjustment. Adjust again, or remove the file."
-    with refusing(found, "ensemble.damaged", sentence):
-        with np.load(found) as arrays:
-            values = {one.name: np.asarray(arrays[one.name]) for one in fields(Members)}
-        labels, lens_names = (tuple(values.pop(n).tolist()) for n in ("labels", "lens_names"))
-        m, k, p = len(values["turn"]), len(labels), len(lens_names)
-        shapes = {
-            **{"focal": (k,), "turn": (m, k, 3), "shift_m": (m, k, 3)},
-            **{"lens": (m, k, p), "water": (m, 7)},
-        }
-        for name, shape in shapes.items():
-            if values[name].shape != shape or not np.isfinite(values[name]).all():
-                raise ValueError(name)
-    return found, Members(labels=labels, lens_names=lens_names, **values)
+    with refusing(found, "ensemble.damaged", sentence), np.load(found) as arrays:
+        values: dict[str, Any] = {one.name: arrays[one.name] for one in fields(Members)}
+        values |= {name: tuple(values[name].tolist()) for name in ("labels", "lens_names")}
+        members = Members(**values)
+        m, k = members.turn.shape[:2]
+        shapes = members.shift_m.shape, members.lens.shape, members.water.shape
+        if shapes != ((m, k, 3), (m, k, len(members.lens_names)), (m, 7)):
+            raise ValueError(shapes)
+    return found, members

@@ -7,21 +7,25 @@ of pixels, which are copied as they are stored.
 from __future__ import annotations
 
 import shutil
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import SettingError, bad_file
 from pcfix.io.atomic import temporary_output
-from pcfix.io.files import check_output, refusing, write_bytes
+from pcfix.io.files import check_output, refusing
 from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray
 from pcfix.options.declare import File
+
+if TYPE_CHECKING:
+    from rasterio.io import DatasetReader
 
 JPEG, TIFF, PNG = (".jpg", ".jpeg"), (".tif", ".tiff"), (".png",)
 SUFFIXES = (*JPEG, *TIFF, *PNG)
@@ -40,50 +44,44 @@ def photographs_in(folder: Path) -> list[Path]:
     return found
 
 
+@contextmanager
+def _opened(path: Path) -> Iterator[DatasetReader]:
+    """Open a photograph with GDAL."""
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning
+
+    with refusing(path, *DAMAGED), warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path) as image:
+            yield image
+
+
 def size_of(path: Path) -> tuple[int, int]:
     """Return columns and rows of a photograph, from its header."""
-    with refusing(path, *DAMAGED):
-        if path.suffix.lower() in TIFF:
-            with photo_library("tifffile").TiffFile(path) as file:
-                return int(file.pages[0].imagewidth), int(file.pages[0].imagelength)
-        from PIL import Image
-
-        with Image.open(path) as image:
-            return image.size
+    with _opened(path) as image:
+        return image.width, image.height
 
 
 def read_photograph(path: Path) -> Pixels:
     """Return the pixels as stored, shape (rows, columns, bands), not rotated by EXIF."""
-    suffix = path.suffix.lower()
-    with refusing(path, *DAMAGED):
-        if suffix in TIFF:
-            with photo_library("tifffile").TiffFile(path) as file:
-                page = file.pages[0]
-                pixels = page.asarray()
-                pixels = pixels if page.planarconfig == 1 else np.moveaxis(pixels, 0, -1)
-        elif suffix in PNG:
-            cv2 = photo_library("cv2")
-            pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-            if pixels is None:
-                raise ValueError("no PNG")
-        else:
-            from PIL import Image
+    if path.suffix.lower() in JPEG:
+        from PIL import Image
 
-            with Image.open(path) as image:
-                pixels = np.asarray(image)
-    return pixels if pixels.ndim == 3 else pixels[..., None]
+        with refusing(path, *DAMAGED), Image.open(path) as photograph:
+            pixels = np.asarray(photograph)
+        return pixels if pixels.ndim == 3 else pixels[..., None]
+    with _opened(path) as image:
+        return np.moveaxis(image.read(), 0, -1)
 
 
 def read_colours(path: Path) -> Pixels:
-    """Return pixels of 8 or 16 bits, red before blue in every format, without alpha."""
+    """Return pixels of 8 or 16 bits, without alpha."""
     pixels = read_photograph(path)
     if pixels.dtype not in (np.uint8, np.uint16):
         sentence = f"has {pixels.dtype} pixels. Give photographs of 8 or 16 bits."
         raise bad_file(path, "photos.kind", sentence, kind=pixels.dtype)
     if pixels.shape[2] == 4 and path.suffix.lower() not in TIFF:
         pixels = pixels[..., :3]
-    if pixels.shape[2] == 3 and path.suffix.lower() in PNG:
-        pixels = pixels[..., ::-1]
     return np.ascontiguousarray(pixels)
 
 
@@ -101,7 +99,7 @@ def write_photograph(source: Path, target: Path, pixels: Pixels, touched: BoolAr
         elif suffix in TIFF:
             _write_tiff(source, path, pixels)
         else:
-            path.write_bytes(_png(pixels))
+            _write_png(path, pixels)
 
 
 def _write_jpeg(source: Path, path: Path, pixels: Pixels, touched: BoolArray) -> None:
@@ -158,106 +156,70 @@ _TIFF_KEPT = {270, 271, 272, 274, 282, 283, 296, 305, 306, 315, 700, 33432, 3355
 """Texts, resolution, rotation, XMP, GeoTIFF keys, and tags of multispectral cameras."""
 
 
-def _png(pixels: Pixels) -> bytes:
-    """Return the bytes of a PNG file."""
-    return bytes(photo_library("cv2").imencode(".png", pixels)[1].tobytes())
+def _write_png(path: Path, pixels: Pixels) -> None:
+    """Write a PNG file of 8 or 16 bits."""
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning
+
+    rows, columns, count = pixels.shape
+    how = {"width": columns, "height": rows, "count": count, "dtype": pixels.dtype.name}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path, "w", driver="PNG", **how) as target:
+            target.write(np.moveaxis(pixels, -1, 0))
 
 
 @dataclass(frozen=True)
 class Frames:
-    """A sequence of images of one size, from a folder or from every n-th frame of a video.
-
-    `photographs` is empty for a video. `interval_s` is the time between frames, where a video
-    states it.
-    """
+    """The photographs of a sequence in a folder, all of one size."""
 
     path: Path
     photographs: tuple[Path, ...]
-    names: tuple[str, ...]  # without a suffix
     columns: int
     rows: int
-    interval_s: float | None = None
-    every: int = 1
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the frames without a suffix."""
+        return tuple(one.stem for one in self.photographs)
 
     def __iter__(self) -> Iterator[Pixels]:
         """Yield the pixels of each frame, shape (rows, columns, bands), as they are stored."""
-        if self.photographs:
-            yield from map(read_photograph, self.photographs)
-            return
-        with _opened(self.path) as film:
-            for number in range(len(self.names) * self.every):
-                if not film.grab():
-                    sentence = f"cannot be read beyond frame {number}. Convert it again."
-                    raise bad_file(self.path, "video.damaged", sentence, frame=number)
-                if number % self.every == 0:
-                    pixels = film.retrieve()[1]
-                    yield pixels if pixels.ndim == 3 else pixels[..., None]
+        return map(read_photograph, self.photographs)
 
 
 def read_frames(path: File, every: int = 1) -> Frames:
-    """Return the frames of a folder or a video, one in `every`; none is decoded yet."""
+    """Return the frames of a folder, one in `every`; none is decoded yet."""
     place = Path(path)
-    if not place.exists():
-        raise bad_file(place, "frames.missing", "there is no such file.")
     if place.is_file():
-        cv2, count = photo_library("cv2"), 0
-        with _opened(place) as film:  # headers of videos may be wrong, so the frames are counted
-            rate = float(film.get(cv2.CAP_PROP_FPS))
-            while film.grab():
-                count += 1
-            columns = int(film.get(cv2.CAP_PROP_FRAME_WIDTH))
-            rows = int(film.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        names = tuple(f"{place.stem}_{every * number:05d}" for number in range(count // every))
-        interval_s = every / rate if 0.1 <= rate <= 10_000.0 else None
-        found = Frames(place, (), names, columns, rows, interval_s, every)
-    else:
-        paths = tuple(photographs_in(place)[::every])
-        sizes = [size_of(one) for one in paths]
-        for one, size in zip(paths, sizes, strict=True):
-            if size != sizes[0]:
-                sentence = f"has {size} pixels, {paths[0].name} {sizes[0]}. Give one size."
-                raise bad_file(one, "photos.size", sentence, size=size)
-        found = Frames(place, paths, tuple(one.stem for one in paths), *sizes[0])
-    count = len(found.names)
-    if count < LEAST_FRAMES:
-        sentence = f"gives {count} frames, of {LEAST_FRAMES} at least. Give more, or lower --every."
-        raise bad_file(place, "frames.too_few", sentence, frames=count)
-    return found
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    cv2 = photo_library("cv2")
-    film = cv2.VideoCapture(str(path))
-    try:
-        if not film.isOpened():
-            sentence = "OpenCV cannot read this video. Convert it to MP4, or give its frames."
-            raise bad_file(path, "video.unreadable", sentence)
-        film.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        yield film
-    finally:
-        film.release()
+        sentence = "is not a folder. Extract the frames of a video: ffmpeg -i VIDEO FOLDER/%05d.png"
+        raise bad_file(place, "photos.no_folder", sentence)
+    paths = tuple(photographs_in(place)[::every])
+    sizes = [size_of(one) for one in paths]
+    for one, size in zip(paths, sizes, strict=True):
+        if size != sizes[0]:
+            sentence = f"has {size} pixels, {paths[0].name} {sizes[0]}. Give one size."
+            raise bad_file(one, "photos.size", sentence, size=size)
+    if len(paths) < LEAST_FRAMES:
+        sentence = f"gives {len(paths)} frames, of {LEAST_FRAMES} at least. Give more, or lower"
+        raise bad_file(place, "frames.too_few", f"{sentence} --every.", frames=len(paths))
+    return Frames(place, paths, *sizes[0])
 
 
 def check_calm(path: File, frames: Frames, *, overwrite: bool) -> tuple[Path, Path]:
     """Return the paths of the median and of its spread; refuse names that cannot be used."""
-    inputs = frames.photographs or (frames.path,)
-    suffixes = (frames.photographs[0].suffix.lower(),) if frames.photographs else PNG
-    target = check_output(path, overwrite=overwrite, inputs=inputs, suffixes=suffixes)
-    if frames.photographs and target.parent.resolve() == frames.path.resolve():
+    first = frames.photographs[0]
+    how: dict[str, Any] = {"overwrite": overwrite, "inputs": frames.photographs}
+    target = check_output(path, suffixes=(first.suffix.lower(),), **how)
+    if target.parent.resolve() == first.parent.resolve():
         sentence = f"{target}: is in the folder of the frames. Give a file in another folder."
         raise SettingError("output.is_input", sentence, path=target)
-    spread = target.with_name(f"{target.stem}_spread.tif")
-    return target, check_output(spread, overwrite=overwrite, inputs=inputs)
+    return target, check_output(target.with_name(f"{target.stem}_spread.tif"), **how)
 
 
 def write_calm(target: Path, frames: Frames, pixels: Pixels) -> None:
     """Write the median, shape (rows, columns, bands), with the metadata of the first photograph."""
-    if frames.photographs:
-        everywhere = np.ones(pixels.shape[:2], bool)
-        write_photograph(frames.photographs[0], target, pixels, everywhere)
-        return
-    write_bytes(target, _png(pixels), overwrite=True)
+    write_photograph(frames.photographs[0], target, pixels, np.ones(pixels.shape[:2], bool))
 
 
 def write_spread(target: Path, spread: FloatArray) -> None:

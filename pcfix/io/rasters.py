@@ -18,7 +18,6 @@ from pcfix.errors import GeometryError, bad_file
 from pcfix.grid.lattice import Lattice, Window
 from pcfix.io.atomic import is_full_disk, temporary_output, temporary_path
 from pcfix.io.files import check_input, check_output, refusing
-from pcfix.libraries import analysis_library
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
     from pyproj import CRS
     from rasterio.io import DatasetReader, DatasetWriter
     from rasterio.transform import Affine
-    from xarray import DataArray
 
 
 NO_HEIGHT = -9999.0
@@ -236,13 +234,6 @@ def write_dod(dsm: Path, reference: Path, output: Path) -> None:
             if known == 0:
                 sentence = f"{dsm} and {reference} have no cell in common. Check their CRS."
                 raise GeometryError("raster.no_overlap", sentence, dsm=dsm, reference=reference)
-
-
-def open_array(path: Path) -> DataArray:
-    """Open a raster of one band, NaN where it has no data; values are read when they are used."""
-    found = check_input(path)
-    array = analysis_library("rioxarray").open_rasterio(found, masked=True)
-    return array.squeeze("band", drop=True).rename(found.stem)
 
 
 Bounds = tuple[float, float, float, float]

@@ -102,13 +102,6 @@ def band_of(path: CloudFiles, options: Any = None) -> Any:
     return replace(one, points=count, mins=np.min(ends, axis=0), maxs=np.max(ends, axis=0))
 
 
-def check_one_file(cloud: Any, options: Any) -> None:
-    """Refuse a scheduler, which shares many files, for one file."""
-    if not isinstance(cloud, Tiles) and getattr(options, "scheduler", None) is not None:
-        sentence = "scheduler needs many files (a folder, glob or list of tiles); omit it."
-        raise SettingError("option.one_file", sentence, option="scheduler")
-
-
 def inputs_of(cloud: Any) -> list[Any]:
     """Return the files of a cloud, one or many."""
     if isinstance(cloud, RasterBand):

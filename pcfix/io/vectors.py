@@ -18,12 +18,11 @@ from pcfix.io import tables
 from pcfix.io.atomic import cannot_write, temporary_output
 from pcfix.io.crs import parse_crs, plan_unit, way_to_cloud
 from pcfix.io.files import check_input, check_output
-from pcfix.libraries import analysis_library, optional_library
+from pcfix.libraries import optional_library
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 
 if TYPE_CHECKING:
-    from geopandas import GeoDataFrame
     from pyproj import CRS
 
 Geometries = npt.NDArray[Any]
@@ -40,9 +39,6 @@ COLUMNS = tables.POINT_SPELLINGS | {
 """Names of a column; the first that the header has is used."""
 LAYER_MARK = "|"
 WGS84, WGS84_3D = "EPSG:4326", "EPSG:4979"
-LONGEST_EDGE_M = 500.0
-"""Edges are divided so before they are transformed: one of 500 m is straight in both to 5 mm."""
-_METRES_PER_DEGREE = 111_000.0
 SPACING_M = 1.0
 """Along lines without heights, which get these from the cloud."""
 SHORE_RADIUS_M = 1.0
@@ -121,10 +117,6 @@ def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool
     if forward is None:
         return vectors
     geometries = vectors.geometries
-    if not heights:
-        degrees = vectors.crs is not None and parse_crs(vectors.crs, "the file").is_geographic
-        longest = LONGEST_EDGE_M / (_METRES_PER_DEGREE if degrees else 1.0)
-        geometries = shapely.segmentize(geometries, longest)
 
     def move(xyz: FloatArray) -> FloatArray:
         there = forward(np.nan_to_num(xyz))
@@ -335,8 +327,3 @@ def write_layers(
                 )  # fmt: skip
         except RuntimeError as error:
             raise cannot_write(target, error, temporary) from error
-
-
-def read_frame(path: Path, layer: str) -> GeoDataFrame:
-    """Read a layer of a GeoPackage with GeoPandas."""
-    return analysis_library("geopandas").read_file(check_input(path), layer=layer)

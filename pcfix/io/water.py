@@ -3,9 +3,7 @@
 Meshes are read here, not by open3d: it returns OBJ coordinates as 32-bit floats, half a metre
 apart at a northing of five million, and a damaged PLY ends the process.
 
-A north-up raster in the cloud's own CRS is used cell by cell; any other becomes a mesh of its cell
-centres, so that a gap stays a gap. Positions are transformed as those of cameras are, which refuses
-what PROJ can only guess.
+A raster is north-up, in the cloud's own CRS, and used cell by cell.
 """
 
 from __future__ import annotations
@@ -21,7 +19,6 @@ import numpy as np
 
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
 from pcfix.io import crs as systems
-from pcfix.io.crs import Points
 from pcfix.io.files import check_input
 from pcfix.io.labels import match_labels
 from pcfix.io.ply import Records, read_header
@@ -41,9 +38,7 @@ from pcfix.options.declare import File
 if TYPE_CHECKING:
     from pyproj import CRS
     from rasterio.io import DatasetReader
-    from rasterio.transform import Affine
 
-    from pcfix.water.surface import Tin
 
 KINDS = (
     "a level such as 0.37, plane:a,b,c, dim:NAME, a mesh (.obj, .ply) or a raster of heights (.tif)"
@@ -72,9 +67,9 @@ def read_water(spec: float | File, cloud_crs: str | CRS | None = None) -> WaterS
         ``surface.obj``, ``surface.ply``
             a triangulated surface in the cloud's own coordinates;
         ``surface.tif``
-            or another raster that GDAL reads: one band of heights, in any CRS.
+            or another raster that GDAL reads: one band of heights, in the cloud's CRS.
     cloud_crs : str or CRS, optional
-        Projected, metres; rasters are brought to it. Default: that of the raster.
+        Projected, metres. Default: that of the raster.
 
     Examples
     --------
@@ -103,7 +98,7 @@ def read_water(spec: float | File, cloud_crs: str | CRS | None = None) -> WaterS
 
 def _mesh(path: Path) -> WaterMesh:
     """Read a mesh that is a height field."""
-    from pcfix.water.surface import in_two_sheets
+    from pcfix.water.surface import build_tin, in_two_sheets
 
     read = _read_obj if path.suffix.lower() == ".obj" else _read_ply
     vertices, triangles = read(path)
@@ -114,23 +109,17 @@ def _mesh(path: Path) -> WaterMesh:
         sentence = "a vertex is missing or not finite. Export it again."
         raise bad_file(path, "water.mesh_damaged", sentence)
     mesh = WaterMesh(vertices, triangles, path.name)
+    try:
+        tin = build_tin(mesh)
+    except GeometryError as error:  # no facet has an area in plan
+        raise bad_file(path, "water.mesh_flat", str(error)) from None
     # holes, edges of three facets and facets that overlap at one height do not matter
-    double, area_m2 = in_two_sheets(_tin_of(path, mesh))
+    double, area_m2 = in_two_sheets(tin)
     share = float(area_m2[double].sum() / area_m2.sum())
     if share > MOST_OVERLAP:
         sentence = f"{100.0 * share:.0f} % of the mesh is above another part. Export one surface."
         raise bad_file(path, "water.mesh_overlap", sentence, share=share)
     return mesh
-
-
-def _tin_of(path: File, mesh: WaterMesh) -> Tin:
-    """Return the facets of a mesh; an `InputError` if none has an area in plan."""
-    from pcfix.water.surface import build_tin
-
-    try:
-        return build_tin(mesh)
-    except GeometryError as error:
-        raise bad_file(path, "water.mesh_flat", str(error)) from None
 
 
 def _read_obj(path: Path) -> tuple[FloatArray, IntArray]:
@@ -177,21 +166,19 @@ def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
 
 IMPOSSIBLE_M = 9000.0
 """A water surface is not as far from zero: such a height is a nodata value that is not stated."""
-MOST_CELLS, MOST_MESHED = 10_000_000, 2_000_000
-"""Cells that are read, for the memory; and cells that become a mesh."""
+MOST_CELLS = 10_000_000
+"""Cells that are read, for the memory."""
 ROUGH_DEG = 3.0
 """A slope by noise alone that moves a point by more than one percent of its depth."""
 
 
-def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRaster | WaterMesh:
-    """Read the heights of the water, in the cloud's CRS and metres; warn of what is assumed.
-
-    A raster that is turned, or in another CRS, becomes a mesh of the centres of its cells.
+def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRaster:
+    """Read the heights of the water, metres; warn of what is assumed.
 
     Parameters
     ----------
     path : path
-        A raster of any format that GDAL reads.
+        A raster of any format that GDAL reads, north-up in the cloud's CRS.
     cloud_crs : str, CRS or None
         Projected, in metres. If the raster or the cloud names no CRS, that of the other is
         assumed.
@@ -201,22 +188,23 @@ def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRa
         if source.count != 1:
             sentence = f"has {source.count} bands. Write the height of the water as one band."
             raise bad_file(name, "water.raster_bands", sentence, value=source.count)
-        t = source.transform
-        if t.is_identity or not np.isfinite(t).all() or not abs(t.determinant) > 0.0:
+        t, size = source.transform, (source.width, source.height)
+        if t.is_identity or not np.isfinite(t).all():
             sentence = "has no valid geotransform. Export it as GeoTIFF, or with a world file."
             raise bad_file(name, "water.raster_place", sentence)
+        if min(size) < 2 or size[0] * size[1] > MOST_CELLS:
+            sentence = f"has {size[0]:,} x {size[1]:,} cells, {MOST_CELLS:,} at most. Cut it to the"
+            sentence += " cloud, or make the cells larger."
+            raise bad_file(name, "water.raster_size", sentence, cells=size[0] * size[1])
         crs = None if source.crs is None else systems.parse_crs(source.crs.to_wkt(), name)
-        share = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.5)])
-        size = source.width, source.height
-        at = np.column_stack([*place_of(t, *(share * size).T), np.zeros(5)])
-        to_cloud = systems.way_to_cloud(crs, cloud_crs, at, name, heights=True)
-        is_grid = to_cloud is None and t.b == t.d == 0.0 and t.a > 0.0 > t.e  # north-up
-        cells, most = size[0] * size[1], MOST_CELLS if is_grid else MOST_MESHED
-        if min(size) < 2 or cells > most:
-            sentence = f"has {size[0]:,} x {size[1]:,} cells, {most:,} at most. Cut it to the"
-            sentence += " cloud, or make the cells larger, in the cloud's CRS."
-            raise bad_file(name, "water.raster_size", sentence, cells=cells)
         heights = _heights(source, crs, name)
+        middle = np.array([[*place_of(t, size[0] / 2, size[1] / 2), 0.0]])
+        to_cloud = systems.way_to_cloud(crs, cloud_crs, middle, name, heights=True)
+        if to_cloud is not None or not (t.b == t.d == 0.0 and t.a > 0.0 > t.e):
+            sentence = "is turned, or in another CRS than the cloud. Reproject it with 'gdalwarp"
+            raise bad_file(name, "water.raster_place", f"{sentence} -t_srs CRS_OF_THE_CLOUD'.")
+    if not np.isfinite(heights).any():
+        raise bad_file(name, "water.raster_empty", "has no height. Check its nodata value.")
     # noise of the cells, against their neighbours: waves are smooth over a few cells
     around = (heights[:-2, 1:-1] + heights[2:, 1:-1] + heights[1:-1, :-2] + heights[1:-1, 2:]) / 4
     noise = np.abs(heights[1:-1, 1:-1] - around)
@@ -227,14 +215,7 @@ def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRa
         sentence += " degrees). Smooth it, or fit a level to it."
         warnings.warn(PcfixWarning("water.rough", sentence, noise_m=noise_m), stacklevel=3)
     short = name.replace("\\", "/").rpartition("/")[2]
-    if is_grid and np.isfinite(heights).any():
-        return WaterRaster(heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), short)
-    mesh = _mesh_of(heights, t, to_cloud or np.asarray, short)
-    if len(mesh.triangles) == 0:
-        sentence = "has no height. Check its nodata value."
-        raise bad_file(name, "water.raster_empty", sentence)
-    _tin_of(name, mesh)
-    return mesh
+    return WaterRaster(heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), short)
 
 
 def _heights(source: DatasetReader, crs: CRS | None, name: str) -> FloatArray:
@@ -257,30 +238,6 @@ def _heights(source: DatasetReader, crs: CRS | None, name: str) -> FloatArray:
             )
     heights[np.isinf(heights)] = np.nan
     return heights
-
-
-def _mesh_of(heights: FloatArray, transform: Affine, to_cloud: Points, name: str) -> WaterMesh:
-    """Return two triangles between each four centres of cells with a height, in the cloud's CRS."""
-    row, column = np.nonzero(np.isfinite(heights))
-    x, y = place_of(transform, column + 0.5, row + 0.5)
-    vertices = to_cloud(np.column_stack([x, y, heights[row, column]]))
-    placed = np.isfinite(vertices).all(axis=1)  # not beyond the area of the CRS
-    vertex = np.full(heights.shape, -1)
-    vertex[row[placed], column[placed]] = np.arange(np.count_nonzero(placed))
-    corners = [vertex[:-1, :-1], vertex[1:, :-1], vertex[1:, 1:], vertex[:-1, 1:]]
-    corner = np.stack(corners, axis=-1).reshape(-1, 4)
-    corner = corner[(corner >= 0).all(axis=1)]
-    triangles = np.vstack([corner[:, [0, 1, 2]], corner[:, [0, 2, 3]]])
-    return WaterMesh(vertices[placed], triangles, name)
-
-
-def read_image_raster(path: File, cloud_crs: str | CRS | None) -> WaterRaster:
-    """Read the water at the time of one image, a raster that is north-up in the cloud's CRS."""
-    found = read_water_raster(path, cloud_crs)
-    if isinstance(found, WaterMesh):
-        sentence = "is turned, or in another CRS than the cloud. Reproject it, with gdalwarp."
-        raise bad_file(path, "water.raster_place", sentence)
-    return found
 
 
 def rasters_of_images(folder: File, names: Sequence[str]) -> dict[int, Path]:

@@ -231,16 +231,10 @@ PLANE = (
 )
 
 
-def raster(turned: bool) -> Seed:
-    """Return what writes a raster, if turned with rows from south to north, by a matrix."""
-
-    def write(folder: Path) -> Path:
-        heights = np.linspace(1.0, 2.0, 80).reshape(8, 10)
-        up = 1.0 if turned else -1.0
-        place = rasterio.Affine(1.0, 0.0, 500_000.0, 0.0, up, 5_200_000.0)
-        return water.write(folder / "water.tif", heights, place, "EPSG:32632", nodata=None)
-
-    return write
+def raster(folder: Path) -> Path:
+    heights = np.linspace(1.0, 2.0, 80).reshape(8, 10)
+    place = rasterio.Affine(1.0, 0.0, 500_000.0, 0.0, -1.0, 5_200_000.0)
+    return water.write(folder / "water.tif", heights, place, "EPSG:32632", nodata=None)
 
 
 def vector(name: str) -> Seed:
@@ -414,7 +408,7 @@ READERS: dict[str, Reader] = {
         obj=text("water.obj", water.OBJ), ply=text("water.ply", PLANE),
     ),
     "raster": one(
-        lambda path: pcfix.read_water(path, "EPSG:32632"), tif=raster(False), turned=raster(True)
+        lambda path: pcfix.read_water(path, "EPSG:32632"), tif=raster
     ),
     "vectors": Reader(read_lines, {
         "csv": text("shore.csv", LINE), "geojson": text("water.geojson", SHAPE),

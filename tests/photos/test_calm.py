@@ -175,7 +175,7 @@ def test_bad_frames(tmp_path, folder, calm):
     with refused("frames.no_overlap", frames=["2"]):
         pcfix.calm_frames(mixed, tmp_path / "calm.png")
     (tmp_path / "film.mp4").write_bytes(b"no film")
-    with refused("video.unreadable"):
+    with refused("photos.no_folder"):
         pcfix.calm_frames(tmp_path / "film.mp4", tmp_path / "calm.png")
     with refused("output.suffix"):
         pcfix.calm_frames(folder, tmp_path / "calm.jpg")
