@@ -20,6 +20,7 @@ from pcfix.io.crs import metres_up
 from pcfix.io.las.source import LasSource, RasterBand, metric_crs
 from pcfix.io.las.writing import NOTES, USER_ID
 from pcfix.io.rasters import NO_HEIGHT, open_raster, place_of, raster_errors, read_masked, slices
+from pcfix.io.tables import METRES
 from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
@@ -143,7 +144,7 @@ def _height_band(raster: DatasetReader, part: RasterBand) -> int:
         sentence = "has no CRS, or no georeference. Assign it, for example with gdal_edit."
         raise bad_file(path, "raster.no_crs", sentence)
     unit = (raster.units[band - 1] or "").strip()
-    if unit.lower() not in ("", "m", "metre", "meter", "metres", "meters"):
+    if unit.lower() not in METRES:
         sentence = f"its heights are in '{unit}'. Convert them to metres."
         raise bad_file(path, "raster.unit", sentence, value=unit)
     return band

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import shapely
 
-from pcfix.errors import InputError, PcfixWarning, SettingError, bad_file
+from pcfix.errors import PcfixWarning, SettingError, bad_file
 from pcfix.io.files import path_of, read_json, refusing
 from pcfix.io.las.source import LasSource, RasterBand, coordinates, metric_crs
 from pcfix.io.raster_cloud import RasterSource, is_raster
@@ -173,23 +173,15 @@ def _listed(path: Path) -> list[Path] | None:
 def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
     """Return files as one cloud; an `InputError` if the header of any cannot be read."""
     heads: dict[Path, tuple[Any, ...]] = {}
-    broken: dict[Path, str] = {}
     for path in paths:
         if is_raster(path):
             sentence = "is one of several rasters. Merge them first, for example with gdalbuildvrt."
             raise bad_file(path, "cloud.rasters", sentence)
-        try:
-            with LasSource(path) as source:
-                header, form = source.header, source.header.point_format
-                kind = metric_crs(source), form.id, tuple(form.dimension_names)
-                box = header.mins, header.maxs, float(max(header.scales))
-                heads[path] = kind, len(source), *box
-        except InputError as error:
-            broken[path] = str(error)
-    if broken:
-        why = "\n".join(f"  {one}" for one in broken.values())
-        sentence = f"{len(broken)} of {len(broken) + len(heads)} files cannot be read:\n{why}"
-        raise bad_file(name, "cloud.broken_files", sentence, paths=list(broken))
+        with LasSource(path) as source:
+            header, form = source.header, source.header.point_format
+            kind = metric_crs(source), form.id, tuple(form.dimension_names)
+            box = header.mins, header.maxs, float(max(header.scales))
+            heads[path] = kind, len(source), *box
     kinds, counts, lows, highs, steps = zip(*heads.values(), strict=True)
     tiles = Tiles(name, tuple(heads), counts, np.array(lows), np.array(highs), max(steps))
     first = tiles.paths[0]

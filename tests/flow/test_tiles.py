@@ -133,8 +133,8 @@ def test_broken_tile(tmp_path):
     (folder / "tile3.las").write_bytes(b"no cloud")
     words = ("correct", folder, tmp_path / "out", *WORDS, *PLAIN_WORDS)
     done = run_pcfix(*words)
-    assert (done.returncode, done.code) == (1, "cloud.broken_files")
-    assert Path(done.error.values["paths"][0]).name == "tile3.las"
+    assert (done.returncode, done.code) == (1, "cloud.damaged")
+    assert Path(done.error.values["path"]).name == "tile3.las"
     (folder / "tile3.las").unlink()
     assert run_pcfix(*words).returncode == 1  # which is found when the points are read
     assert not tiles_in(tmp_path / "out")
@@ -223,7 +223,7 @@ def test_refused_inputs(case, tmp_path):
 
 
 def test_refused_outputs(cloud, tmp_path):
-    folder, merged = cloud
+    folder, _ = cloud
     (tmp_path / "file.laz").write_bytes(b"")
     (tmp_path / "two.txt").write_text(f"{folder}/tile0.laz\n{folder}/../tiles/tile0.laz\n")
     (tmp_path / "bad.vpc").write_text('{"features": [{}]}')
@@ -307,7 +307,7 @@ def test_damaged_tile(scene, tmp_path):
     shutil.copytree(scene / "cloud" / "tiles", tmp_path / "tiles")
     (tmp_path / "tiles" / "tile1.laz").write_bytes(b"no cloud")
     done = run_pcfix("clean", tmp_path / "tiles", tmp_path / "out", "--jobs", "1")
-    assert done.code == "cloud.broken_files"
+    assert done.code == "cloud.damaged"
     assert not list((tmp_path / "out").glob("*.la[sz]"))
     reference = scene / "lidar" / "merged.laz"
     for make in (
