@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pcfix import Cameras
+from tests.io.test_water import ply
 from tests.utils.clouds import (
     EAST_M,
     NORTH_M,
@@ -41,8 +42,7 @@ TABLES = {
     "open_quote": 'label,x,y,z\n"a,1,2,90\nb,1,2,90\n',
     "endless": 'label,x,y,z\n"' + "a" * 200_000 + "\n",
 }
-PLY = "ply\nformat ascii 1.0\nelement vertex {}\nproperty double x\nproperty double y\n"
-PLY += "property double z\nelement face {}\nproperty list uchar int vertex_indices\nend_header\n"
+CORNERS = [[0, 0, 1], [9, 0, 1], [0, 9, 1]]
 V = "v 0 0 1\nv 9 0 1\nv 0 9 1\n"
 MESHES = {
     "empty.obj": "",
@@ -58,9 +58,9 @@ MESHES = {
     "garbage.obj": "\x00\x01\x02 no mesh at all \xff\xfe\n" * 50,
     "empty.ply": "",
     "garbage.ply": "\x00\x01\x02 no mesh at all \xff\xfe\n" * 50,
-    "no_faces.ply": PLY.format(3, 0) + "0 0 1\n9 0 1\n0 9 1\n",
-    "bad_index.ply": PLY.format(3, 1) + "0 0 1\n9 0 1\n0 9 1\n3 0 1 7\n",
-    "cut.ply": PLY.format(300, 100) + "0 0 1\n9 0 1\n0 9 1\n",
+    "no_faces.ply": ply(CORNERS, []).decode("latin-1"),
+    "bad_index.ply": ply(CORNERS, [[0, 1, 7]]).decode("latin-1"),
+    "cut.ply": ply(CORNERS, [[0, 1, 2]]).decode("latin-1")[:-1],
 }
 SENSORS = {
     "zero": SENSOR + "0,36,24\n",
@@ -108,7 +108,7 @@ def folder(tmp_path_factory):
     (at / "images" / "cameras.csv").write_bytes((at / "cameras.csv").read_bytes())
     for kind, texts in (("t_{}.csv", TABLES), ("s_{}.csv", SENSORS), ("{}", MESHES)):
         for name, text in texts.items():
-            (at / kind.format(name)).write_text(text, "latin-1")
+            (at / kind.format(name)).write_bytes(text.encode("latin-1"))
     (at / "shore.txt").write_text("x y z\n")
     (at / "sensor.las").write_text(SENSOR + "24,360,240\n")
     corners = [(x, y) for y in (NORTH_M - 50, NORTH_M + 200) for x in (EAST_M - 50, EAST_M + 200)]

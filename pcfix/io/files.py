@@ -304,8 +304,9 @@ def find_members(cameras: File) -> tuple[Path, Members] | None:
         values: dict[str, Any] = {one.name: arrays[one.name] for one in fields(Members)}
         values |= {name: tuple(values[name].tolist()) for name in ("labels", "lens_names")}
         members = Members(**values)
-        m, k = members.turn.shape[:2]
-        shapes = members.shift_m.shape, members.lens.shape, members.water.shape
-        if shapes != ((m, k, 3), (m, k, len(members.lens_names)), (m, 7)):
+        m, k, p = len(members), len(members.labels), len(members.lens_names)
+        named = ("focal", "turn", "shift_m", "lens", "water")
+        shapes = [getattr(members, name).shape for name in named]
+        if shapes != [(k,), (m, k, 3), (m, k, 3), (m, k, p), (m, 7)]:
             raise ValueError(shapes)
     return found, members

@@ -2,13 +2,12 @@
 
 The format is Greg Turk's (The PLY Polygon File Format, 1994): a header of lines names elements and
 their properties, ``property TYPE NAME`` or ``property list COUNT_TYPE ITEM_TYPE NAME``; the records
-follow as text or as bytes without padding. Below, a unit is a byte, or a number of a text.
+follow as bytes without padding. Records that follow as text are refused.
 """
 
 from __future__ import annotations
 
 import re
-import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +24,7 @@ _TYPES = {
     **{"int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "int64": "i8", "uint64": "u8"},
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
 }
-_FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_FORMATS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _MOST_HEADER_BYTES = 1 << 20
 _KINDS = {"vertex": "vertices", "face": "faces"}
 _ROWS_AT_ONCE = 1_000_000
@@ -44,7 +43,7 @@ class Header(NamedTuple):
     """The header of a PLY file, for its vertices or another element."""
 
     name: str  # of the file, for messages
-    order: str  # of the bytes, "<" or ">"; empty for text
+    order: str  # of the bytes, "<" or ">"
     kind: str  # of the records, in the plural, for messages
     records: int  # stated, not checked
     properties: tuple[Property, ...]  # of a record
@@ -55,10 +54,6 @@ class Header(NamedTuple):
         """Return the type of a number, or of a list's items; None without such a property."""
         found = [p.item for p in self.properties if p.name == name and bool(p.length) == is_list]
         return found[0] if found else None
-
-    def size(self, kind: str) -> int:
-        """Return the units of a type."""
-        return int(kind[1]) if self.order else 1
 
 
 def parse_header(name: str, head: bytes, element: str = "vertex") -> Header:
@@ -71,6 +66,8 @@ def parse_header(name: str, head: bytes, element: str = "vertex") -> Header:
     lines = [line.split() for line in head[: end.start()].decode("latin-1").splitlines()]
     try:
         for key, *fields in filter(None, lines):
+            if [key, *fields[:1]] == ["format", "ascii"]:
+                raise bad_file(name, "ply.text", "is a PLY of text. Export it as binary PLY.")
             if key == "format":
                 order = _FORMATS[fields[0]]
             elif key == "element":
@@ -110,9 +107,9 @@ class Records:
         fields: list[tuple[int, int]] = []
         self._place: dict[tuple[str, bool], tuple[int, int]] = {}
         for p in header.properties:
-            size, is_list = header.size(p.item), bool(p.length)
+            size, is_list = int(p.item[1]), bool(p.length)
             if is_list or not fields or fields[-1][1]:
-                fields.append((0, header.size(p.length) if is_list else 0))
+                fields.append((0, int(p.length[1]) if is_list else 0))
             before, count = fields[-1]
             self._place[p.name, is_list] = len(fields) - 1, before
             fields[-1] = before + size, count
@@ -155,32 +152,22 @@ class Records:
 
 
 def _items_at(units: npt.NDArray[Any], order: str, item: str | None) -> npt.NDArray[Any]:
-    """View units as the item of a type that begins at each of them; text has numbers as units."""
-    if not order:
-        return units
+    """View bytes as the item of a type that begins at each of them."""
     kind = np.dtype(f"{order}{item}")
     return np.ndarray(max(len(units) - kind.itemsize + 1, 0), kind, units, strides=(1,))
 
 
 def _units(path: Path, header: Header) -> npt.NDArray[Any]:
-    """Return the bytes of the records, or the numbers of a text, to the end of the file."""
+    """Return the bytes of the records, to the end of the file."""
     skip = 0
     for count, properties in header.skipped:
         if count and any(p.length for p in properties):
             sentence = f"has lists before the {header.kind}. Export the {header.kind} first."
             raise bad_file(path, "ply.order", sentence)
-        skip += count * sum(header.size(p.item) for p in properties)
-    if header.order:
-        if path.stat().st_size <= header.end:  # an empty map is not allowed
-            return np.zeros(0, np.uint8)
-        return np.memmap(path, np.uint8, "r", offset=header.end)[skip:]
-    text = path.read_bytes()[header.end :].decode("latin-1")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)
-            return np.fromstring(text, np.float64, sep=" ")[skip:]
-    except (DeprecationWarning, ValueError) as error:
-        raise bad_file(path, "ply.text", "not all of its text is numbers. Export again.") from error
+        skip += count * sum(int(p.item[1]) for p in properties)
+    if path.stat().st_size <= header.end:  # an empty map is not allowed
+        return np.zeros(0, np.uint8)
+    return np.memmap(path, np.uint8, "r", offset=header.end)[skip:]
 
 
 @kernel

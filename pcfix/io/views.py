@@ -216,8 +216,7 @@ def _positions(vertices: Records) -> FloatArray:
 def _listed(path: Path, records: Records) -> Views:
     """Return the image numbers of each point as int32, if they are whole and not negative."""
     start, number = records.lists(_IMAGES)
-    with np.errstate(invalid="ignore"):  # NaN and infinity of a text
-        image: npt.NDArray[Any] = number.astype(np.int32)
+    image: npt.NDArray[Any] = number.astype(np.int32)
     wrong = np.flatnonzero((image < 0) | (image != number))
     if wrong.size:
         value = number[wrong[0]].item()

@@ -153,11 +153,7 @@ def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
         sentence = f"needs vertices with x, y, z and faces with {_CORNERS[0]}. Export a mesh."
         raise bad_file(path, "water.mesh_damaged", sentence)
     start, corners = faces.lists(named[0])
-    with np.errstate(invalid="ignore"):
-        corner = corners.astype(np.int64)
-    if (corner != corners).any():
-        sentence = "a face names a vertex by a fraction. Export it again."
-        raise bad_file(path, "water.mesh_damaged", sentence)
+    corner = corners.astype(np.int64)
     count = np.maximum(np.diff(start) - 2, 0)
     first = np.repeat(start[:-1], count)
     other = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(count) - count, count)

@@ -416,12 +416,15 @@ def river(folder, data, rng):
     box, hole = square(338416, 272916, 16), square(338420, 272920, 4)
     to_geojson(folder / "mask.geojson", [{"type": "Polygon", "coordinates": [box, hole]}], crs)
     mesh = [row.split() for row in (data / "water_surface.obj").read_text().splitlines()]
-    corners = [" ".join(row[1:]) for row in mesh if row[:1] == ["v"]]
+    corners = [[float(one) for one in row[1:4]] for row in mesh if row[:1] == ["v"]]
     faces = [[int(c.split("/")[0]) - 1 for c in row[1:]] for row in mesh if row[:1] == ["f"]]
-    head = ["ply", "format ascii 1.0", f"element vertex {len(corners)}"]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(corners)}"]
     head += [f"property double {axis}" for axis in "xyz"]
     head += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
-    write(folder / "water.ply", "\n".join(head), corners + [f"3 {a} {b} {c}" for a, b, c in faces])
+    rows = np.zeros(len(faces), [("count", "u1"), ("corner", "<i4", 3)])
+    rows["count"], rows["corner"] = 3, faces
+    data = "\n".join([*head, ""]).encode() + np.array(corners, "<f8").tobytes() + rows.tobytes()
+    (folder / "water.ply").write_bytes(data)
     import rasterio
 
     heights = np.tile(174.8 + 0.0004 * np.arange(36), (25, 1)).astype("float32")

@@ -224,11 +224,8 @@ def openmvs(order: str, weights: bool = True) -> Seed:
     return write
 
 
-PLANE = (
-    "ply\nformat ascii 1.0\nelement vertex 4\nproperty double x\nproperty double y\nproperty double"
-    " z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n0 0 1\n9 0 1.5\n"
-    "9 9 1\n0 9 1\n3 0 1 2\n3 0 2 3\n"
-)
+SQUARE = [[0, 0, 1], [9, 0, 1.5], [9, 9, 1], [0, 9, 1]]
+PLANE = water.ply(SQUARE, [[0, 1, 2], [0, 2, 3]])
 
 
 def raster(folder: Path) -> Path:
@@ -401,7 +398,7 @@ READERS: dict[str, Reader] = {
         **{name: text(name, data) for name, (data, _) in unsupported.FILES.items()}
     ),
     "views": Reader(read_lists, {
-        "colmap": vis, "openmvs": openmvs("<"), "big": openmvs(">"), "text": openmvs("", False),
+        "colmap": vis, "openmvs": openmvs("<"), "big": openmvs(">", False),
     }),
     "mesh": one(
         lambda path: pcfix.read_water(path, "EPSG:32632"),

@@ -55,26 +55,33 @@ def test_obj(tmp_path):
     assert mesh.triangles.tolist() == [[0, 1, 2], [0, 2, 3]]
 
 
-@pytest.mark.parametrize("layout", ["ascii", "binary_little_endian"])
-def test_ply(tmp_path, layout):
+PLY = (
+    b"ply\nformat binary_little_endian 1.0\nelement vertex %d\nproperty double x\n"
+    b"property double y\nproperty double z\nelement face %d\n"
+    b"property list uchar int vertex_indices\nend_header\n"
+)
+
+
+def ply(vertices, triangles):
+    """Return the bytes of a mesh, shapes (n, 3)."""
+    faces = np.zeros(len(triangles), [("count", "u1"), ("corner", "<i4", 3)])
+    faces["count"], faces["corner"] = 3, np.reshape(triangles, (-1, 3))
+    counts = len(vertices), len(triangles)
+    return PLY % counts + np.asarray(vertices, "<f8").tobytes() + faces.tobytes()
+
+
+def test_ply(tmp_path):
     vertices = np.array(
         [[512000.12345, 4987000.54321, 10.001], [512010.5, 4987000.5, 10], [512000, 4987010, 10]]
     )
-    head = (
-        f"ply\nformat {layout} 1.0\nelement vertex 3\nproperty double x\nproperty double y\n"
-        "property double z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    ).encode()
-    if layout == "ascii":
-        body = "".join(" ".join(map(repr, map(float, v))) + "\n" for v in vertices) + "3 0 1 2\n"
-        data = head + body.encode()
-    else:
-        data = head + vertices.astype("<f8").tobytes() + b"\x03"
-        data += np.array([0, 1, 2], "<i4").tobytes()
     path = tmp_path / "water.ply"
-    path.write_bytes(data)
+    path.write_bytes(ply(vertices, [[0, 1, 2]]))
     mesh = pcfix.read_water(path)
     assert np.array_equal(mesh.vertices, vertices)
     assert mesh.triangles.tolist() == [[0, 1, 2]]
+    path.write_bytes(path.read_bytes().replace(b"binary_little_endian", b"ascii"))
+    with refused("ply.text", path=path):
+        pcfix.read_water(path)
 
 
 # Rasters

@@ -444,7 +444,7 @@ def _vertices(archive: zipfile.ZipFile, name: str | None, axes: str) -> tuple[Fl
     where, data = f"{archive.filename}: {name}", archive.read(name or "")
     header = parse_header(where, data)
     kinds = {p.name: header.order + p.item for p in header.properties if not p.length}
-    if not header.order or header.skipped or not {*axes, "id"} <= kinds.keys():
+    if header.skipped or not {*axes, "id"} <= kinds.keys():
         raise damaged(where, f"it is not a binary PLY of vertices with {', '.join(axes)}, id")
     with checks.reading(where):
         rows = np.frombuffer(data, np.dtype([*kinds.items()]), header.records, header.end)
