@@ -27,8 +27,7 @@ from pcfix.io.cameras.georeference import likely_mistake
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header
-from pcfix.io.raster_cloud import is_raster
-from pcfix.io.tiles import Clouds
+from pcfix.io.tiles import Clouds, is_raster
 from pcfix.io.views import ViewReport
 from pcfix.label.labelling import Labelling
 from pcfix.lens.frames import beside_frames

@@ -21,7 +21,7 @@ from pcfix.errors import GeometryError, InputError, NoTiePointsError, PcfixWarni
 from pcfix.flow.surfaces import CloudView, find_surface
 from pcfix.io.cameras import read_cameras, read_tie_points, takes_sensor
 from pcfix.io.cameras.georeference import Georeference, georeference
-from pcfix.io.labels import match_labels
+from pcfix.io.tables import match_labels
 from pcfix.io.tides import level_offsets, read_image_times, read_tide
 from pcfix.io.vectors import LAYER_MARK, read_water_polygons
 from pcfix.io.views import ViewList, read_views, track_views

@@ -25,10 +25,9 @@ from pcfix.io import rasters
 from pcfix.io.crs import crs_words
 from pcfix.io.files import read_json, sha256, write_bytes, write_text
 from pcfix.io.las.source import RasterBand, stated_crs
-from pcfix.io.raster_cloud import RasterSource
 from pcfix.io.styles import Symbol, limits_of, vector_style
 from pcfix.io.tables import read_check_depths
-from pcfix.io.tiles import Tiles, open_cloud
+from pcfix.io.tiles import RasterSource, Tiles, open_cloud
 from pcfix.io.vectors import Layer, write_layers
 from pcfix.model import BATHYMETRIC_POINT, Cameras, FloatArray, WaterSurface
 from pcfix.options.correct import LEVEL_M

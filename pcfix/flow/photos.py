@@ -21,9 +21,9 @@ from pcfix.flow.inputs import Inputs
 from pcfix.flow.runner import Progress, check_folder, check_summary, write_summary
 from pcfix.io.clouds import is_cloud
 from pcfix.io.files import check_output
-from pcfix.io.labels import match_labels
 from pcfix.io.photographs import photographs_in, read_photograph, size_of, write_photograph
 from pcfix.io.rasters import filled_heights, open_raster
+from pcfix.io.tables import match_labels
 from pcfix.io.water import rasters_of_images, read_water_raster
 from pcfix.model import Cameras, FloatArray, Lens, WaterDimension
 from pcfix.options.declare import File, taken

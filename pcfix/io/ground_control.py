@@ -46,8 +46,7 @@ from pcfix.io.cameras.table import SPELLINGS as POSITIONS
 from pcfix.io.cameras.table import crs as table_crs
 from pcfix.io.crs import LOCAL, METRES, is_local, is_topocentric, parse_crs, way_to_cloud
 from pcfix.io.files import check_input
-from pcfix.io.labels import match_labels, unnamed
-from pcfix.io.tables import Table, number, places, read_lines, read_table
+from pcfix.io.tables import Table, match_labels, number, places, read_lines, read_table, unnamed
 from pcfix.model import Cameras, FloatArray, GnssPositions, GroundControl, IntArray
 from pcfix.options.declare import File
 

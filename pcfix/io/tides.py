@@ -21,8 +21,7 @@ import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io.files import check_input, refusing
-from pcfix.io.labels import match_labels
-from pcfix.io.tables import read_table
+from pcfix.io.tables import match_labels, read_table
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 

@@ -40,8 +40,8 @@ from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io.cameras.colmap import read_images
 from pcfix.io.crs import Points
 from pcfix.io.files import check_input
-from pcfix.io.labels import match_labels
 from pcfix.io.ply import Header, Property, Records, read_header
+from pcfix.io.tables import match_labels
 from pcfix.lens.imaging import straight_images
 from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, Views
 from pcfix.options.declare import File

@@ -20,10 +20,9 @@ import numpy as np
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
 from pcfix.io import crs as systems
 from pcfix.io.files import check_input
-from pcfix.io.labels import match_labels
 from pcfix.io.ply import Records, read_header
 from pcfix.io.rasters import open_raster, place_of, read_masked
-from pcfix.io.tables import METRES, number
+from pcfix.io.tables import METRES, match_labels, number
 from pcfix.model import (
     FloatArray,
     IntArray,

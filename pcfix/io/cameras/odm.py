@@ -45,8 +45,7 @@ import numpy as np
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import AffineFrame, LensModel, Source, damaged, lens_by_name, triple
 from pcfix.io.crs import Topocentric
-from pcfix.io.labels import unnamed
-from pcfix.io.tables import read_lines
+from pcfix.io.tables import read_lines, unnamed
 from pcfix.lens.rotations import from_rotation_vectors
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
 
