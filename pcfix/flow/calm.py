@@ -20,7 +20,7 @@ from pcfix.grid.lattice import Lattice
 from pcfix.io.atomic import temporary_output
 from pcfix.io.crs import parse_crs
 from pcfix.io.files import scratch_arrays
-from pcfix.io.photographs import Frames, check_calm, read_frames, write_calm, write_spread
+from pcfix.io.photographs import Frames, check_calm, read_frames, write_photograph, write_spread
 from pcfix.io.rasters import new_raster, write_bands
 from pcfix.model import FloatArray, Lens, WaterRaster
 from pcfix.options.declare import File, taken
@@ -111,7 +111,8 @@ def calm_frames(
                     " glints, a wrong interval or depth). Do not rely on the surfaces."
                 )
                 notes.append(PcfixWarning("waves.explained", words, explained=water.explained))
-    write_calm(target, found, median)
+    # with the metadata of the first
+    write_photograph(found.photographs[0], target, median, np.ones(median.shape[:2], bool))
     write_spread(beside, spread)
     middle = np.array([0.5 * found.columns, 0.5 * found.rows, 1.0])
     moved = homographies @ middle

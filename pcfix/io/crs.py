@@ -361,17 +361,14 @@ def way_to_cloud(
     source = None if crs is None else parse_crs(crs, name)
     if all(one is None or is_local(one) for one in (source, cloud)):
         return None
-    if source is None:
-        known = "" if cloud is None else cloud.name
-        assume("crs.assumed", f"names no CRS; that of the cloud is assumed ({known}).")
-        return None
-    if cloud is None:
-        unit = plan_unit(source)[0] if source.is_projected else "degrees"
-        if not source.is_projected or plan_unit(source)[1] != 1.0:
+    known = cloud or source
+    if source is None or cloud is None:
+        unit, size = ("", 1.0) if source is None else plan_unit(source)
+        if source is not None and (size != 1.0 or not source.is_projected):
             sentence = f"is in {unit} ({source.name}), the cloud names no CRS. Set the cloud's CRS."
             raise bad_file(name, "crs.cloud_missing", sentence, unit=unit)
-        words = f"the cloud names no CRS; that of the file is assumed ({source.name})."
-        assume("crs.assumed", words)
+        who = "the file" if source is None else "the cloud"
+        assume("crs.assumed", f"{who} names no CRS; {known.name if known else ''} is assumed.")
         return None
     if is_local(cloud) or is_local(source):
         sentence = f"is in {source.name}, the cloud in {cloud.name}, of which one is local. Use one"

@@ -217,11 +217,6 @@ def check_calm(path: File, frames: Frames, *, overwrite: bool) -> tuple[Path, Pa
     return target, check_output(target.with_name(f"{target.stem}_spread.tif"), **how)
 
 
-def write_calm(target: Path, frames: Frames, pixels: Pixels) -> None:
-    """Write the median, shape (rows, columns, bands), with the metadata of the first photograph."""
-    write_photograph(frames.photographs[0], target, pixels, np.ones(pixels.shape[:2], bool))
-
-
 def write_spread(target: Path, spread: FloatArray) -> None:
     """Write the spread of the frames, shape (rows, columns), as TIFF of float32."""
     tifffile = photo_library("tifffile")

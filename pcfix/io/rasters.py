@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 NO_HEIGHT = -9999.0
 """Value of cells without a height; every program that reads GeoTIFF knows this one."""
+IMPOSSIBLE_M = 9000.0
+"""A larger height is a nodata value that the file does not state."""
 METRE = "metre"
 TO_95 = 1.959964
 """Half-width of 95 % of a normal distribution, in standard deviations."""

@@ -26,7 +26,15 @@ from pcfix.io.crs import metres_up
 from pcfix.io.files import path_of, read_json, refusing
 from pcfix.io.las.source import LasSource, RasterBand, coordinates, metric_crs
 from pcfix.io.las.writing import NOTES, USER_ID
-from pcfix.io.rasters import NO_HEIGHT, open_raster, place_of, raster_errors, read_masked, slices
+from pcfix.io.rasters import (
+    IMPOSSIBLE_M,
+    NO_HEIGHT,
+    open_raster,
+    place_of,
+    raster_errors,
+    read_masked,
+    slices,
+)
 from pcfix.io.tables import METRES
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -220,8 +228,6 @@ RASTERS = (".tif", ".tiff", ".vrt", ".png", ".jpg", ".jpeg")
 """Of rasters; the last three only to say that pictures have no heights."""
 READ_CELLS = 256
 """Side of the windows that are read, whose points are corrected at once."""
-IMPOSSIBLE_M = 9000.0
-"""A larger height is a nodata value that the file does not state."""
 CACHE_BYTES = 64_000_000
 """Of GDAL, whose default is 5 % of the memory of the machine."""
 STEPS_A_CELL = 1000.0

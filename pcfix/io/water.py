@@ -21,7 +21,7 @@ from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
 from pcfix.io import crs as systems
 from pcfix.io.files import check_input
 from pcfix.io.ply import Records, read_header
-from pcfix.io.rasters import open_raster, place_of, read_masked
+from pcfix.io.rasters import IMPOSSIBLE_M, open_raster, place_of, read_masked
 from pcfix.io.tables import METRES, match_labels, number
 from pcfix.model import (
     FloatArray,
@@ -159,8 +159,6 @@ def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
     return vertices.numbers(*"xyz"), corner[np.column_stack([first, other, other + 1])]
 
 
-IMPOSSIBLE_M = 9000.0
-"""A water surface is not as far from zero: such a height is a nodata value that is not stated."""
 MOST_CELLS = 10_000_000
 """Cells that are read, for the memory."""
 ROUGH_DEG = 3.0
