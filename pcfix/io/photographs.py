@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,9 +24,6 @@ from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray
 from pcfix.options.declare import File
 
-if TYPE_CHECKING:
-    from rasterio.io import DatasetReader
-
 JPEG, TIFF, PNG = (".jpg", ".jpeg"), (".tif", ".tiff"), (".png",)
 SUFFIXES = (*JPEG, *TIFF, *PNG)
 DAMAGED = ("photos.damaged", "is damaged, or not a photograph ({}). Copy it from the camera again.")
@@ -37,7 +34,8 @@ Pixels = npt.NDArray[Any]
 def photographs_in(folder: Path) -> list[Path]:
     """Return the photographs directly in a folder, in the order of their names."""
     if not folder.is_dir():
-        raise bad_file(folder, "photos.no_folder", "is not a folder. Give that of the photographs.")
+        sentence = "is not a folder of photographs. Extract those of a video with ffmpeg."
+        raise bad_file(folder, "photos.no_folder", sentence)
     found = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file())
     if not found:
         raise bad_file(folder, "photos.none", f"has no photographs ({', '.join(SUFFIXES)}).")
@@ -45,33 +43,33 @@ def photographs_in(folder: Path) -> list[Path]:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[DatasetReader]:
-    """Open a photograph with GDAL."""
+def _opened(path: Path, *mode: str, **how: Any) -> Iterator[Any]:
+    """Open an image without a georeference with GDAL."""
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning
 
-    with refusing(path, *DAMAGED), warnings.catch_warnings():
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(path) as image:
+        with rasterio.open(path, *mode, **how) as image:
             yield image
 
 
 def size_of(path: Path) -> tuple[int, int]:
     """Return columns and rows of a photograph, from its header."""
-    with _opened(path) as image:
+    with refusing(path, *DAMAGED), _opened(path) as image:
         return image.width, image.height
 
 
 def read_photograph(path: Path) -> Pixels:
     """Return the pixels as stored, shape (rows, columns, bands), not rotated by EXIF."""
-    if path.suffix.lower() in JPEG:
+    with refusing(path, *DAMAGED):
+        if path.suffix.lower() not in JPEG:
+            with _opened(path) as image:
+                return np.moveaxis(image.read(), 0, -1)
         from PIL import Image
 
-        with refusing(path, *DAMAGED), Image.open(path) as photograph:
-            pixels = np.asarray(photograph)
-        return pixels if pixels.ndim == 3 else pixels[..., None]
-    with _opened(path) as image:
-        return np.moveaxis(image.read(), 0, -1)
+        with Image.open(path) as photograph:
+            return np.atleast_3d(np.asarray(photograph))
 
 
 def read_colours(path: Path) -> Pixels:
@@ -99,7 +97,10 @@ def write_photograph(source: Path, target: Path, pixels: Pixels, touched: BoolAr
         elif suffix in TIFF:
             _write_tiff(source, path, pixels)
         else:
-            _write_png(path, pixels)
+            rows, columns, count = pixels.shape
+            how = {"width": columns, "height": rows, "count": count, "dtype": pixels.dtype.name}
+            with _opened(path, "w", driver="PNG", **how) as image:
+                image.write(np.moveaxis(pixels, -1, 0))
 
 
 def _write_jpeg(source: Path, path: Path, pixels: Pixels, touched: BoolArray) -> None:
@@ -156,19 +157,6 @@ _TIFF_KEPT = {270, 271, 272, 274, 282, 283, 296, 305, 306, 315, 700, 33432, 3355
 """Texts, resolution, rotation, XMP, GeoTIFF keys, and tags of multispectral cameras."""
 
 
-def _write_png(path: Path, pixels: Pixels) -> None:
-    """Write a PNG file of 8 or 16 bits."""
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning
-
-    rows, columns, count = pixels.shape
-    how = {"width": columns, "height": rows, "count": count, "dtype": pixels.dtype.name}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(path, "w", driver="PNG", **how) as target:
-            target.write(np.moveaxis(pixels, -1, 0))
-
-
 @dataclass(frozen=True)
 class Frames:
     """The photographs of a sequence in a folder, all of one size."""
@@ -191,9 +179,6 @@ class Frames:
 def read_frames(path: File, every: int = 1) -> Frames:
     """Return the frames of a folder, one in `every`; none is decoded yet."""
     place = Path(path)
-    if place.is_file():
-        sentence = "is not a folder. Extract the frames of a video: ffmpeg -i VIDEO FOLDER/%05d.png"
-        raise bad_file(place, "photos.no_folder", sentence)
     paths = tuple(photographs_in(place)[::every])
     sizes = [size_of(one) for one in paths]
     for one, size in zip(paths, sizes, strict=True):
