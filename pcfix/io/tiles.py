@@ -246,7 +246,7 @@ class RasterSource(LasSource):
     It has the open `raster` with the number of the `band` of heights, its `crs`, the `window` of
     all cells and their side `cell_m`. Stored values of `dtype` are heights (m) after multiplication
     by `scale` and addition of `offset`; a copy has `nodata` where there is no height. The points of
-    `part` are counted, see `pcfix.io.tiles.band_of`; before that there are none.
+    `part` are counted, see `band_of`; before that there are none.
     """
 
     def __init__(self, part: RasterBand) -> None:

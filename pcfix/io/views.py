@@ -30,7 +30,7 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -66,13 +66,6 @@ _MANY = 0.1
 _NEIGHBOURS = 20_000
 
 
-class ImageOrder(NamedTuple):
-    """One meaning of the image numbers."""
-
-    source: str
-    camera: npt.NDArray[np.int32]  # (images,), rows of `Cameras`, -1 without one
-
-
 @dataclass(frozen=True, eq=False)
 class ViewList:
     """The cameras that contributed to each of n points; `ViewMatch` gives them to a cloud's rows.
@@ -87,7 +80,8 @@ class ViewList:
     what: str  # the kind of file
     listed: Views  # of n points; a camera is an int32, the file's number of the image
     xyz: FloatArray | None = None  # (n, 3), frame of the file, then of the cameras
-    orders: tuple[ImageOrder, ...] = ()  # possible meanings of a number, until geometry decides
+    # rows of `Cameras` (-1 without one) that the numbers may mean, until geometry decides
+    orders: tuple[IntArray, ...] = ()
     share_seen: float | None = None
     tolerance_spacings: float = 0.05
 
@@ -146,7 +140,7 @@ def track_views(
     row = np.repeat(np.arange(len(rows)), np.diff(listed.start))
     pairs = np.unique(np.column_stack([row, listed.camera]), axis=0)  # a track may name one twice
     start = np.concatenate([[0], np.cumsum(np.bincount(pairs[:, 0], minlength=len(rows)))])
-    order = ImageOrder("the cameras of the tie points", np.arange(len(cameras), dtype=np.int32))
+    order = np.arange(len(cameras))
     views = ViewList(
         path, "tie points", Views(start, pairs[:, 1]), tie_points.xyz[rows], (order,),
         tolerance_spacings=2.0,
@@ -225,28 +219,25 @@ def _listed(path: Path, records: Records) -> Views:
     return Views(start, image, kind="depth-maps")
 
 
-def image_orders(raw: ViewList, cameras: Cameras) -> tuple[ImageOrder, ...]:
+def image_orders(raw: ViewList, cameras: Cameras) -> tuple[IntArray, ...]:
     """Return the orders that the image numbers may follow, the most likely first."""
-    orders, folder = list[ImageOrder](), raw.path.parent
+    orders, folder = list[IntArray](), raw.path.parent
     models = [folder / place / name for place in _PLACES for name in ("images.bin", "images.txt")]
     for model in filter(Path.is_file, models):
         with suppress(InputError):  # a damaged model is skipped
             images = read_images(model, points=False)
-            by_id = sorted(images, key=lambda one: one.identifier)
-            for source, some in ((f"{model}", images), (f"{model} by IMAGE_ID", by_id)):
-                row = match_labels([one.name for one in some], cameras.labels)[0]
-                orders.append(ImageOrder(source, row.astype(np.int32)))
-    orders.append(ImageOrder("the cameras as given", np.arange(len(cameras), dtype=np.int32)))
+            for some in (images, sorted(images, key=lambda one: one.identifier)):
+                orders.append(match_labels([one.name for one in some], cameras.labels)[0])
+    orders.append(np.arange(len(cameras)))
     most = int(raw.listed.camera.max(initial=-1))
-    fitting = [order for order in orders if most < len(order.camera)]
+    fitting = [order for order in orders if most < len(order)]
     if not fitting:
-        largest = max(orders, key=lambda order: len(order.camera))
-        sentence = f"names image {most} (from 0); {largest.source} has {len(largest.camera)}. Put"
-        sentence += " the sparse model next to the list."
+        sentence = f"names image {most} (from 0), of {max(map(len, orders))} images. Put the sparse"
+        sentence += " model next to the list."
         raise bad_file(raw.path, "views.image_number", sentence, value=most)
-    known = [order for order in fitting if (order.camera >= 0).any()]
+    known = [order for order in fitting if (order >= 0).any()]
     if not known:
-        sentence = f"no image of {fitting[0].source} is among the cameras. Give this block's."
+        sentence = "none of its images is among the cameras. Give those of this block."
         raise bad_file(raw.path, "views.other_block", sentence)
     return tuple(known)
 
@@ -264,7 +255,7 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray) -> ViewList:
     sizes = np.array([(lens.width, lens.height) for lens in cameras.lenses])
     shares = []
     for order in views.orders:
-        camera = order.camera[some.camera].astype(np.int64)
+        camera = order[some.camera]
         known = np.flatnonzero(camera >= 0)
         if len(known):
             size = sizes[camera[known]]
@@ -332,7 +323,7 @@ class ViewMatch:
             row = self._rows(xyz, first_row, views.xyz, report)
         matched = np.flatnonzero(row >= 0)
         some = views.listed.take(row[matched])
-        camera = views.orders[0].camera[some.camera].astype(np.int64)
+        camera = views.orders[0][some.camera]
         posed = camera >= 0
         start = np.zeros(len(row) + 1, np.int64)
         start[matched + 1] = np.diff(np.concatenate([[0], np.cumsum(posed)])[some.start])
