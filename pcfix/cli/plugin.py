@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pcfix.cli.flags import Command
-from pcfix.io.styles import packed
+from pcfix.io.files import packed_plugin
 from pcfix.options.declare import Option, options_of
 from pcfix.version import __version__
 
@@ -23,7 +23,7 @@ _PLACES = {
 def plugin_zip(commands: Mapping[str, Command]) -> bytes:
     """Return the plugin with the `OFFERED` commands."""
     table = {"version": __version__, "commands": [_command(n, commands[n]) for n in OFFERED]}
-    return packed(json.dumps(table, indent=1) + "\n", __version__)
+    return packed_plugin(json.dumps(table, indent=1) + "\n", __version__)
 
 
 def _command(name: str, command: Command) -> dict[str, Any]:

@@ -11,10 +11,10 @@ from pcfix.adjust.diagnosis import EXPORT, Diagnosis
 from pcfix.errors import InputError, SettingError, plain
 from pcfix.flow.diagnosis import adjust_words, diagnose_inputs, has_datum, quick_ties
 from pcfix.flow.inputs import Inputs, paths_in
-from pcfix.flow.plausibility import plausible
+from pcfix.flow.plausibility import likely_mistake, plausible
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import CloudView, sample_of, view_of
-from pcfix.io.cameras.georeference import adjusted_minus_gnss, likely_mistake
+from pcfix.io.cameras.georeference import adjusted_minus_gnss
 from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.crs import shortened
 from pcfix.io.files import check_input

@@ -19,11 +19,10 @@ from pcfix.flow.correction import CloudTally, Plan, correct_chunk
 from pcfix.flow.diagnosis import diagnose_in_passing, quick_ties
 from pcfix.flow.inputs import CameraInputs, Inputs, paths_in, transfer_between
 from pcfix.flow.planning import plan_correction, plan_of, read_inputs
-from pcfix.flow.plausibility import CloudSample, Plausible, plausible
+from pcfix.flow.plausibility import CloudSample, Plausible, likely_mistake, plausible
 from pcfix.flow.raster import check_heights
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
-from pcfix.io.cameras.georeference import likely_mistake
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header

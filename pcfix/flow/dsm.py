@@ -30,11 +30,11 @@ from pcfix.io.files import check_output, scratch_arrays, write_text
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.las.writing import is_ours
 from pcfix.io.rasters import METRE, TO_95
-from pcfix.io.styles import raster_style
 from pcfix.io.tiles import CloudFiles, Clouds, cloud_of, inputs_of, open_cloud
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, FloatArray
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules
+from pcfix.report.styles import raster_style
 from pcfix.running import bounds, empty, release
 from pcfix.sums import Figures
 from pcfix.version import __version__

@@ -25,7 +25,6 @@ from pcfix.io import rasters
 from pcfix.io.crs import crs_words
 from pcfix.io.files import read_json, sha256, write_bytes, write_text
 from pcfix.io.las.source import RasterBand, stated_crs
-from pcfix.io.styles import Symbol, limits_of, vector_style
 from pcfix.io.tables import read_check_depths
 from pcfix.io.tiles import RasterSource, Tiles, open_cloud
 from pcfix.io.vectors import Layer, write_layers
@@ -37,6 +36,7 @@ from pcfix.report.adjustment import adjustment_sentence
 from pcfix.report.comparison import evaluation
 from pcfix.report.page import Report, Table, extent_of, render
 from pcfix.report.run import RunMaps, run_report
+from pcfix.report.styles import Symbol, limits_of, vector_style
 from pcfix.report.text import Plain, Summary
 from pcfix.water.surface import surface_above
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import io
 import json
 import mmap
 import os
@@ -15,9 +16,11 @@ import re
 import stat
 import subprocess
 import weakref
+import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
+from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
@@ -310,3 +313,23 @@ def find_members(cameras: File) -> tuple[Path, Members] | None:
         if shapes != [(k,), (m, k, 3), (m, k, 3), (m, k, p), (m, 7)]:
             raise ValueError(shapes)
     return found, members
+
+
+_WHEN = (1980, 1, 1, 0, 0, 0)
+"""Time of all files in an archive, so that the same input gives the same bytes."""
+
+
+def packed_plugin(table: str, version: str) -> bytes:
+    """Return the QGIS plugin as a ZIP file, with a table of its commands as JSON."""
+    stream = io.BytesIO()
+    own = {
+        one.name: one.read_text("utf-8")
+        for one in files("pcfix.qgis").iterdir()
+        if one.name.endswith((".py", ".txt"))
+    }
+    own["metadata.txt"] = own["metadata.txt"].replace("version=0.0", f"version={version}")
+    own["commands.json"] = table
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as file:
+        for name in sorted(own):
+            file.writestr(zipfile.ZipInfo(f"pcfix/{name}", _WHEN), own[name].encode())
+    return stream.getvalue()

@@ -291,37 +291,3 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatA
 
 
 # ---- cameras that are not over their cloud ----
-
-
-MARGIN_M = 100.0
-"""Distance from the cloud, beyond half of its sides, at which a block can still belong to it."""
-ABSURD_HEIGHTS = 3.0
-"""Largest height of cameras above the cloud, in widths of the cloud."""
-
-
-def likely_mistake(centres: FloatArray, low: FloatArray, high: FloatArray) -> str | None:
-    """Return how a block does not match its cloud; None if it does.
-
-    Parameters
-    ----------
-    centres : array, shape (k, 3)
-        Projection centres, assumed to be in the cloud's CRS.
-    low, high : array, shape (3,)
-        Corners of the cloud, metres.
-    """
-    size, middle = (high - low)[:2], np.median(centres, axis=0)
-    x, y = (low + high)[:2] / 2.0 - middle[:2]
-    if (np.abs([x, y]) > size + MARGIN_M).any():
-        away = float(np.hypot(x, y))
-        far = f"{away / 1000.0:,.1f} km" if away >= 1e4 else f"{away:.0f} m"
-        advice = "check the CRS, the unit and the order of x and y of both, or give an offset of"
-        advice += f" {x:.0f}, {y:.0f} m by --cameras-offset"
-        return f"The cameras are {far} from the cloud in plan; {advice}."
-    width = max(size.max(), MARGIN_M)
-    if low[2] <= middle[2] <= high[2] + ABSURD_HEIGHTS * width:
-        return None
-    what = f"{middle[2] - high[2]:.0f} m above the cloud, which is {width:.0f} m wide"
-    if middle[2] < low[2]:
-        what = f"{low[2] - middle[2]:.0f} m below the lowest point of the cloud"
-    why = "check the unit and the vertical datum of both, or see --cameras-offset"
-    return f"The cameras are {what}: {why}."

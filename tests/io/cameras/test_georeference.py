@@ -9,7 +9,8 @@ import pytest
 from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
-from pcfix.io.cameras.georeference import adjusted_minus_gnss, georeference, likely_mistake
+from pcfix.flow.plausibility import likely_mistake
+from pcfix.io.cameras.georeference import adjusted_minus_gnss, georeference
 from pcfix.model import Cameras, GnssPositions
 from tests.utils import geodesy
 from tests.utils.codes import refused
