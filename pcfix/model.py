@@ -364,7 +364,7 @@ class GroundControl:
     def surveyed(self) -> GroundControl:
         """The points with coordinates."""
         known = np.asarray(np.isfinite(self.xyz).all(axis=1))
-        kept, rows = known[self.point], np.flatnonzero(known)
+        rows_used, rows = known[self.point], np.flatnonzero(known)
         return replace(
             self,
             names=tuple(self.names[i] for i in rows),
@@ -372,10 +372,10 @@ class GroundControl:
             sigma_m=self.sigma_m[rows],
             is_check=self.is_check[rows],
             under_water=self.under_water[rows],
-            point=(np.cumsum(known) - 1)[self.point[kept]],
-            camera=self.camera[kept],
-            image_xy=self.image_xy[kept],
-            sigma_px=self.sigma_px[kept],
+            point=(np.cumsum(known) - 1)[self.point[rows_used]],
+            camera=self.camera[rows_used],
+            image_xy=self.image_xy[rows_used],
+            sigma_px=self.sigma_px[rows_used],
             on=(),
             on_sigma_m=np.zeros(0),
         )

@@ -134,7 +134,7 @@ def mapped(function: Callable[..., Any], *arrays: Array) -> Array:
     return np.asarray(result)
 
 
-def kept(mask: Array, array: Array) -> Array:
+def subset(mask: Array, array: Array) -> Array:
     """Return the rows of an array, (n, ...), where a mask, (n,), is true."""
     count, done = int(np.count_nonzero(mask)), 0
     if count == len(mask):

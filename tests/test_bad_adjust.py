@@ -158,16 +158,16 @@ def test_gnss_of_another_block(refuse):
 )
 def test_start_poses(refuse, model, code):
     def change(folder, files):
-        made, rng = files.made, np.random.default_rng(5)
-        turn = Rotation.random(len(made.cameras), rng=rng).as_matrix()
+        data, rng = files.data, np.random.default_rng(5)
+        turn = Rotation.random(len(data.cameras), rng=rng).as_matrix()
         if model == "upside down":
             turn = np.broadcast_to(np.eye(3), turn.shape)
         wild = replace(
-            made.cameras, rotations=np.ascontiguousarray(turn), crs=EPSG,
-            centres=made.cameras.centres + rng.normal(0.0, 0.2, made.cameras.centres.shape),
+            data.cameras, rotations=np.ascontiguousarray(turn), crs=EPSG,
+            centres=data.cameras.centres + rng.normal(0.0, 0.2, data.cameras.centres.shape),
         )  # fmt: skip
         shutil.rmtree(folder / "model")
-        write_colmap(folder / "model", wild, made.ties)
+        write_colmap(folder / "model", wild, data.ties)
 
     refuse(code, change=change)
 

@@ -77,7 +77,7 @@ def test_commands():
 
 
 IDIOM = re.compile(
-    r"\b(anew|mend(s|ed|ing)?|so many|by itself|told|tells|kept|came|said|beside|stands|lies"
+    r"\b(anew|mend(s|ed|ing)?|bent|so many|by itself|told|tells|kept|came|said|beside|stands|lies"
     r"|goes by|leaves? out|left out|in sight|doubts?|steep(er|est)?)\b", re.I
 )  # fmt: skip
 """Words of the project's former idiom, which readers did not understand."""

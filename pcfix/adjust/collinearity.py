@@ -308,7 +308,7 @@ def _brown_gradient(c: FloatArray, x: float, y: float, code: int) -> tuple[float
 
 @device
 def condition(state: State, given: Given, p: int, work: Workspace, at: int) -> bool:
-    """Fill a row of the workspace with the condition that a point lies on a surface, if it does.
+    """Fill a row of the workspace with the condition of a point on a surface, if it is on one.
 
     Membership of a surface (Mulsow 2024) is one more observation: the distance from the surface,
     along the axis nearest to its normal, is zero within a standard deviation. The second of the two

@@ -101,7 +101,7 @@ class Diagnosis:
 
     @property
     def decided_by(self) -> Sign | None:
-        """The first sign that says something."""
+        """The first sign with evidence."""
         return next((sign for sign in self.signs if sign.speaks is not None), None)
 
     @property

@@ -63,7 +63,7 @@ def adjust_ties(block: Block, unknowns: Unknowns, *, choose_lens: bool = True) -
             " and poses belong to one model, and the water level; or align the images again."
         )
         raise GeometryError("adjust.not_converged", words)
-    problem, now, precision = _settled(clean, now)
+    problem, now, precision = _final_solution(clean, now)
     notes = list[PcfixWarning]()
     if choose_lens:
         weak = weak_lens_parameters(problem, now, precision)
@@ -76,7 +76,7 @@ def adjust_ties(block: Block, unknowns: Unknowns, *, choose_lens: bool = True) -
             notes.append(PcfixWarning("adjust.weak_lens", words, fixed=weak))
         if weak or more:
             lens = (*(name for name in unknowns.lens if name not in weak), *more)
-            problem, now, precision = _settled(*_with_lens(clean, now, lens))
+            problem, now, precision = _final_solution(*_with_lens(clean, now, lens))
     factor = disagreement_of(problem, now, precision) * common_errors(problem, precision)
     precision = precision_of(problem, now, precision.sigma0, factor)
     return adjusted_of(problem, now, precision, notes, "tie points")
@@ -98,7 +98,7 @@ def _cleaned(problem: Problem, now: Solution) -> tuple[Problem, Solution]:
     return problem, now
 
 
-def _settled(problem: Problem, now: Solution) -> tuple[Problem, Solution, Precision]:
+def _final_solution(problem: Problem, now: Solution) -> tuple[Problem, Solution, Precision]:
     """Return the least squares solution without outliers, and its precision.
 
     The noise is now estimated from all residuals, long tails included, so that GNSS and control

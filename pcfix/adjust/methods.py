@@ -24,7 +24,7 @@ SMALL_WATER = 10
 GROSS_SIGMAS, GROSS_PX = 20.0, 10.0
 """A control point with larger errors than both is a mistake, not noise."""
 
-ELSEWHERE = 0.1
+MOST_OFFSET = 0.1
 """Share of the flying height; no absorbed refraction puts control points that far off."""
 
 BED_GSD = 1.5
@@ -105,14 +105,14 @@ def check_marks(
     """
     marks, _ = marks_of(control)
     found = intersect_fixed(plain_block(cameras, marks))
-    met = np.isfinite(found.squares) & (np.diff(found.start) >= 2) & ~control.is_check
-    if met.sum() < 3:
+    intersect = np.isfinite(found.squares) & (np.diff(found.start) >= 2) & ~control.is_check
+    if intersect.sum() < 3:
         return
     off = found.xyz - control.xyz
-    middle = np.median(off[met], axis=0)
-    distance = np.where(met, np.linalg.norm(off - middle, axis=1), 0.0)
+    middle = np.median(off[intersect], axis=0)
+    distance = np.where(intersect, np.linalg.norm(off - middle, axis=1), 0.0)
     height = float(np.median(cameras.centres[:, 2]) - np.nanmedian(control.xyz[:, 2]))
-    if is_placed and np.abs(middle).max() > ELSEWHERE * height > 0.0:
+    if is_placed and np.abs(middle).max() > MOST_OFFSET * height > 0.0:
         x, y, z = (-middle).tolist()
         words = (
             f"{name}: the control points are {x:.1f}, {y:.1f}, {z:.1f} m (x, y, z; median) from the"
@@ -121,7 +121,7 @@ def check_marks(
         )
         raise GeometryError("gcps.offset", words, path=name, offset_m=[x, y, z])
     worst = int(np.argmax(distance))
-    if distance[worst] > ELSEWHERE * height > 0.0:
+    if distance[worst] > MOST_OFFSET * height > 0.0:
         point = control.names[worst]
         words = (
             f"{name}: control point {point} does not fit: its marks intersect"

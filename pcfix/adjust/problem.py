@@ -208,8 +208,8 @@ def _planes(
                     " needed. Mark more points."
                 )
                 raise GeometryError("gcps.few_on_plane", words, plane=", ".join(bundle))
-            apart = np.vstack([points - points.mean(axis=0) for points in on])
-            normal = np.linalg.svd(apart, full_matrices=False)[2][-1]
+            offsets = np.vstack([points - points.mean(axis=0) for points in on])
+            normal = np.linalg.svd(offsets, full_matrices=False)[2][-1]
         up = int(np.abs(normal).argmax())
         x, y = (up + 1) % 3, (up + 2) % 3
         slopes = -normal[[x, y]] / normal[up]
@@ -394,8 +394,8 @@ def intersect_fixed(block: Block) -> Intersected:
     problem, start = prepare(block, Unknowns(poses="fixed", lens=()))
     state, step = intersected(problem, start.state)
     r = residuals(state, problem.given)
-    settled = np.asarray((np.abs(step) < CLOSE_M).all(axis=1))
-    r[~settled[block.owner]] = np.nan
+    converged = np.asarray((np.abs(step) < CLOSE_M).all(axis=1))
+    r[~converged[block.owner]] = np.nan
     return Intersected(state.xyz + problem.origin, r, np.asarray(block.start))
 
 

@@ -201,7 +201,7 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
         },
         "observations": {
             "used": a.used.sum(),
-            "left_out": (~a.used & ~block.is_check[block.owner]).sum(),
+            "excluded": (~a.used & ~block.is_check[block.owner]).sum(),
         },
         "sigma0": a.sigma0,
         "redundancy": a.redundancy,

@@ -40,7 +40,7 @@ SAME_SIDES = 0.002
 POINTS_AT_ONCE = 100_000
 """Points whose cameras are listed at a time, which limits the memory."""
 
-MOST_APART = 0.1
+MOST_SHIFT = 0.1
 """Share of the flying height between two centres of one image; refraction moves a block, with its
 datum and scale, by a few hundredths."""
 
@@ -156,7 +156,7 @@ class Transferred(NamedTuple):
     moved: BoolArray  # (n,), whether a point could be transferred
     views: Views | None  # their view list with the adjusted cameras, if there is one
 
-    def whole(self, correction: Correction) -> Correction:
+    def as_original(self, correction: Correction) -> Correction:
         """Return the correction of `xyz` as one of the original points.
 
         Points that were not transferred or not corrected stay at their original place.
@@ -180,7 +180,7 @@ class TransferCounts(Sums):
 
     @classmethod
     def of(cls, step: Transferred, correction: Correction) -> TransferCounts:
-        """Return those of a chunk, with the correction that `Transferred.whole` returned."""
+        """Return those of a chunk, with the correction that `Transferred.as_original` returned."""
         followed = step.moved & ~correction.uncorrected
         shift = (step.xyz - step.original_xyz)[followed]
         land = int((correction.outcome[followed] == Outcome.LAND).sum())
@@ -216,15 +216,15 @@ class CloudTransfer:
         if not len(xyz):
             return
         height = float(np.median(self.original.centres[:, 2]) - np.median(xyz[:, 2]))
-        way = self.adjusted.centres - self.original.centres
-        apart = float(np.median(np.linalg.norm(way, axis=1)))
-        if apart > MOST_APART * height > 0.0:
+        offset = self.adjusted.centres - self.original.centres
+        off_m = float(np.median(np.linalg.norm(offset, axis=1)))
+        if off_m > MOST_SHIFT * height > 0.0:
             words = (
-                f"--adjusted-from: its cameras are {apart:,.0f} m from the adjusted ones (median;"
+                f"--adjusted-from: its cameras are {off_m:,.0f} m from the adjusted ones (median;"
                 f" flying height {height:,.0f} m). Check both files, --cameras-crs and"
                 " --cameras-offset, which count for the file that has no CRS."
             )
-            raise GeometryError("adjusted_from.too_far", words, distance_m=apart, height_m=height)
+            raise GeometryError("adjusted_from.too_far", words, distance_m=off_m, height_m=height)
 
     def check(self, name: str, counts: TransferCounts) -> None:
         """Refuse a cloud that the original cameras do not see."""
@@ -250,6 +250,6 @@ class CloudTransfer:
         }
 
     def provenance(self) -> dict[str, Any]:
-        """Return what the output file says about the transfer."""
+        """Return the record of the transfer for the output file."""
         source = self.original.source
         return {"adjusted_from": {"cameras": len(self.row), "source": source}}

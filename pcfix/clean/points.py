@@ -16,7 +16,7 @@ from pcfix.clean.neighbours import PIECE_ROWS, SLACK, Neighbours, make_tiles
 from pcfix.errors import bad_file
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.options.steps import LEAST_NEIGHBOURS, CleanRules
-from pcfix.running import current, kept, row_numbers
+from pcfix.running import current, row_numbers, subset
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
 ReasonArray = npt.NDArray[np.uint8]
@@ -146,7 +146,7 @@ def _pieces(
     xyz: FloatArray, used: BoolArray, axes: int
 ) -> Iterator[tuple[Neighbours, IntArray, FloatArray]]:
     """Yield the search, and rows and coordinates of the used points, piece by piece."""
-    tiles, row = make_tiles(kept(used, xyz)), kept(used, row_numbers(len(xyz)))
+    tiles, row = make_tiles(subset(used, xyz)), subset(used, row_numbers(len(xyz)))
     near = Neighbours(tiles, axes)
     for piece in tiles.pieces(PIECE_ROWS):
         yield near, row[tiles.row[piece]], tiles.xyz[piece]

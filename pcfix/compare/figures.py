@@ -15,7 +15,7 @@ from pcfix.compare.match import Match, heights_at, mean_spacing_m
 from pcfix.compare.statistics import binned, distribution_of, fit_line, statistics_of, tvu_of
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, plain
 from pcfix.model import FloatArray
-from pcfix.running import blocks, bounds, kept, mapped
+from pcfix.running import blocks, bounds, mapped, subset
 from pcfix.sums import Figures
 
 
@@ -87,7 +87,7 @@ def figures_of(
     The cross-sections along `lines` come with the automatic ones; `others` are further clouds by
     name. Raises GeometryError if there are too few points for planes, or M3C2 finds nothing.
     """
-    whole, reference, rules = match.whole, match.reference, match.settings
+    survey, reference, rules = match.survey, match.reference, match.settings
     c2c, c2c_from_reference = found = c2c_of(match)
     notes = sparse_notes(match, *found)
     pairs = vertical = residuals = None
@@ -106,14 +106,14 @@ def figures_of(
             residuals = np.column_stack([after.xy, after.reference_m, after.error_m])
     also = []
     for name, other in others.items():
-        ways = zip(("c2c", "c2c_from_reference"), c2c_of(other), strict=True)
-        distances = {way: None if one is None else one.after for way, one in ways}
-        also.append(Figures(name=name, cloud=other.whole.name, **distances))
+        measures = zip(("c2c", "c2c_from_reference"), c2c_of(other), strict=True)
+        distances = {key: None if one is None else one.after for key, one in measures}
+        also.append(Figures(name=name, cloud=other.survey.name, **distances))
     counts = Figures(
-        cloud=len(whole) + whole.left_out,
-        cloud_left_out=whole.left_out,
-        reference=len(reference.xyz) + reference.left_out,
-        reference_left_out=reference.left_out,
+        cloud=len(survey) + survey.excluded,
+        cloud_excluded=survey.excluded,
+        reference=len(reference.xyz) + reference.excluded,
+        reference_excluded=reference.excluded,
         outside_overlap=match.outside,
         not_submerged=match.not_submerged,
         compared=len(match.places) if reference.sparse else len(match.cloud),
@@ -121,7 +121,7 @@ def figures_of(
         reference_compared=len(match.places) if rules.from_reference else 0,
     )
     return Comparison(
-        cloud=whole.name,
+        cloud=survey.name,
         reference=reference.name,
         # each point of the cloud, or each check point
         measured_at="reference" if reference.sparse else "cloud",
@@ -179,24 +179,24 @@ def sparse_notes(match: Match, to: Figures | None, back: Figures | None) -> list
         spacings[name] = spacing_m(xyz, max(side, 1e-9))
     notes = []
     for pair, sparse, dense in zip((to, back), spacings, reversed(spacings), strict=True):
-        apart, times = spacings[sparse], spacings[sparse] / max(spacings[dense], 1e-9)
-        if pair is None or times < SPARSER or apart < (mean := pair.after.statistics.mean_m):
+        spacing, times = spacings[sparse], spacings[sparse] / max(spacings[dense], 1e-9)
+        if pair is None or times < SPARSER or spacing < (mean := pair.after.statistics.mean_m):
             continue
         remedy = f"Give --direction {'from' if sparse == 'reference' else 'to'}-reference."
         if match.reference.raster:
             remedy = "Use the vertical error, or give the reference as points."
         text = (
             f"C2C to the {sparse} ({mean:.3f} m on average) mostly measures the spacing of its"
-            f" points: {apart:.2g} m, {times:.0f} times that of the {dense}. {remedy}"
+            f" points: {spacing:.2g} m, {times:.0f} times that of the {dense}. {remedy}"
         )
-        notes.append(PcfixWarning(f"{sparse}.sparse", text, spacing_m=apart, times=times))
+        notes.append(PcfixWarning(f"{sparse}.sparse", text, spacing_m=spacing, times=times))
     return notes
 
 
 def _pairs(match: Match) -> Figures:
     """Return the `Pairs` at each point of the cloud, or at each check point."""
     sparse, k = match.reference.sparse, match.settings.neighbours
-    name = match.whole.name if sparse else match.reference.name
+    name = match.survey.name if sparse else match.reference.name
     count = len(match.cloud if sparse else match.reference.xyz)
     if count < k:
         sentence = (
@@ -233,8 +233,8 @@ def _by_depth(match: Match, pairs: Figures, notes: list[PcfixWarning]) -> dict[s
     def submerged(p: Pairs) -> tuple[FloatArray, FloatArray]:
         """Return reference depths and errors of the submerged places."""
         above = surface if p is after else np.asarray(match.water_at(p.xy))
-        depth = mapped(np.subtract, kept(wet, above), kept(wet, p.reference_m))
-        return depth, kept(wet, p.error_m)
+        depth = mapped(np.subtract, subset(wet, above), subset(wet, p.reference_m))
+        return depth, subset(wet, p.error_m)
 
     found = both(submerged, pairs)
     (depth, error), error_before = found.after, found.before and found.before[1]
@@ -242,10 +242,10 @@ def _by_depth(match: Match, pairs: Figures, notes: list[PcfixWarning]) -> dict[s
         "depth": both(lambda f: fit_line(f[0], mapped(np.subtract, *f)), found),
         "depth_bins": binned(depth, error, error_before, rules.bin_width),
         "tvu": tvu_of(error, depth),
-        "bed": both(lambda p: statistics_of(kept(wet, p.error_m)), pairs),
+        "bed": both(lambda p: statistics_of(subset(wet, p.error_m)), pairs),
     }
     if not wet.all():
-        figures["land"] = both(lambda p: statistics_of(kept(~wet, p.error_m)), pairs)
+        figures["land"] = both(lambda p: statistics_of(subset(~wet, p.error_m)), pairs)
     return figures
 
 
@@ -263,7 +263,7 @@ def _sections(
 ) -> tuple[Section, ...]:
     """Return the cross-sections that were asked for."""
     if match.settings.sections:
-        bed = kept(match.wet, match.cloud.xyz) if match.wet.any() else match.cloud.xyz
+        bed = subset(match.wet, match.cloud.xyz) if match.wet.any() else match.cloud.xyz
         lines = [*lines, *lines_downslope(bed, match.settings.sections)]
     layers = {
         "water": match.water_points,
@@ -381,7 +381,7 @@ def lines_downslope(xyz: FloatArray, count: int) -> tuple[SectionLine, ...]:
     lines = []
     for low, high in pairwise(edges):
         left_of = place[:, 1]
-        share = kept((left_of >= low) & (left_of <= high), place)
+        share = subset((left_of >= low) & (left_of <= high), place)
         (start, _), (stop, _) = bounds(share) if len(share) else np.zeros((2, 2))
         if stop > start:
             middle = origin[:2] + 0.5 * (low + high) * left

@@ -70,7 +70,7 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
     known = np.isfinite(distance)
     if not known.any():
         sentence = (
-            f"M3C2: no cylinder of {cylinder:.3g} m radius holds points of both clouds within"
+            f"M3C2: no cylinder of {cylinder:.3g} m radius contains points of both clouds within"
             f" {max_distance_m:.3g} m. Check that they overlap."
         )
         values = {"radius_m": cylinder, "max_distance_m": max_distance_m}

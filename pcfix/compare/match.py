@@ -12,7 +12,7 @@ from pcfix.clean.neighbours import nearest_of
 from pcfix.errors import GeometryError, SettingError, bad_file
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import CompareRules
-from pcfix.running import blocks, bounds, empty, kept, mapped
+from pcfix.running import blocks, bounds, empty, mapped, subset
 
 GAP_SPACINGS, MIN_GAP_M = 5.0, 1.0
 """A point counts up to this distance outside the other cloud, unless the user sets it."""
@@ -29,7 +29,7 @@ class SurveyCloud:
     name: str  # for messages
     xyz: FloatArray  # (n, 3)
     crs: Any  # pyproj.CRS or None
-    left_out: int  # points withheld, or of an ignored class
+    excluded: int  # points withheld, or of an ignored class
     shift_m: FloatArray | None  # (n, 3), true minus apparent, of a cloud that pcfix corrected
     bathymetric: BoolArray  # (n,), class 40
     water_m: FloatArray  # (n,), height of the water above each point; NaN if unknown
@@ -54,10 +54,10 @@ class SurveyCloud:
             return self
         return replace(
             self,
-            xyz=kept(rows, self.xyz),
-            shift_m=None if self.shift_m is None else kept(rows, self.shift_m),
-            bathymetric=kept(rows, self.bathymetric),
-            water_m=kept(rows, self.water_m),
+            xyz=subset(rows, self.xyz),
+            shift_m=None if self.shift_m is None else subset(rows, self.shift_m),
+            bathymetric=subset(rows, self.bathymetric),
+            water_m=subset(rows, self.water_m),
         )
 
 
@@ -68,7 +68,7 @@ class Reference:
     name: str  # for messages
     xyz: FloatArray  # (m, 3), metres
     crs: Any  # pyproj.CRS or None
-    left_out: int = 0  # points withheld, of noise, or of water; cells without data
+    excluded: int = 0  # points withheld, of noise, or of water; cells without data
     sparse: bool = False  # single check points, not a sampled surface
     raster: bool = False  # centres of cells
 
@@ -77,7 +77,7 @@ class Reference:
 class Match:
     """The points of a cloud and a reference that are compared."""
 
-    whole: SurveyCloud  # all points that are neither withheld nor noise
+    survey: SurveyCloud  # all points that are neither withheld nor noise
     asked: SurveyCloud  # those under water, if only these are compared
     cloud: SurveyCloud  # the n points of these within the reference
     wet: BoolArray  # (n,), those under water
@@ -94,10 +94,10 @@ class Match:
     @cached_property
     def water_points(self) -> FloatArray:
         """The water surface above the points where it is known, shape (w, 3), metres."""
-        known = mapped(np.isfinite, self.whole.water_m)
+        known = mapped(np.isfinite, self.survey.water_m)
         if not known.any():
             return np.empty((0, 3))
-        xyz, water_m = kept(known, self.whole.xyz), kept(known, self.whole.water_m)
+        xyz, water_m = subset(known, self.survey.xyz), subset(known, self.survey.water_m)
         return mapped(lambda p, w: np.column_stack([p[:, :2], w]), xyz, water_m)
 
     def water_at(self, xy: FloatArray) -> FloatArray | None:
@@ -105,7 +105,7 @@ class Match:
 
         Without a surface it is the height above the nearest point where it is known.
         """
-        if (water := self.whole.water) is not None:
+        if (water := self.survey.water) is not None:
             from pcfix.water.surface import surface_above  # slow to import
 
             return mapped(
@@ -119,7 +119,7 @@ class Match:
         return height
 
 
-def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, given: bool) -> Match:
+def match(survey: SurveyCloud, target: Reference, settings: CompareRules, *, given: bool) -> Match:
     """Choose the points to compare.
 
     If the user has `given` the water surface it decides what is submerged, else also class 40.
@@ -134,39 +134,39 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
     if code:
         sentence = f"{target.name} {why}. Omit --direction {direction}, or give a cloud."
         raise SettingError(code, sentence, path=target.name, direction=direction)
-    wet = mapped(lambda xyz, water: xyz[:, 2] < water, whole.xyz, whole.water_m)
+    wet = mapped(lambda xyz, water: xyz[:, 2] < water, survey.xyz, survey.water_m)
     if not given:
-        wet |= whole.bathymetric
-    chosen = wet if settings.submerged else np.ones(len(whole), np.bool_)
+        wet |= survey.bathymetric
+    chosen = wet if settings.submerged else np.ones(len(survey), np.bool_)
     if not chosen.any():
         sentence = (
             "no point is of class 40 or below the water. Give the water surface with --water, or"
             " omit --submerged."
         )
-        raise bad_file(whole.name, "cloud.not_submerged", sentence)
-    asked, not_submerged = whole.take(chosen), int(len(whole) - chosen.sum())
+        raise bad_file(survey.name, "cloud.not_submerged", sentence)
+    asked, not_submerged = survey.take(chosen), int(len(survey) - chosen.sum())
     by_place = target.sparse or settings.from_reference
     places, near = target.xyz, chosen
     if by_place:
-        gap = settings.max_gap or gap_m(whole.xyz)
-        places = kept(near_in_plan(places, asked.xyz, gap), places)
+        gap = settings.max_gap or gap_m(survey.xyz)
+        places = subset(near_in_plan(places, asked.xyz, gap), places)
     if not target.sparse:
         gap = settings.max_gap or gap_m(target.xyz)
-        near = chosen & near_in_plan(whole.xyz, target.xyz, gap)
+        near = chosen & near_in_plan(survey.xyz, target.xyz, gap)
     if not (near.any() and len(places)):
         boxes = [bounds(xyz[:, :2]) for xyz in (asked.xyz, target.xyz)]
         places_of = [
             f"{name} (x {low[0]:.1f} to {high[0]:.1f}, y {low[1]:.1f} to {high[1]:.1f})"
-            for name, (low, high) in zip((whole.name, target.name), boxes, strict=True)
+            for name, (low, high) in zip((survey.name, target.name), boxes, strict=True)
         ]
         raise GeometryError(
             "reference.no_overlap",
             f"{' and '.join(places_of)} do not overlap in plan. Check the CRS of both.",
-            cloud=whole.name, reference=target.name, bounds=boxes,
+            cloud=survey.name, reference=target.name, bounds=boxes,
         )  # fmt: skip
     outside = len(target.xyz) - len(places) if target.sparse else int((chosen & ~near).sum())
     found = Match(
-        whole, asked, whole.take(near), kept(near, wet), target, places, outside, not_submerged,
+        survey, asked, survey.take(near), subset(near, wet), target, places, outside, not_submerged,
         settings,
     )  # fmt: skip
     surface = found.water_at(places[:, :2]) if by_place and settings.submerged else None
@@ -181,7 +181,7 @@ def match(whole: SurveyCloud, target: Reference, settings: CompareRules, *, give
         )
         raise GeometryError("reference.not_submerged", sentence, path=target.name)
     dry = int((~under).sum()) if target.sparse else 0
-    return replace(found, places=kept(under, places), not_submerged=not_submerged + dry)
+    return replace(found, places=subset(under, places), not_submerged=not_submerged + dry)
 
 
 def gap_m(xyz: FloatArray) -> float:

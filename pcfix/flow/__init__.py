@@ -1,4 +1,4 @@
-"""The one calculation: over arrays, and over a whole file chunk by chunk.
+"""The commands: each reads, computes and writes, for arrays or a file in chunks.
 
 Every door (command line, PDAL, Python) ends here.
 """

@@ -25,7 +25,7 @@ from pcfix.io.rasters import new_raster, write_bands
 from pcfix.model import FloatArray, Lens, WaterRaster
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import CalmOptions
-from pcfix.photos.calm import LEAST_CORNERS, corners_in, covered, laid, median_of, register
+from pcfix.photos.calm import LEAST_CORNERS, corners_in, covered, median_of, register, warped
 from pcfix.photos.mapping import Photo
 from pcfix.photos.waves import Nodes, View, displacements, fit_waves, nodes_of, slopes_of
 from pcfix.running import release, threads
@@ -73,7 +73,7 @@ def calm_frames(
     if given.surface and interval is None:
         sentence = "--surface needs the time between the frames. Give --interval."
         raise SettingError("option.missing", sentence, option="interval")
-    target, beside = check_calm(out, found, overwrite=given.overwrite)
+    target, spread_path = check_calm(out, found, overwrite=given.overwrite)
     folder = target.with_name(f"{target.stem}_water")
     if given.surface and folder.exists() and not given.overwrite:
         sentence = f"{folder}: exists. Add --overwrite to replace it."
@@ -113,7 +113,7 @@ def calm_frames(
                 notes.append(PcfixWarning("waves.explained", words, explained=water.explained))
     # with the metadata of the first
     write_photograph(found.photographs[0], target, median, np.ones(median.shape[:2], bool))
-    write_spread(beside, spread)
+    write_spread(spread_path, spread)
     middle = np.array([0.5 * found.columns, 0.5 * found.rows, 1.0])
     moved = homographies @ middle
     return finished(
@@ -122,7 +122,7 @@ def calm_frames(
         notes,
         input=str(frames),
         output=str(out),
-        spread_file=str(beside),
+        spread_file=str(spread_path),
         frames=len(found.names),
         columns=found.columns,
         rows=found.rows,
@@ -160,7 +160,7 @@ def _median(
             stack = empty((len(frames.names), *frame.shape), frame.dtype)
         check_kind(frames.names[number], frame, stack[0])
         same = np.array_equal(homographies[number], np.eye(3))
-        stack[number] = frame if same else laid(frame, homographies[number])
+        stack[number] = frame if same else warped(frame, homographies[number])
     shape = stack.shape[1:3]
     median = np.empty(stack.shape[1:], stack.dtype)
     spread = np.empty(shape, np.float32)

@@ -19,7 +19,7 @@ from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.crs import shortened
 from pcfix.io.files import check_input
 from pcfix.io.ground_control import read_gnss
-from pcfix.lens.frames import cameras_in_sight
+from pcfix.lens.frames import count_visible_cameras
 from pcfix.model import Cameras, FloatArray, TiePoints, WaterDimension
 from pcfix.options.correct import CamerasCheckOptions
 from pcfix.options.declare import File, taken
@@ -178,11 +178,11 @@ def _fit(
     ``seen_by`` are the shares of the points in the frames of 0, 1, 2, 3 or more images. The verdict
     is what is likely wrong, empty if cameras and cloud match.
     """
-    visible = np.minimum(cameras_in_sight(xyz, cameras), 3)
+    visible = np.minimum(count_visible_cameras(xyz, cameras), 3)
     shares = np.bincount(visible, minlength=4) / len(xyz)
     found = plausible(cameras, xyz, ties, **flight)
     verdict = likely_mistake(cameras.centres, xyz.min(axis=0), xyz.max(axis=0))
-    verdict = verdict or " ".join(map(str, found.doubts))
+    verdict = verdict or " ".join(map(str, found.problems))
     return {
         "cloud": view.name,
         "points_sampled": len(xyz),
@@ -240,7 +240,7 @@ def cameras_text(report: CamerasReport) -> str:
         for label, tests in (("Tested", fit["tested"]), ("Not tested", fit["not_tested"])):
             rows += [("" if i else label, one) for i, one in enumerate(tests)]
     if (found := report.diagnosis) is not None:
-        says = {True: "absorbed: ", False: "not absorbed: ", None: "no evidence: "}
+        verdicts = {True: "absorbed: ", False: "not absorbed: ", None: "no evidence: "}
         verdict = f"not known; give control points (--gcps), or {EXPORT}"
         if found.decided_by is not None:
             have = "have" if found.absorbed else "have not"
@@ -248,7 +248,9 @@ def cameras_text(report: CamerasReport) -> str:
         if found.likely_error_m is not None:
             verdict += f"; the likely error of heights is {found.likely_error_m:.2g} m"
         rows.append(("Refraction", verdict))
-        rows += [(s.name[:1].upper() + s.name[1:], says[s.speaks] + s.words) for s in found.signs]
+        rows += [
+            (s.name[:1].upper() + s.name[1:], verdicts[s.speaks] + s.words) for s in found.signs
+        ]
         if found.absorbed:
             rows += [("Next step", "adjust the poses:"), ("", report.remedy)]
     return aligned(f"{r['path']}: {cameras.source or 'cameras'}", rows)

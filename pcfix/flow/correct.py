@@ -29,7 +29,7 @@ from pcfix.io.las.writing import output_header
 from pcfix.io.tiles import Clouds, is_raster
 from pcfix.io.views import ViewReport
 from pcfix.label.labelling import Labelling
-from pcfix.lens.frames import beside_frames
+from pcfix.lens.frames import count_outside_frames
 from pcfix.model import (
     BATHYMETRIC_POINT,
     NO_CAMERAS,
@@ -154,7 +154,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     notes = [
         *plan.input_notes,
         *([] if tally.views is None else tally.views.notes()),
-        *(() if tested is None else tested.doubts),
+        *(() if tested is None else tested.problems),
         *plan.notes,
         *coded("water.extent", water_notes),
         *([] if absorbed is None else [absorbed]),
@@ -213,7 +213,7 @@ def _check_counts(plan: Plan, tally: CloudTally, report: ViewReport | None) -> l
     if figures.outcomes[Outcome.NO_CAMERA] + flat == figures.submerged:
         raise GeometryError(
             "cameras.max_angle" if flat else "cameras.no_overlap",
-            f"{name}: {_out_of_sight(plan, figures, flat)}",
+            f"{name}: {_no_visible_camera(plan, figures, flat)}",
             submerged=figures.submerged,
             flat=flat,
         )
@@ -229,7 +229,7 @@ def _check_counts(plan: Plan, tally: CloudTally, report: ViewReport | None) -> l
     return water_notes
 
 
-def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
+def _no_visible_camera(plan: Plan, figures: Tally, flat: int) -> str:
     """Return the sentence for a cloud of which no camera sees a submerged point."""
     limit = plan.survey.limit_deg
     if flat:
@@ -241,7 +241,7 @@ def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
     distance = float(np.hypot(*(plan.cameras.centres - middle)[:, :2].T).min())
     within = f" within {limit:g} degrees" if limit else ""
     sentence = (
-        f"no camera images a submerged point{within}; the nearest is {distance:,.1f} m in"
+        f"no image shows a submerged point{within}; the nearest is {distance:,.1f} m in"
         f" plan from the middle of the {figures.submerged:,} submerged points. Check that cameras"
         " and cloud have the same CRS, and that pitch 0 is straight down."
     )
@@ -252,13 +252,13 @@ def _out_of_sight(plan: Plan, figures: Tally, flat: int) -> str:
 def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> Plausible:
     """Test cameras, cloud and water against each other; warn of what does not fit."""
     sample, given = tally.sample or CloudSample(), plan.inputs.cameras
-    doubts = () if isinstance(plan.found, WaterProposal) else sample.level_doubts()
+    problems = () if isinstance(plan.found, WaterProposal) else sample.level_notes()
     tested = plausible(
-        plan.cameras, sample.rows[:, :3], ties, doubts,
+        plan.cameras, sample.rows[:, :3], ties, problems,
         file="" if isinstance(given, Cameras) else given or "", water_m=sample.water_m,
         listed=plan.kind is not None,
     )  # fmt: skip
-    for warning in tested.doubts:
+    for warning in tested.problems:
         warnings.warn(warning, stacklevel=3)
     return tested
 
@@ -393,7 +393,7 @@ def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:
         raise SettingError(
             "views.camera", f"views name camera {camera.max()}, but there are {len(cameras)}."
         )
-    counts = beside_frames(points, views, cameras)
+    counts = count_outside_frames(points, views, cameras)
     if counts.any():
         entries, outside = int(counts.sum()), int(np.count_nonzero(counts))
         sentence = f"views: {entries:,} entries of {outside:,} points are ignored: their cameras"

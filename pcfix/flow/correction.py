@@ -196,7 +196,7 @@ def correct_chunk(
     correction = _through_water(plan, batch, np.flatnonzero(submerged), covariances=covariances)
     moved = None
     if step is not None:
-        correction = step.whole(correction)
+        correction = step.as_original(correction)
         moved = TransferCounts.of(step, correction)
     return correction, CloudTally(
         figures=Tally.of(correction),

@@ -150,7 +150,7 @@ def adjust_words(
 
 
 def water_word(given: Any) -> str:
-    """Return a water as it was given, or SPEC where an adjustment does not take it."""
+    """Return the given water, or SPEC if an adjustment cannot use it."""
     known = isinstance(given, str | PathLike | float | int)
     return f"{given}" if known and not str(given).startswith("dim:") else "SPEC"
 

@@ -111,15 +111,15 @@ def grid_dsm(
             if given.resolution is None:
                 cell_m = round_resolution(_spacing_m(source, used))
                 rules = replace(rules, resolution=cell_m)
-            apart_m = _spacing_m(source, used, rules.cell_m)
+            gap_m = _spacing_m(source, used, rules.cell_m)
         lattice = lattice_over(*bounds(used[:, :2]), rules.cell_m, str(task.source))
         tiles = make_tiles(used, points=BIN_POINTS)
         # the widest circle around a triangle
-        reach = TIN_REACH_SPACINGS * apart_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
+        reach = TIN_REACH_SPACINGS * gap_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
         reach_m = max(reach)
         paths = {"dsm": task.target, **more}
         tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
-        counted = _write_rasters(tiles, lattice, reach_m, apart_m, rules, paths, crs, tags, report)
+        counted = _write_rasters(tiles, lattice, reach_m, gap_m, rules, paths, crs, tags, report)
     if given.style:
         write_text(style, raster_style(task.target, rules.what), overwrite=given.overwrite)
     result = Figures(
@@ -137,7 +137,7 @@ def grid_dsm(
         points_used=len(used),  # of the surface asked for, neither noise nor withheld
         **counted,
         points_per_cell=len(used) / counted["cells"],  # mean over the cells with points
-        spacing_m=apart_m,  # of the points used, within the area that they fill
+        spacing_m=gap_m,  # of the points used, within the area that they fill
         hole_m=reach_m if rules.method == "tin" else rules.fill,  # widest hole that was bridged
         settings=asdict(rules),
         seconds=task.seconds,
@@ -150,7 +150,7 @@ def _write_rasters(
     tiles: PointTiles,
     lattice: Lattice,
     reach_m: float,
-    apart_m: float,
+    gap_m: float,
     rules: DsmRules,
     paths: dict[str, Path],
     crs: Any,
@@ -162,7 +162,7 @@ def _write_rasters(
     Returns the numbers of cells and the statistics of their values, by their names in the summary.
     """
     size_m, method = rules.cell_m, rules.method
-    reach, spacing = reach_m / size_m, apart_m / size_m
+    reach, spacing = reach_m / size_m, gap_m / size_m
     # the number of cells around a window whose points decide on it
     beyond = int(np.ceil(reach)) + 1 if method == "tin" else 0
     plan = None if crs is None else parts(crs)[0]
@@ -184,13 +184,13 @@ def _write_rasters(
             around = window.grown(margin).clipped(lattice.window)
             xyz = tiles.xyz[tiles.within(*lattice.box(around.grown(beyond)))]
             release()
-            whole, *counted = grid_window(xyz, around, lattice, method, reach, spacing)
+            enlarged, *counted = grid_window(xyz, around, lattice, method, reach, spacing)
             if rules.what == "uncertainty":  # the root mean square of the standard errors of a cell
-                whole = TO_95 * np.hypot(whole, counted[1])
-            height, number, spread = (band[window.within(around)] for band in (whole, *counted))
+                enlarged = TO_95 * np.hypot(enlarged, counted[1])
+            height, number, spread = (band[window.within(around)] for band in (enlarged, *counted))
             values = height[~np.isnan(height)]
             if widest:
-                height = fill_holes(whole, window, around, widest)
+                height = fill_holes(enlarged, window, around, widest)
             rasters.write_bands(dsm, [height], window)
             if "counts" in paths:
                 rasters.write_bands(counts, [number, spread], window)

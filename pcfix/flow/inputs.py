@@ -215,7 +215,8 @@ def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:
 def _without(both: list[Inputs], unchanged: Sequence[bool], **changes: Any) -> list[Inputs]:
     """Return the inputs, with changes where `unchanged` is false."""
     return [
-        one if keep else replace(one, **changes) for one, keep in zip(both, unchanged, strict=True)
+        one if is_unchanged else replace(one, **changes)
+        for one, is_unchanged in zip(both, unchanged, strict=True)
     ]
 
 

@@ -258,7 +258,7 @@ def _checks(folder: Path, points: FloatArray, depths: File | None) -> list[Layer
 def report_run(
     run: RunFolder, inputs: list[Path], first: Plain, corrected: Plain, compared: Plain
 ) -> Plain:
-    """Write the page of a run, and return what it says in short.
+    """Write the page of a run, and return its main figures.
 
     `first`, `corrected` and `compared` are the results of these steps.
     """

@@ -49,7 +49,7 @@ def map_photos(
     progress: Progress | None = None,
     **keywords: Any,
 ) -> Figures:
-    """Write every photograph as it would be without water; what ``pcfix photos`` runs.
+    """Write every photograph as seen without water; ``pcfix photos``.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
 from pcfix.report.page import Table
 from pcfix.report.text import aligned
 from pcfix.running import threads
-from pcfix.simulate.scene import lay_out, points_on, see
+from pcfix.simulate.scene import find_visible, lay_out, points_on
 from pcfix.simulate.settings import SceneSettings
 from pcfix.sums import Figures
 from pcfix.water.index import index_of
@@ -136,8 +136,8 @@ def _bed(given: PlanOptions, depth_m: float) -> tuple[Block, FloatArray]:
     most = (MOST_BASES, MOST_SPACINGS) * np.array(scene.base_and_spacing_m)
     scene = replace(scene, area_m=tuple(np.minimum(scene.area_m, most).tolist()))
     site = lay_out(scene)
-    sight = see(points_on(site.terrain, POINTS, site.rng), site, site.rng)
-    seen = np.flatnonzero(sight.paired)
+    imaged = find_visible(points_on(site.terrain, POINTS, site.rng), site, site.rng)
+    seen = np.flatnonzero(imaged.paired)
     if len(seen) < FEWEST_SEEN:
         share = len(seen) / POINTS
         raise SettingError(
@@ -146,9 +146,9 @@ def _bed(given: PlanOptions, depth_m: float) -> tuple[Block, FloatArray]:
             f" {share:.0%} of a bed {depth_m:g} m deep are in three images. Give more overlap.",
             overlap=given.overlap, sidelap=given.sidelap, share=share,
         )  # fmt: skip
-    views = Views(sight.start, sight.camera).take(seen)
-    apparent = sight.intersected(sight.ideal)[seen]
-    block = plain_block(site.true, TiePoints(sight.truth[seen], views, sight.ideal))
+    views = Views(imaged.start, imaged.camera).take(seen)
+    apparent = imaged.intersected(imaged.ideal)[seen]
+    block = plain_block(site.true, TiePoints(imaged.truth[seen], views, imaged.ideal))
     block = restricted(block, well_seen(block))  # without images that hardly see the bed
     return replace(
         block,

@@ -105,7 +105,7 @@ def plan_of(
 
 
 def _check_frames(cameras: Cameras, options: CorrectOptions) -> None:
-    """Refuse cameras without angles or lens, as it is not known which of them saw a point.
+    """Refuse cameras without angles or lens, because visibility is unknown.
 
     On the sample scene the bed is 0.9 m off with all 40 cameras, 0.02 m with those in whose frame
     the points are. A method or a limit of the rays that the user gives is used.
@@ -147,12 +147,12 @@ def plan_correction(plan: Plan) -> Plan:
         # the first points show whether the list is in the order of the cloud, or has coordinates
         first = sample_of(view, np.arange(min(CHUNK_POINTS, view.points)), water)
         if plan.match is not None:
-            plan = replace(plan, match=plan.match.settled(first.xyz))
+            plan = replace(plan, match=plan.match.with_image_order(first.xyz))
         if transfer is not None:
             transfer.check_models(first.xyz)
     if inputs.port is not None:  # no water surface, and no reconstruction type to detect
         return plan
-    chunks = partial(_whole_cloud, plan)
+    chunks = partial(_all_chunks, plan)
     labelling = plan.labelling.scanned(parts_of(chunks(), water), view.low, view.high)
     plan = replace(plan, labelling=labelling)
     if inputs.check_depths is not None:
@@ -169,8 +169,8 @@ def plan_correction(plan: Plan) -> Plan:
         plan = _with_pose_errors(plan)
     if first is not None and plan.kind is not None:
         plan = _with_type_of_list(plan, first)
-    doubts = dict.fromkeys(note for one in plan.verdicts for note in one.warnings())
-    return replace(plan, notes=(*plan.notes, *coded("cloud.reconstruction", doubts)))
+    remarks = dict.fromkeys(note for one in plan.verdicts for note in one.warnings())
+    return replace(plan, notes=(*plan.notes, *coded("cloud.reconstruction", remarks)))
 
 
 def fit_check_depths(path: File, parts: Iterable[Part]) -> DepthRegression:
@@ -243,7 +243,7 @@ def _with_pose_errors(plan: Plan) -> Plan:
     return replace(plan, survey=with_poses(plan.survey, errors))
 
 
-def _whole_cloud(plan: Plan) -> Iterator[Points]:
+def _all_chunks(plan: Plan) -> Iterator[Points]:
     """Yield the whole cloud, transferred to the adjusted cameras if there are any."""
     row = 0
     for points in plan.view.chunks(plan.found.surface):
@@ -306,7 +306,7 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
 def _scanned(
     plan: Plan, chunks: Chunks, *, sample: bool, occluder: bool
 ) -> tuple[Batch | None, Batch | None, Occluder | None]:
-    """Read the whole cloud once, for a sample of it and for the surface that hides points.
+    """Read the whole cloud once, for a sample of it and for the surface that occludes points.
 
     The sample is evenly spread over the order of the cloud, without noise. If its points may be too
     far apart to detect the reconstruction type, submerged points in squares are returned too.

@@ -19,7 +19,7 @@ from pcfix.flow.surfaces import Points
 from pcfix.io.cameras.georeference import adjusted_minus_gnss, frame_of, is_tied
 from pcfix.io.crs import heights_of
 from pcfix.io.tides import read_altitudes
-from pcfix.lens.frames import cameras_in_sight
+from pcfix.lens.frames import count_visible_cameras
 from pcfix.lens.imaging import straight_images
 from pcfix.model import Cameras, FloatArray, TiePoints
 from pcfix.options.declare import File
@@ -53,12 +53,12 @@ class Plausible(NamedTuple):
     """The results of one or more tests."""
 
     fits: tuple[str, ...] = ()  # tests that were passed
-    doubts: tuple[PcfixWarning, ...] = ()  # tests that were not
+    problems: tuple[PcfixWarning, ...] = ()  # tests that were not
     unchecked: tuple[str, ...] = ()  # what could not be tested
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        lists = {"fits": self.fits, "problems": self.doubts, "unchecked": self.unchecked}
+        lists = {"fits": self.fits, "problems": self.problems, "unchecked": self.unchecked}
         return {name: list(map(str, one)) for name, one in lists.items()}
 
 
@@ -88,7 +88,7 @@ class CloudSample(Sums):
         known = self.rows[np.isfinite(self.rows[:, 3]), 3]
         return float(np.median(known)) if len(known) else None
 
-    def level_doubts(self) -> tuple[PcfixWarning, ...]:
+    def level_notes(self) -> tuple[PcfixWarning, ...]:
         """Return warnings if the shoreline in the cloud is at another height than the water."""
         known = self.rows[np.isfinite(self.rows[:, 3])]
         if len(known) < LEAST_POINTS:
@@ -111,7 +111,7 @@ def plausible(
     cameras: Cameras,
     cloud: FloatArray,
     ties: TiePoints | None = None,
-    level_doubts: tuple[PcfixWarning, ...] = (),
+    level_notes: tuple[PcfixWarning, ...] = (),
     *,
     file: File = "",
     water_m: float | None = None,
@@ -120,11 +120,11 @@ def plausible(
     """Test cameras and cloud against each other.
 
     Cameras and tie points are in the cloud's frame; `cloud` are some of its points, shape (n, 3),
-    metres, evenly spread. `level_doubts` are those of `CloudSample`, `file` is that of the cameras,
+    metres, evenly spread. `level_notes` are those of `CloudSample`, `file` is that of the cameras,
     `water_m` the median height of the water, and `listed` says whether the listed images were found
     to hold their points.
     """
-    level = Plausible(doubts=level_doubts)
+    level = Plausible(problems=level_notes)
     if not len(cameras) or not len(cloud):
         return level
     in_list = Plausible(fits=("listed points visible in their images",))
@@ -142,7 +142,7 @@ def plausible(
     )
     return Plausible(
         tuple(one for test in tests for one in test.fits),
-        tuple(one for test in tests for one in test.doubts),
+        tuple(one for test in tests for one in test.problems),
         tuple(one for test in tests for one in test.unchecked),
     )
 
@@ -154,14 +154,14 @@ def _frames(cameras: Cameras, xyz: FloatArray) -> Plausible:
     """
     if cameras.lenses is None or cameras.rotations is None:
         return Plausible(unchecked=("frames (the cameras have no lenses or no angles)",))
-    unseen = float(np.mean(cameras_in_sight(xyz, cameras) < 2))
+    unseen = float(np.mean(count_visible_cameras(xyz, cameras) < 2))
     if unseen > MOST_UNSEEN:
         sentence = (
             f"{100.0 * unseen:.1f} % of the points are in fewer than two frames. Check coordinates,"
             " heights, angles and interior orientation of the cameras, and whether some are"
             " missing."
         )
-        return Plausible(doubts=(PcfixWarning("cameras.no_overlap", sentence, share=unseen),))
+        return Plausible(problems=(PcfixWarning("cameras.no_overlap", sentence, share=unseen),))
     fits = f"{100.0 * (1.0 - unseen):.4g} % of the points in two frames or more"
     unchecked = () if cameras.gnss else ("a shift in plan (no GNSS positions)",)
     return Plausible(fits=(fits,), unchecked=unchecked)
@@ -183,14 +183,14 @@ def _ties(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Plausi
             f" {image} (median). Poses, lens and points of the camera file do not belong together;"
             " export them again."
         )
-        doubt = PcfixWarning("cameras.residuals", sentence, share=residual, image=image)
-        return Plausible(doubts=(doubt,))
+        problem = PcfixWarning("cameras.residuals", sentence, share=residual, image=image)
+        return Plausible(problems=(problem,))
     placed = ties.xyz[np.isfinite(ties.xyz).all(axis=1)]
     placed = placed[:: 1 + len(placed) // TIES]
     tree = cKDTree(cloud[:, :2])
-    apart, row = (np.asarray(one) for one in tree.query(placed[:, :2]))
+    distance, row = (np.asarray(one) for one in tree.query(placed[:, :2]))
     among = np.asarray(tree.query(cloud[:: 1 + len(cloud) // TIES, :2], k=2)[0])
-    near = apart <= 2.0 * np.median(among[:, 1])
+    near = distance <= 2.0 * np.median(among[:, 1])
     if near.sum() < LEAST_TIES:
         return Plausible(unchecked=("heights (no tie points on the cloud)",))
     off = float(np.median((placed[:, 2] - cloud[row, 2])[near]))
@@ -200,7 +200,7 @@ def _ties(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Plausi
             f" (median of {int(near.sum()):,}). Check the offset, the vertical datum and the unit"
             " of the heights."
         )
-        return Plausible(doubts=(PcfixWarning("cameras.height", sentence, off_m=off),))
+        return Plausible(problems=(PcfixWarning("cameras.height", sentence, off_m=off),))
     fits = f"tie points match their images, {abs(off):.2f} m from the cloud's heights"
     return Plausible(fits=(fits,))
 
@@ -236,7 +236,7 @@ def _directions(cameras: Cameras) -> Plausible:
         usual = 2.0 * np.median(length)
         rows = np.flatnonzero((length > 0.0) & (length < usual) & steep[:-1] & steep[1:])
     if cameras.rotations is None or len(rows) < LEAST_STEPS:
-        return Plausible(unchecked=("yaw (no flight lines with it)",))
+        return Plausible(unchecked=("yaw (the images are not in flight lines)",))
     top = -cameras.rotations[rows, 1]  # direction of the upper edge, world frame
     heading, yaw = np.arctan2(*step[rows].T), np.arctan2(top[:, 0], top[:, 1])
     # the angles as they are, and as if radians had been taken for degrees
@@ -244,7 +244,7 @@ def _directions(cameras: Cameras) -> Plausible:
     turns = [abs(float(np.degrees(np.angle(mean)))) for mean in means]
     is_steady = [bool(abs(mean) >= STEADY) for mean in means]
     if not is_steady[0]:
-        return Plausible(unchecked=("yaw (no flight lines with it)",))
+        return Plausible(unchecked=("yaw (the images are not in flight lines)",))
     if turns[0] <= MOST_TURN_DEG:
         return Plausible(fits=("yaw along the flight lines",))
     are_radians = is_steady[1] and turns[1] <= MOST_TURN_DEG
@@ -254,7 +254,7 @@ def _directions(cameras: Cameras) -> Plausible:
         f"The images are turned by {turns[0]:.0f} degrees against the flight lines. Check the"
         " convention and the unit of the angles, unless the camera was mounted like that."
     )
-    return Plausible(doubts=(PcfixWarning("cameras.yaw", sentence, turn_deg=turns[0]),))
+    return Plausible(problems=(PcfixWarning("cameras.yaw", sentence, turn_deg=turns[0]),))
 
 
 def _positions(cameras: Cameras, name: str) -> Plausible:
@@ -280,14 +280,16 @@ def _positions(cameras: Cameras, name: str) -> Plausible:
             f"The cameras are {abs(above_m):.1f} m {'above' if above_m > 0.0 else 'below'} their"
             " GNSS positions. Check the heights of --cameras-crs, or install the grid of the geoid."
         )
-        return Plausible(doubts=(PcfixWarning("cameras.heights_differ", sentence, off_m=above_m),))
+        return Plausible(
+            problems=(PcfixWarning("cameras.heights_differ", sentence, off_m=above_m),)
+        )
     if middle <= MOST_OFF_M:
         return Plausible(fits=(f"positions {middle:.1f} m in plan from their GNSS",))
     sentence = (
         f"The cameras are {middle:.4g} m in plan from their GNSS positions (median of"
         f" {len(off_m)}). Check their CRS and offset."
     )
-    return Plausible(doubts=(PcfixWarning("cameras.gnss", sentence, off_m=middle),))
+    return Plausible(problems=(PcfixWarning("cameras.gnss", sentence, off_m=middle),))
 
 
 def _flown(cameras: Cameras, file: File, water_m: float | None) -> Plausible:
@@ -312,10 +314,10 @@ def _flown(cameras: Cameras, file: File, water_m: float | None) -> Plausible:
         f" take-off (median of {len(rows)}), which would be {where}. If it was not, check the"
         " vertical datum and the unit of cameras and water."
     )
-    doubt = PcfixWarning(
+    problem = PcfixWarning(
         "cameras.flying_height", sentence, above_water_m=above, above_take_off_m=flown
     )
-    return Plausible(doubts=(doubt,))
+    return Plausible(problems=(problem,))
 
 
 def likely_mistake(centres: FloatArray, low: FloatArray, high: FloatArray) -> str | None:

@@ -125,7 +125,7 @@ def rebuild_rounds(
         [],
         rounds=rounds,
         done_before=done_before,  # rounds that an earlier call finished
-        settled=abs(rounds[-1].mean_m) < threshold_m,
+        converged=abs(rounds[-1].mean_m) < threshold_m,
         gsd_m=round(block.gsd_m, 5),
         threshold_m=threshold_m,
         mapping=given.mapping,

@@ -229,7 +229,7 @@ def _opened(run: RunFolder) -> Record:
     """Return the record of a folder, made where it is missing; refuse one of another run."""
     folder = run.folder
     if not folder.parent.is_dir():
-        sentence = f"{folder}: the folder {folder.parent} does not exist. Make it first."
+        sentence = f"{folder}: the folder {folder.parent} does not exist. Create it first."
         raise SettingError("output.no_folder", sentence, path=folder)
     folder.mkdir(exist_ok=True)
     record = Record(run)

@@ -118,7 +118,7 @@ class FileTask:
         """Whether the output exists, with the same key."""
         return self.target.is_file() and files.read_tally(self.record)[0] == self.key
 
-    def keep(self, tally: Any) -> None:
+    def save(self, tally: Any) -> None:
         """Write the statistics; an older output must not be taken for the one that follows."""
         self.target.unlink(missing_ok=True)
         files.write_tally(self.record, self.key, tally)
@@ -174,7 +174,7 @@ def run_command(
         try:
             (folder / RECORDS).mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            sentence = f"{folder}: cannot be made ({error.strerror})."
+            sentence = f"{folder}: cannot be created ({error.strerror})."
             raise InputError("output.folder", sentence) from error
         done = len(tiles) - points
         for one, why in run(do_task, pickle.dumps((work, planned)), todo):
@@ -308,7 +308,7 @@ def do_task(pickled: bytes, task: FileTask, jobs: int | None = None) -> str:
         work, plan = pickle.loads(pickled)
         with threads(jobs), warnings.catch_warnings():
             warnings.simplefilter("ignore", PcfixWarning)  # shown when the plan was made
-            stream(work, plan, replace(task, jobs=jobs), task.keep)
+            stream(work, plan, replace(task, jobs=jobs), task.save)
     except PcfixError as error:
         return str(error)
     return ""

@@ -92,7 +92,7 @@ def sample_of(
     for one in view.chunks(water):
         low, high = np.searchsorted(rows, (first, first + len(one.xyz)))
         if match is not None:
-            match = match if first else match.settled(one.xyz)
+            match = match if first else match.with_image_order(one.xyz)
             one = one._replace(views=match.views_of(one.xyz, first)[0])
         parts.append(one.take(rows[low:high] - first))
         first += len(one.xyz)
@@ -160,17 +160,17 @@ FAR_M = 1000.0
 def _check_near(name: str, xyz: FloatArray, view: CloudView, most_m: float) -> None:
     """Raise InputError if the vertices of a water surface are too far from the cloud in plan."""
     low, high = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
-    apart_m = float(np.maximum(low - view.high, view.low - high).max())
-    if apart_m > most_m:
+    away_m = float(np.maximum(low - view.high, view.low - high).max())
+    if away_m > most_m:
         raise InputError(
             "water.no_overlap",
-            f"{name}: does not overlap the cloud in plan; they are {apart_m / 1e3:,.2f} km apart."
+            f"{name}: does not overlap the cloud in plan; they are {away_m / 1e3:,.2f} km apart."
             " Check its CRS and the order of its axes.",
-            path=name, apart_m=apart_m,
+            path=name, away_m=away_m,
         )  # fmt: skip
 
 
-APART_M = 2.0
+MOST_OFFSET_M = 2.0
 """Largest median difference between the common water and that of an image, more than tides."""
 
 
@@ -218,7 +218,7 @@ def own_water_of(
         text = f"{folder}: none of its rasters overlaps the cloud. Check their CRS."
         raise InputError("water.no_overlap", text, path=folder)
     off_m = float(np.median(differs)) if differs else 0.0
-    if abs(off_m) > APART_M:
+    if abs(off_m) > MOST_OFFSET_M:
         raise InputError(
             "water.datum",
             f"{folder}: its water differs by {off_m:+.2f} m from --water ({water}). Give both the"

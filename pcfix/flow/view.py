@@ -150,7 +150,7 @@ def view_clouds(
 
 
 def _read(path: Path, most: int) -> tuple[list[_Layer], Any]:
-    """Return a cloud, if known also as it was before its correction, and its CRS."""
+    """Return a cloud, its apparent points if they are known, and its CRS."""
     with LasSource(path) as source:
         crs = metric_crs(source)
         names = [n for n in SHOWN if n in source.header.point_format.extra_dimension_names]
@@ -204,8 +204,8 @@ def _grid(surface: WaterSurface | None, low: FloatArray, high: FloatArray) -> Fl
     sides = [np.linspace(low[axis], high[axis], WATER_CELLS + 1) for axis in (0, 1)]
     xyz = np.dstack([*np.meshgrid(*sides), np.zeros((WATER_CELLS + 1, WATER_CELLS + 1))])
     xyz[..., 2] = surface_above(surface, xyz.reshape(-1, 3)).height_m.reshape(xyz.shape[:2])
-    ways = (xyz[:, :-1], xyz[:, 1:]), (xyz[:-1], xyz[1:])  # east, north
-    edges = np.vstack([np.stack(way, axis=2).reshape(-1, 2, 3) for way in ways])
+    grid_lines = (xyz[:, :-1], xyz[:, 1:]), (xyz[:-1], xyz[1:])  # east, north
+    edges = np.vstack([np.stack(pair, axis=2).reshape(-1, 2, 3) for pair in grid_lines])
     return np.asarray(edges[np.isfinite(edges).all(axis=(1, 2))])
 
 

@@ -1,4 +1,4 @@
-"""Describe a water surface: as it was given, fitted or found in a cloud; ``pcfix water``."""
+"""Describe a water surface: given, fitted or detected in a cloud; ``pcfix water``."""
 
 from __future__ import annotations
 

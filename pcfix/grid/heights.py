@@ -62,10 +62,10 @@ def cell_statistics(cell: IntArray, z: FloatArray, size: int) -> dict[str, Any]:
     offset = np.add.reduceat(above, first) / n
     scatter = np.sqrt(np.add.reduceat((above - np.repeat(offset, n)) ** 2, first) / n)
     median = (z[first + (n - 1) // 2] + z[first + n // 2]) / 2.0
-    whole = np.full((5, size), np.nan)
-    whole[:, filled] = low + offset, median, low, z[first + n - 1], scatter
+    statistics = np.full((5, size), np.nan)
+    statistics[:, filled] = low + offset, median, low, z[first + n - 1], scatter
     names = ("mean", "median", "min", "max", "spread")
-    return {"points": count, **dict(zip(names, whole, strict=True))}
+    return {"points": count, **dict(zip(names, statistics, strict=True))}
 
 
 MOVED = 1e-4

@@ -33,7 +33,7 @@ from pcfix.model import (
     WaterPlane,
     WaterSurface,
 )
-from pcfix.running import FEW_ROWS, blocks, empty, kept, mapped, release
+from pcfix.running import FEW_ROWS, blocks, empty, mapped, release, subset
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -124,7 +124,7 @@ def read_cloud(
             source.header.point_format.extra_dimension_names
         )
         for points in _few_points(source, own, names):
-            known, keep = points.dimensions or {}, points.counts(skip_classes)
+            known, used = points.dimensions or {}, points.counts(skip_classes)
             if water is None and "WaterDepth" in known:
                 depth = known["WaterDepth"]
                 above = np.where(depth > 0.0, points.xyz[:, 2] + depth, np.nan)
@@ -134,10 +134,10 @@ def read_cloud(
                 above = surface_above(own, points.xyz, points.heights).height_m
             else:
                 above = np.full(len(points.xyz), np.nan)
-            bathymetric = kept(keep, points.classes) == BATHYMETRIC_POINT
-            parts = [kept(keep, points.xyz), kept(keep, above), bathymetric]
+            bathymetric = subset(used, points.classes) == BATHYMETRIC_POINT
+            parts = [subset(used, points.xyz), subset(used, above), bathymetric]
             if known.keys() >= set(SHIFTS):
-                parts.append(np.column_stack([known[name] for name in SHIFTS])[keep])
+                parts.append(np.column_stack([known[name] for name in SHIFTS])[used])
             columns = columns or [empty((most, *part.shape[1:]), part.dtype) for part in parts]
             for column, part in zip(columns, parts, strict=True):
                 column[first : first + len(part)] = part
@@ -207,7 +207,7 @@ def read_reference(reference: Clouds) -> Reference:
     found = reference_of(reference)
     if isinstance(found, Tiles) or is_cloud(check_input(found)):
         cloud = read_cloud(found, skip_classes=NOISE_CLASSES + WATER_CLASSES)
-        return Reference(cloud.name, cloud.xyz, cloud.crs, cloud.left_out)
+        return Reference(cloud.name, cloud.xyz, cloud.crs, cloud.excluded)
     suffix = found.suffix.lower()
     if suffix in TABLES:
         xyz = read_table(found, ("x", "y", "z"), spellings=POINT_SPELLINGS).of("xyz")

@@ -343,7 +343,7 @@ def is_same_numbers(source: CRS, target: CRS, *, heights: bool = True) -> bool:
     return same and not (heights and metres_up(source) != metres_up(target))
 
 
-def way_to_cloud(
+def to_cloud_crs(
     crs: str | CRS | None, cloud_crs: str | CRS | None, at: FloatArray, name: str, *, heights: bool
 ) -> Points | None:
     """Return the transformation from a file's CRS to the cloud's, None for none; warn of guesses.

@@ -138,7 +138,7 @@ def check_output(
         kind = kind_of(target.stat().st_mode)
     except (FileNotFoundError, NotADirectoryError):
         if not target.parent.is_dir():
-            sentence = f"the folder {target.parent} does not exist. Make it first."
+            sentence = f"the folder {target.parent} does not exist. Create it first."
             raise refused("no_folder", sentence) from None
         return target
     except OSError as error:

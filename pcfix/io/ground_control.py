@@ -44,7 +44,7 @@ from pcfix.io.cameras.odm import named_crs
 from pcfix.io.cameras.table import AXES, centres, gnss_positions, has_header, open_table
 from pcfix.io.cameras.table import SPELLINGS as POSITIONS
 from pcfix.io.cameras.table import crs as table_crs
-from pcfix.io.crs import LOCAL, METRES, is_local, is_topocentric, parse_crs, way_to_cloud
+from pcfix.io.crs import LOCAL, METRES, is_local, is_topocentric, parse_crs, to_cloud_crs
 from pcfix.io.files import check_input
 from pcfix.io.tables import Table, match_labels, number, places, read_lines, read_table, unnamed
 from pcfix.model import Cameras, FloatArray, GnssPositions, GroundControl, IntArray
@@ -222,7 +222,7 @@ def _to_cameras(
 ) -> FloatArray:
     """Return points in the CRS of the cameras; refuse points far from the block."""
     target = cameras.crs
-    forward = way_to_cloud(source, target, xyz, str(table.path), heights=True)
+    forward = to_cloud_crs(source, target, xyz, str(table.path), heights=True)
     moved = xyz if forward is None else forward(xyz)
     lost = ~np.isfinite(moved).all(axis=1) & np.isfinite(xyz).all(axis=1)
     if lost.any():
@@ -235,10 +235,10 @@ def _to_cameras(
     # points that no image of the block can show
     middle = np.median(cameras.centres[:, :2], axis=0)
     reach_m = FARTHEST_M + np.hypot(*(cameras.centres[:, :2] - middle).T).max()
-    apart_m = np.hypot(*(moved[:, :2] - middle).T)
-    if (apart_m > reach_m).any():
-        i = int(np.argmax(apart_m))
-        words = f"it is {apart_m[i] / 1e3:,.0f} km from the block. Check the CRS of the points, and"
+    away_m = np.hypot(*(moved[:, :2] - middle).T)
+    if (away_m > reach_m).any():
+        i = int(np.argmax(away_m))
+        words = f"it is {away_m[i] / 1e3:,.0f} km from the block. Check the CRS of the points, and"
         raise _error(table, rows[i], "gcps.far", f"{words} the order of x and y.")
     return moved
 
@@ -402,10 +402,10 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
     if is_tied(cameras.crs, str(source)):
         enu_m = adjusted_minus_gnss(cameras, str(source))[0][:, :2]
         both = enu_m[np.isfinite(enu_m).all(axis=1)]
-        apart_m = float(np.median(np.hypot(*both.T))) if len(both) else 0.0
-        if apart_m > FARTHEST_M:
-            sentence = f"its positions are {apart_m / 1e3:,.0f} km from the block. Check their CRS."
-            raise bad_file(source, "gnss.far", sentence, apart_m=apart_m)
+        away_m = float(np.median(np.hypot(*both.T))) if len(both) else 0.0
+        if away_m > FARTHEST_M:
+            sentence = f"its positions are {away_m / 1e3:,.0f} km from the block. Check their CRS."
+            raise bad_file(source, "gnss.far", sentence, away_m=away_m)
     if known < len(cameras):
         words = f"{source}: {known} of {len(cameras)} images have a GNSS position."
         note = PcfixWarning("gnss.images_without", words, path=source, images=known)

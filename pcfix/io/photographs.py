@@ -135,7 +135,7 @@ def _write_tiff(source: Path, path: Path, pixels: Pixels) -> None:
     with tifffile.TiffFile(source) as file:
         page = file.pages[0]
         plain, planar = page.is_memmappable and page.is_contiguous, page.planarconfig == 2
-        tags = [tag for tag in page.tags.values() if tag.code in _TIFF_KEPT]
+        tags = [tag for tag in page.tags.values() if tag.code in _COPIED_TAGS]
         how: dict[str, Any] = {
             "photometric": page.photometric, "compression": page.compression,
             "extratags": [(tag.code, tag.dtype, tag.count, tag.value, True) for tag in tags],
@@ -152,7 +152,7 @@ def _write_tiff(source: Path, path: Path, pixels: Pixels) -> None:
         tifffile.imwrite(path, stored, metadata=None, **how)
 
 
-_TIFF_KEPT = {270, 271, 272, 274, 282, 283, 296, 305, 306, 315, 700, 33432, 33550, 33922, 34735,
+_COPIED_TAGS = {270, 271, 272, 274, 282, 283, 296, 305, 306, 315, 700, 33432, 33550, 33922, 34735,
               34736, 34737, 48020, 48021, 48022}  # fmt: skip
 """Texts, resolution, rotation, XMP, GeoTIFF keys, and tags of multispectral cameras."""
 

@@ -16,7 +16,7 @@ import shapely
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io import tables
 from pcfix.io.atomic import cannot_write, temporary_output
-from pcfix.io.crs import parse_crs, plan_unit, way_to_cloud
+from pcfix.io.crs import parse_crs, plan_unit, to_cloud_crs
 from pcfix.io.files import check_input, check_output
 from pcfix.libraries import optional_library
 from pcfix.model import FloatArray
@@ -109,11 +109,11 @@ def read_vectors(path: File, *, crs: str | None = None) -> Vectors:
 
 
 def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool) -> Vectors:
-    """Transform geometries to the cloud's CRS; see `way_to_cloud`. Without `heights` z stays."""
+    """Transform geometries to the cloud's CRS; see `to_cloud_crs`. Without `heights` z stays."""
     at = vectors.coordinates
     heights = heights and bool(np.isfinite(at[:, 2]).any())
     at = np.nan_to_num(at)
-    forward = way_to_cloud(vectors.crs, cloud_crs, at, vectors.name, heights=heights)
+    forward = to_cloud_crs(vectors.crs, cloud_crs, at, vectors.name, heights=heights)
     if forward is None:
         return vectors
     geometries = vectors.geometries
@@ -127,7 +127,7 @@ def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool
     there = np.where(shapely.has_z(geometries), there, shapely.force_2d(there))
     moved = replace(vectors, geometries=there)
     if not np.isfinite(moved.coordinates[:, :2]).all():
-        sentence = "some of it has no place in the cloud's CRS. Check the file's CRS."
+        sentence = "part of it cannot be transformed to the cloud's CRS. Check the file's CRS."
         raise bad_file(vectors.name, "vector.outside_crs", sentence)
     return moved
 
@@ -221,9 +221,9 @@ def read_shoreline(
     for line in drawn:
         found.append(_vertices(np.array([shapely.segmentize(line, SPACING_M)])))
         total, vertices = len(found[-1]), float(len(line.coords) - line.is_closed)
-        apart = max(line.length / (2.0 * SHORE_RADIUS_M), 1.0)
+        independent = max(line.length / (2.0 * SHORE_RADIUS_M), 1.0)
         worth = 2.0 / 3.0 * vertices if vertices < total else vertices
-        counts.append(np.full(total, min(1.0, min(worth, apart) / total)))
+        counts.append(np.full(total, min(1.0, min(worth, independent) / total)))
     xyz = np.vstack(found)
     known = xyz[np.isfinite(xyz[:, 2]), 2]
     if len(known) >= FEW and not known.any():  # a flat drawing

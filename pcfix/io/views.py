@@ -281,7 +281,7 @@ class ViewMatch:
     def __init__(
         self, views: ViewList, cameras: Cameras, *, points: int | None = None, step_m: float = 0.0
     ) -> None:
-        """Check that a list, read with these cameras, can belong to a cloud of so many `points`.
+        """Check that a list, read with these cameras, can belong to a cloud of `points` points.
 
         The cloud's coordinates are rounded to `step_m`, the scale of a LAS file.
         """
@@ -298,7 +298,7 @@ class ViewMatch:
             values = {"listed": len(views), "points": points}
             raise bad_file(views.path, "views.other_points", sentence, **values)
 
-    def settled(self, xyz: FloatArray) -> ViewMatch:
+    def with_image_order(self, xyz: FloatArray) -> ViewMatch:
         """Return the match with the order of the images that the cloud's first points show.
 
         A list that is matched by row number is refused if its cameras do not see them.
@@ -338,8 +338,8 @@ class ViewMatch:
         """Return the list's row of each point, -1 if it has none, and count the matches."""
         row = np.full(len(xyz), -1)
         same_row = listed[first_row : first_row + len(xyz)]
-        apart_m = np.linalg.norm(same_row - xyz[: len(same_row)], axis=1)
-        near = np.flatnonzero(apart_m <= self._same_m)
+        away_m = np.linalg.norm(same_row - xyz[: len(same_row)], axis=1)
+        near = np.flatnonzero(away_m <= self._same_m)
         row[near] = first_row + near
         report.by_row = len(near)
         rest = np.flatnonzero(row < 0)

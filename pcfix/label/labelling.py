@@ -189,7 +189,7 @@ class Labelling:
             classes = ", ".join(map(str, self.settings.respect_classes))
             raise GeometryError(
                 "option.respect_classes",
-                f"{name}: all {counts.respected:,} points below the water are of the classes to"
+                f"{name}: all {counts.respected:,} points below the water are in the classes to"
                 f" respect ({classes}). Respect fewer classes.",
                 path=name, points=counts.respected,
             )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Test whether points, or whole tiles of points, lie in the frames of cameras.
+"""Test whether points, or tiles of points, are in the frames of cameras.
 
 The frame of a central projection without distortion is a pyramid with its tip in the projection
 centre: a point is in the frame if it is on the inner side of its four planes.
@@ -108,7 +108,7 @@ def frames_of(cameras: Cameras) -> Frames:
     )
 
 
-BESIDE = 1.0
+MARGIN = 1.0
 """A view list may name a camera whose frame misses the point by at most this times its longer side.
 
 An apparent point is some pixels from its image. Much farther outside the distortion is
@@ -124,7 +124,7 @@ def listed_frames_of(cameras: Cameras) -> Frames:
     """
     if cameras.rotations is None or cameras.lenses is None:
         return no_frames(len(cameras))
-    return frames_of(narrower(cameras, -BESIDE))
+    return frames_of(narrower(cameras, -MARGIN))
 
 
 def narrower(cameras: Cameras, share: float) -> Cameras:
@@ -201,8 +201,8 @@ def mark(
     plain = plain_lens(lens)
     # only one of the two loops runs; with the choice inside, the first would not be vectorised
     for j in range(marks.size if lens[PLAIN] != 0.0 else 0):
-        way = points[j] - centre[0], points[run + j] - centre[1], points[2 * run + j] - centre[2]
-        u, v, _ = plain_image(plain, times(r, way))
+        ray = points[j] - centre[0], points[run + j] - centre[1], points[2 * run + j] - centre[2]
+        u, v, _ = plain_image(plain, times(r, ray))
         inside = (u >= 0.0) & (u <= lens[WIDTH]) & (v >= 0.0) & (v <= lens[HEIGHT])
         marks[j] = 1.0 if inside else 0.0
         count += 1 if inside else 0
@@ -227,7 +227,9 @@ def may_hold(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: 
     return True
 
 
-def cameras_in_sight(xyz: FloatArray, cameras: Cameras, views: Views | None = None) -> IntArray:
+def count_visible_cameras(
+    xyz: FloatArray, cameras: Cameras, views: Views | None = None
+) -> IntArray:
     """Return how many cameras have each point, (n, 3), in their frame; occlusion is ignored.
 
     Only those of the view lists count, if there are any, in frames as of `listed_frames_of`.
@@ -241,9 +243,9 @@ def cameras_in_sight(xyz: FloatArray, cameras: Cameras, views: Views | None = No
     return counts
 
 
-def beside_frames(xyz: FloatArray, views: Views, cameras: Cameras) -> IntArray:
+def count_outside_frames(xyz: FloatArray, views: Views, cameras: Cameras) -> IntArray:
     """Return the number of cameras in the view list of each point, (n, 3), that cannot image it."""
-    return np.asarray(np.diff(views.start) - cameras_in_sight(xyz, cameras, views))
+    return np.asarray(np.diff(views.start) - count_visible_cameras(xyz, cameras, views))
 
 
 @kernel

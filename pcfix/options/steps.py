@@ -85,7 +85,7 @@ class CleanRules(OptionSet, panel=Panel.TESTS):
             is_on = any(getattr(self, name) is not None for name in limits)
             object.__setattr__(self, switch, is_on)
         if not (self.statistical or self.radius is not None or self.weak or self.below_or_floating):
-            raise SettingError("option.no_test", "All tests are off. Leave at least one on.")
+            raise SettingError("option.no_test", "All tests are off. Switch at least one on.")
 
     @property
     def below_or_floating(self) -> bool:

@@ -105,8 +105,8 @@ def _coarse(one: tuple[FloatArray, Any], other: tuple[FloatArray, Any]) -> Any:
         return None
     mine = one[0][[match.queryIdx for match in good]]
     theirs = other[0][[match.trainIdx for match in good]]
-    found, kept = cv2.findHomography(mine, theirs, cv2.RANSAC, OUTLIER_PX)
-    return None if found is None or kept.sum() < LEAST_CORNERS else found
+    found, inliers = cv2.findHomography(mine, theirs, cv2.RANSAC, OUTLIER_PX)
+    return None if found is None or inliers.sum() < LEAST_CORNERS else found
 
 
 def register(places: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -142,8 +142,8 @@ def register(places: FloatArray) -> tuple[FloatArray, FloatArray]:
     return homographies, scatter
 
 
-def _moved(way: FloatArray, places: FloatArray) -> FloatArray:
-    whole = np.column_stack([places, np.ones(len(places))]) @ way.T
+def _moved(homography: FloatArray, places: FloatArray) -> FloatArray:
+    whole = np.column_stack([places, np.ones(len(places))]) @ homography.T
     return np.asarray(whole[:, :2] / whole[:, 2:])
 
 
@@ -161,19 +161,19 @@ def _fitted(one: FloatArray, other: FloatArray, weight: FloatArray) -> FloatArra
     return np.asarray(scale @ np.append(found, 1.0).reshape(3, 3) @ np.linalg.inv(scale))
 
 
-def laid(frame: npt.NDArray[Any], way: FloatArray) -> npt.NDArray[Any]:
+def warped(frame: npt.NDArray[Any], homography: FloatArray) -> npt.NDArray[Any]:
     """Resample a frame, shape (rows, columns, bands), by a homography; bicubic."""
     cv2 = photo_library("cv2")
     how: Any = {"flags": cv2.INTER_CUBIC, "borderMode": cv2.BORDER_REPLICATE}
     size = frame.shape[1], frame.shape[0]
-    return by_bands(partial(cv2.warpPerspective, M=way, dsize=size, **how), frame)
+    return by_bands(partial(cv2.warpPerspective, M=homography, dsize=size, **how), frame)
 
 
-def covered(way: FloatArray, shape: tuple[int, int], top: int, bottom: int) -> BoolArray:
+def covered(homography: FloatArray, shape: tuple[int, int], top: int, bottom: int) -> BoolArray:
     """Return which pixels of rows `top` to `bottom` of the first frame another one covers."""
     rows, columns = shape
     edge = np.array([[0.0, 0.0], [columns, 0.0], [columns, rows], [0.0, rows]]) - 0.5
-    corners = _moved(way, edge) - [0.0, top]
+    corners = _moved(homography, edge) - [0.0, top]
     inside = np.ones((bottom - top, columns), bool)
     x, y = np.arange(columns)[None, :], np.arange(bottom - top)[:, None]
     for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):

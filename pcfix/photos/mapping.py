@@ -73,11 +73,11 @@ class Ground:
         z = np.where(known, height_m - self.middle[2], 0.0)
         corners = np.column_stack([np.tile(x, rows), np.repeat(y, columns), z.ravel()])
         # two triangles for each square of four known heights
-        whole = known[:-1, :-1] & known[:-1, 1:] & known[1:, :-1] & known[1:, 1:]
-        one = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1))[whole]
-        below, beside = one + columns, one + 1
+        complete = known[:-1, :-1] & known[:-1, 1:] & known[1:, :-1] & known[1:, 1:]
+        one = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1))[complete]
+        below, right = one + columns, one + 1
         faces = np.vstack(
-            [np.column_stack([one, below, beside]), np.column_stack([beside, below, below + 1])]
+            [np.column_stack([one, below, right]), np.column_stack([right, below, below + 1])]
         )
         tensor = load_open3d("open3d.core").Tensor.from_numpy
         triangles = tensor(corners.astype(np.float32)), tensor(faces.astype(np.uint32))
@@ -153,14 +153,14 @@ def nodes_of(lens: Lens, step_px: int) -> tuple[FloatArray, tuple[int, int]]:
 
 
 def exact(photo: Photo, scene: Scene, step_px: int) -> Shifts:
-    """Map by the true bed in `scene`: straight out through the lens, back as the light came."""
+    """Map by the true bed in `scene`: out by a straight ray, back along the refracted one."""
     nodes, shape = nodes_of(photo.lens, step_px)
     xyz, depth, known = ground_seen(photo, scene, nodes)
     shift = np.zeros((len(nodes), 2))
     wet = np.flatnonzero(depth > 0.0)
     place, pierced, free = traced(photo, xyz[wet], depth[wet], scene)
     free &= np.isfinite(place).all(axis=1)
-    free[free] = ~hidden(scene.ground, pierced[free], xyz[wet[free]])
+    free[free] = ~occluded(scene.ground, pierced[free], xyz[wet[free]])
     shift[wet[free]] = place[free] - nodes[wet[free]]
     known[wet[~free]] = False
     return Shifts(step_px, shift.reshape(*shape, 2).astype(np.float32), known.reshape(shape))
@@ -225,14 +225,14 @@ def traced(
     return photo.pixels(pierced), pierced, found
 
 
-def hidden(ground: Ground, start: FloatArray, end: FloatArray) -> BoolArray:
-    """Return whether the ground stands between start and end, both of shape (n, 3)."""
-    way = end - start
-    length = np.linalg.norm(way, axis=1)
-    apart = length > 0.0
-    found = np.zeros(len(way), bool)
-    hit = ground.hit(start[apart], way[apart] / length[apart, None])
-    found[apart] = hit < length[apart] - OCCLUSION_CELLS * ground.cell_m
+def occluded(ground: Ground, start: FloatArray, end: FloatArray) -> BoolArray:
+    """Return whether the ground is between start and end, both of shape (n, 3)."""
+    ray = end - start
+    length = np.linalg.norm(ray, axis=1)
+    distinct = length > 0.0
+    found = np.zeros(len(ray), bool)
+    hit = ground.hit(start[distinct], ray[distinct] / length[distinct, None])
+    found[distinct] = hit < length[distinct] - OCCLUSION_CELLS * ground.cell_m
     return found
 
 

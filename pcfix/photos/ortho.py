@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.model import BoolArray, FloatArray
-from pcfix.photos.mapping import Photo, Scene, hidden, traced
+from pcfix.photos.mapping import Photo, Scene, occluded, traced
 from pcfix.water.surface import surface_above
 
 FEATHER = 0.01
@@ -69,7 +69,7 @@ def picture_of(pixels: npt.NDArray[Any], shrunk: int = 1, *, blanks: bool = Fals
 
 
 def blank_in(pixels: npt.NDArray[Any]) -> BoolArray:
-    """Return the black areas of an image without water, and the pixels beside them."""
+    """Return the black areas of an image without water, and the pixels next to them."""
     import cv2
 
     limit = BLACK * (257 if pixels.dtype == np.uint16 else 1)
@@ -143,7 +143,7 @@ def seen_at(photo: Photo, xyz: FloatArray, scene: Scene) -> tuple[FloatArray, Bo
     seen &= ((place >= 0.0) & (place <= frame)).all(axis=1)
     rows = np.flatnonzero(seen)
     start = np.broadcast_to(photo.centre, (len(rows), 3))
-    seen[rows] = ~hidden(scene.ground, start, pierced[rows])
+    seen[rows] = ~occluded(scene.ground, start, pierced[rows])
     rows = np.flatnonzero(seen)
-    seen[rows] = ~hidden(scene.ground, pierced[rows], xyz[rows])
+    seen[rows] = ~occluded(scene.ground, pierced[rows], xyz[rows])
     return place, seen

@@ -113,9 +113,9 @@ def pair_points(
     import cv2
 
     nothing = np.empty((0, 3))
-    way = right.centre - left.centre
-    base = float(np.linalg.norm(way))
-    x = way / base
+    baseline = right.centre - left.centre
+    base = float(np.linalg.norm(baseline))
+    x = baseline / base
     z = left.rotation[2] + right.rotation[2]
     z = z - (z @ x) * x
     z /= np.linalg.norm(z)

@@ -98,12 +98,12 @@ def bed_places(view: View, pixels: FloatArray) -> FloatArray:
     start = on_level(view, pixels)
     ray = start - view.photo.centre
     ray /= np.linalg.norm(ray, axis=1)[:, None]
-    bent = ray / view.refractive_index
-    bent[:, 2] = -np.sqrt(1.0 - (bent[:, :2] ** 2).sum(axis=1))
+    refracted_ray = ray / view.refractive_index
+    refracted_ray[:, 2] = -np.sqrt(1.0 - (refracted_ray[:, :2] ** 2).sum(axis=1))
     place = start
     for _ in range(10):
-        far = (view.bed(place[:, :2]) - start[:, 2]) / bent[:, 2]
-        place = start + far[:, None] * bent
+        far = (view.bed(place[:, :2]) - start[:, 2]) / refracted_ray[:, 2]
+        place = start + far[:, None] * refracted_ray
     return place
 
 
@@ -261,8 +261,8 @@ class _Shell:
         """Return the slopes of f frames along each wave number, as Fourier coefficients, (f, m)."""
         planes = (slope * weight[..., None]).transpose(0, 2, 1)
         planes = planes.reshape(len(slope), 2, self._height, -1)
-        whole = np.fft.fft2(planes, s=self._shape).reshape(len(slope), 2, -1)[..., self._rows]
-        return np.asarray((self.number.T * whole).sum(axis=1) / self._size)
+        spectrum = np.fft.fft2(planes, s=self._shape).reshape(len(slope), 2, -1)[..., self._rows]
+        return np.asarray((self.number.T * spectrum).sum(axis=1) / self._size)
 
     def energy(self, slope: FloatArray) -> FloatArray:
         """Return the energy of slopes, shape (f, n, 2), at each wave number."""

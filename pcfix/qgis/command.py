@@ -30,7 +30,7 @@ def program_of(setting: str) -> str:
     named = setting.strip() or "pcfix"
     tries = [named]
     if Path(named).is_dir():
-        tries = [str(Path(named, *way)) for way in (("bin", "pcfix"), ("Scripts", "pcfix.exe"))]
+        tries = [str(Path(named, *place)) for place in (("bin", "pcfix"), ("Scripts", "pcfix.exe"))]
     found = next(filter(None, map(shutil.which, tries)), None)
     if found is None:
         raise CommandError(f"There is no pcfix at '{named}'. {HELP}")

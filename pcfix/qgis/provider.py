@@ -12,7 +12,7 @@ from qgis import core
 from .command import CommandError, program_of, run, words_of
 
 PROGRAM = "PCFIX_PROGRAM"
-SAID = "said"
+MESSAGES = "messages"
 CLOUDS = "Point clouds and DSMs (*.las *.laz *.tif *.tiff *.vrt);;All files (*.*)"
 OUTPUTS = "LAZ (*.laz);;LAS (*.las);;GeoTIFF (*.tif)"
 LAYER = "raster_layer"
@@ -106,7 +106,7 @@ class Algorithm(core.QgsProcessingAlgorithm):
                 words = "Raster layer of heights, instead of the cloud"
                 layer = core.QgsProcessingParameterRasterLayer(LAYER, words, None, True)
                 self.addParameter(layer)
-        self.addOutput(core.QgsProcessingOutputString(SAID, "Messages of pcfix"))
+        self.addOutput(core.QgsProcessingOutputString(MESSAGES, "Messages of pcfix"))
 
     def processAlgorithm(  # noqa: N802
         self, parameters: dict[str, Any], context: Any, feedback: Any
@@ -119,10 +119,10 @@ class Algorithm(core.QgsProcessingAlgorithm):
                 values[one["name"]] = layer.source()
             if one["kind"] == "cloud" and not values[one["name"]]:
                 raise core.QgsProcessingException("Give a cloud, or a raster layer.")
-        said: list[str] = []
+        lines: list[str] = []
 
         def say(line: str) -> None:
-            said.append(line)
+            lines.append(line)
             (feedback.pushWarning if "warning:" in line else feedback.pushInfo)(line)
 
         try:
@@ -136,7 +136,7 @@ class Algorithm(core.QgsProcessingAlgorithm):
         written = {name: values[name] for name in outputs if values[name]}
         for path in written.values():
             _load(Path(path), context)
-        return {**written, SAID: "\n".join(said)}
+        return {**written, MESSAGES: "\n".join(lines)}
 
     def _value(self, one: dict[str, Any], parameters: dict[str, Any], context: Any) -> Any:
         name, kind = one["name"], one["kind"]
@@ -178,7 +178,7 @@ def _parameter(one: dict[str, Any]) -> Any:
 
 
 def _load(path: Path, context: Any) -> None:
-    """Load an output, or the rasters and vectors of a folder, with the style beside them."""
+    """Load an output, or the rasters and vectors of a folder, with the style next to them."""
     paths = sorted(path.iterdir()) if path.is_dir() else [path]
     for one in paths:
         for layer in _layers(one):

@@ -1,4 +1,4 @@
-"""Choose the cameras that give a ray to each point: all in whose frame it lies, or a view list."""
+"""Choose the cameras of each point: all whose frames contain it, or those of a view list."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Rule(NamedTuple):
     """Which rays count, and how they are refracted."""
 
     least_cosine2: float  # squared cosine of the largest incidence angle
-    bend: float  # 1 / n
+    ratio: float  # 1 / n
 
 
 def rig_of(survey: Survey) -> Rig:
@@ -75,7 +75,7 @@ def rule_of(survey: Survey) -> Rule:
     return Rule(least, 1.0 / survey.settings.refractive_index)
 
 
-def is_bent(survey: Survey) -> bool:
+def has_varying_slopes(survey: Survey) -> bool:
     """Whether the rays of a point may pierce the water under different slopes."""
     return isinstance(survey.water, WaterMesh | WaterRaster) or survey.own_water is not None
 
@@ -95,7 +95,7 @@ def chosen_views(batch: Batch, shift_m: FloatArray | None = None) -> Views:
     """Return the cameras whose rays each point gets, as a list.
 
     Those of the list of the batch, in its order and with its weights, that can have imaged the
-    point (`pcfix.lens.frames.BESIDE`); or, without a list, all whose frames contain the point. With
+    point (`pcfix.lens.frames.MARGIN`); or, without a list, all whose frames contain the point. With
     `shift_m`, shape (m, 3), the frames hold the image of the true point instead, which is the
     apparent one plus the shift.
     """
@@ -208,16 +208,16 @@ def _choose_all(
             i = rows[j]
             if start.size:  # the entries of a point stay where they are in the list
                 candidates = camera[start[i] : start[i + 1]]
-                kept = _choose(candidates, None, tile, j, rig, frames, rule, tin, fields)
-                for k in range(kept.size):
-                    place[begin[i] + k] = start[i] + kept[k]
+                selected = _choose(candidates, None, tile, j, rig, frames, rule, tin, fields)
+                for k in range(selected.size):
+                    place[begin[i] + k] = start[i] + selected[k]
             else:
                 begin[i] = free
-                kept = _choose(near, marks, tile, j, rig, frames, rule, tin, fields)
-                for k in range(kept.size):
-                    place[free + k] = near[kept[k]]
-                free += kept.size
-            count[i + 1] = kept.size
+                selected = _choose(near, marks, tile, j, rig, frames, rule, tin, fields)
+                for k in range(selected.size):
+                    place[free + k] = near[selected[k]]
+                free += selected.size
+            count[i + 1] = selected.size
 
 
 @kernel(allocates=True)

@@ -412,16 +412,16 @@ def _aim(out: FloatArray, c: int, count: int, tile: Tile, block: Block) -> None:
     for j in range(count):
         normal, bed = three(tile.points, 4 * TILE + j), room[BED * TILE + j]
         p = three(tile.points, j)
-        up, way = minus(centre, p), minus(original, three(tile.points, _ORIGINAL * TILE + j))
+        up, ray = minus(centre, p), minus(original, three(tile.points, _ORIGINAL * TILE + j))
         above = normal[2] * (tile.points[3 * TILE + j] - (p[2] - points.offset[c]))
         # the ray of the original image in the adjusted camera, from where it passes the point
-        d = in_other(images.original, images.adjusted, c, scaled(-1.0, way))
+        d = in_other(images.original, images.adjusted, c, scaled(-1.0, ray))
         e = scaled(dot(up, d) / dot(d, d), d)
         a = minus(up, e)
         above -= dot(normal, a)
         # H and L^2; f leads to the piercing point, as in `rays`
         across, length2 = dot(normal, e), dot(e, e)
-        per_across, length = 1.0 / across, np.sqrt(dot(way, way))
+        per_across, length = 1.0 / across, np.sqrt(dot(ray, ray))
         f = above * per_across if above > 0.0 else 0.0
         d = refracted(e, length2, normal, across, 1.0 / n if above > 0.0 else 1.0)
         a, down = beyond(a, f, e), 1.0 / d[2]
@@ -430,7 +430,7 @@ def _aim(out: FloatArray, c: int, count: int, tile: Tile, block: Block) -> None:
         out[_PLACE * TILE + j], out[(_PLACE + 1) * TILE + j] = q[0], q[1]
         out[_PLACE_BY_HEIGHT * TILE + j] = d[0] * down
         out[(_PLACE_BY_HEIGHT + 1) * TILE + j] = d[1] * down
-        put(room, _RAY * TILE + j, scaled(-1.0 / length, way))
+        put(room, _RAY * TILE + j, scaled(-1.0 / length, ray))
         put(room, _Q * TILE + j, q)
         away = np.sqrt(length2)
         room[_LENGTH * TILE + j], room[_AWAY * TILE + j] = length, f * away

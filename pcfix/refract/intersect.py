@@ -160,7 +160,7 @@ def _intersect(
                     row[_DISTANCE] = ray_distance(sums[9 * TILE + j], nine(sums, j), vector(row))
         if len(covariance):
             room = room_of(tile, result, rows)
-            uncertainty.add_errors(room, tile, marks[:seeing], near, rig, given.rule.bend, budget)
+            uncertainty.add_errors(room, tile, marks[:seeing], near, rig, given.rule.ratio, budget)
             uncertainty.finish_tile(covariance, rows, room, tile, level_sigma, budget)
 
 
@@ -204,7 +204,7 @@ def add_camera(
     incidence angles.
     """
     centre, offset = row_of(rig.centres, c), rig.offset[c]
-    least_cosine2, r = rule.least_cosine2, rule.bend
+    least_cosine2, r = rule.least_cosine2, rule.ratio
     rays = 0
     for j in range(marks.size):
         x, y, z = three(tile, j)
@@ -227,8 +227,8 @@ def add_camera(
             q = 1.0 / (length2 * height)
         # 1 / L^2
         inv = height * q if use else 0.0
-        bend = r if h > 0.0 else 1.0
-        d = refracted(e, length2, normal, height, bend)
+        ratio = r if h > 0.0 else 1.0
+        d = refracted(e, length2, normal, height, ratio)
         terms = line_terms(scaled(f, e), d, inv)
         add_three(sums, j, times, terms[0:3])
         add_three(sums, 3 * TILE + j, times, terms[3:6])

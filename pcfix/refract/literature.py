@@ -379,9 +379,12 @@ def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
     # the base in plan from each image to the nearest other place, and in the frame of its camera
     plan, place = np.unique(centres[:, :2].round(3), axis=0, return_inverse=True)
     near = np.asarray(cKDTree(plan).query(plan, k=[2])[1])[:, 0]
-    way = (plan[np.minimum(near, len(plan) - 1)] - plan)[place.reshape(-1)]
-    right, down, _ = np.abs(np.einsum("kij,kj->ik", rotations[rows, :, :2], way))
-    height_m, base_m = float(np.median(centres[:, 2] - level_m)), float(np.median(np.hypot(*way.T)))
+    to_next = (plan[np.minimum(near, len(plan) - 1)] - plan)[place.reshape(-1)]
+    right, down, _ = np.abs(np.einsum("kij,kj->ik", rotations[rows, :, :2], to_next))
+    height_m, base_m = (
+        float(np.median(centres[:, 2] - level_m)),
+        float(np.median(np.hypot(*to_next.T))),
+    )
     frames = np.array([(lenses[i].focal, lenses[i].width, lenses[i].height) for i in rows])
     tangents = np.median(frames[:, 1:] / frames[:, :1], axis=0) / 2.0
     along, across = tangents[::-1] if np.median(right) < np.median(down) else tangents

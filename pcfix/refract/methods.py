@@ -15,7 +15,7 @@ import numpy as np
 
 from pcfix.model import FloatArray, IntArray, Outcome, WaterPlane
 from pcfix.refract.batch import Batch, Intersection, Survey
-from pcfix.refract.choice import chosen_views, is_bent, near_borders
+from pcfix.refract.choice import chosen_views, has_varying_slopes, near_borders
 from pcfix.refract.tiling import spatial_order
 from pcfix.refract.uncertainty import with_uncertainty
 from pcfix.water.surface import SurfaceAbove
@@ -104,7 +104,7 @@ def _takes_all_in_frame(batch: Batch) -> bool:
         batch.views is None
         and survey.learned.occluder is None
         and survey.learned.matcher is None
-        and not is_bent(survey)
+        and not has_varying_slopes(survey)
     )
 
 

@@ -88,8 +88,8 @@ def _patches_of(batch: Batch, points: int, at_borders: bool) -> Patches | None:
     xy = batch.xyz[usable, :2]
     close = np.arange(len(xy))
     if at_borders and points == PATCH_POINTS[0]:
-        apart = _border_distance_m(xy, batch.survey.cameras.centres[:, :2])
-        close = np.sort(np.argsort(apart)[: max(PATCHES, int(BORDER_SHARE * len(xy)))])
+        border_m = _border_distance_m(xy, batch.survey.cameras.centres[:, :2])
+        close = np.sort(np.argsort(border_m)[: max(PATCHES, int(BORDER_SHARE * len(xy)))])
     seeds = np.unique(close[np.linspace(0, len(close) - 1, PATCHES).astype(int)])
     tree = cKDTree(xy, balanced_tree=False, compact_nodes=False)
     patch = usable[tree.query(xy[seeds], k=points)[1]]
@@ -126,7 +126,7 @@ class Squares:
         self._taken = list[tuple[Batch, FloatArray]]()
 
     def add(self, batch: Batch) -> None:
-        """Take what lies in the squares."""
+        """Add the points within the squares."""
         x, y = np.floor(batch.xyz[:, :2].T / self._width_m).astype(np.int64).view(np.uint64)
         mixed = (x * np.uint64(_MIX[0])) ^ (y * np.uint64(_MIX[1]))
         mixed = (mixed ^ (mixed >> np.uint64(32))) * np.uint64(_MIX[2])
@@ -226,8 +226,8 @@ def grid_m(xyz: FloatArray) -> float | None:
             return None
         gap = np.diff(values)
         step = float(np.median(gap))
-        whole = np.abs(gap / step - np.rint(gap / step)) < 0.02
-        if not whole.mean() > GRID_SHARE:
+        is_integer = np.abs(gap / step - np.rint(gap / step)) < 0.02
+        if not is_integer.mean() > GRID_SHARE:
             return None
         steps.append(step)
     return float(np.mean(steps))

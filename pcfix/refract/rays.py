@@ -325,7 +325,7 @@ def settle(
     b, c = -plane[0] / plane[2], -plane[1] / plane[2]
     before = b, c
     for _ in range(SETTLING_STEPS):
-        (x, y, z_plane), depth = _way_out(plane, q, e, n)
+        (x, y, z_plane), depth = _exit_point(plane, q, e, n)
         z, b_there, c_there = plane_at(tin, field, x, y, origin)
         # the path changes by the height, and by the slope times the depth
         change = abs(z - z_plane) + abs(depth) * (abs(b_there - b) + abs(c_there - c))
@@ -349,14 +349,14 @@ def _settle_on_crease(
     """
     (b1, c1), (b2, c2), low, high = one, other, 0.0, 1.0
     for _ in range(HALVINGS):
-        (x, y, _), _ = _way_out(plane, q, e, n)
+        (x, y, _), _ = _exit_point(plane, q, e, n)
         z, b, c = plane_at(tin, field, x, y, origin)
         if np.isnan(z):
             return
         # a slope between the two sides
         share = 0.5 * (low + high)
         lay(plane, x, y, z, b1 + share * (b2 - b1), c1 + share * (c2 - c1))
-        (x, y, _), _ = _way_out(plane, q, e, n)
+        (x, y, _), _ = _exit_point(plane, q, e, n)
         _, b, c = plane_at(tin, field, x, y, origin)
         # on which side does the light leave now?
         if (b - b1) ** 2 + (c - c1) ** 2 > (b - b2) ** 2 + (c - c2) ** 2:
@@ -366,7 +366,7 @@ def _settle_on_crease(
 
 
 @device
-def _way_out(plane: FloatArray, q: Vector, e: Vector, n: float) -> tuple[Vector, float]:
+def _exit_point(plane: FloatArray, q: Vector, e: Vector, n: float) -> tuple[Vector, float]:
     """Return where light from Q leaves the water through a plane, and the depth of Q below it."""
     normal = vector(plane)
     path = light_path(q, e, normal, plane[3], n)

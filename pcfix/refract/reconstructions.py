@@ -202,7 +202,7 @@ class Verdict(NamedTuple):
         }
 
     def __str__(self) -> str:
-        way, other = "lower" if self.deeper_m >= 0.0 else "higher", self.runner_up.words
+        side, other = "lower" if self.deeper_m >= 0.0 else "higher", self.runner_up.words
         how = "set by the user"
         if not self.is_given:
             by = f" by {self.by}" if self.by else ""
@@ -210,7 +210,7 @@ class Verdict(NamedTuple):
         fit = ", which fits better" if self.is_given and self.is_against else ""
         text = (
             f"Cloud: {self.chosen.words} ({how}). Next best: {other}{fit}; the bed would be"
-            f" {abs(self.deeper_m):.3f} m {way}."
+            f" {abs(self.deeper_m):.3f} m {side}."
         )
         if not self.patches or self.share > 0.5:
             return text
@@ -341,10 +341,10 @@ def _beds(
     """Correct the points of the patches for each type; None if fewer than two can."""
     z: FloatArray = np.array(in_threads(partial(_heights, part, around), types))
     covered = np.isfinite(z).sum(axis=1)
-    kept = np.flatnonzero(covered >= COVERED * covered.max())
-    if len(kept) < 2 or not covered.max():
+    comparable = np.flatnonzero(covered >= COVERED * covered.max())
+    if len(comparable) < 2 or not covered.max():
         return None
-    z, types = z[kept], tuple(types[i] for i in kept)
+    z, types = z[comparable], tuple(types[i] for i in comparable)
     known = place[np.isfinite(z[:, place]).all(axis=(0, 2))]
     if len(known) < LEAST_PATCHES:
         half, none = np.full((len(z), len(z)), 0.5), np.zeros((len(z), len(z)))
@@ -440,7 +440,7 @@ def _model_uncertainty(part: Batch, beds: _Beds, at: int, among: list[int]) -> M
     deep = depth > LEAST_DEPTH_M
 
     def left(a: int, b: int, most: float) -> float:
-        apart = (np.abs((beds.z[a] - beds.z[b])[beds.place]) / depth)[deep]
+        difference = (np.abs((beds.z[a] - beds.z[b])[beds.place]) / depth)[deep]
         # by the probability of the other type
         wrong = 0.5 * math.erfc(beds.errors[a, b] / math.sqrt(2.0))
         share = float(np.interp(wrong, OPEN, (0.0, 1.0)))
@@ -448,11 +448,11 @@ def _model_uncertainty(part: Batch, beds: _Beds, at: int, among: list[int]) -> M
         if not (beds.types[a].is_single or beds.types[b].is_single):
             by_steps = max(float(beds.share[a, b]), 0.0) + float(beds.sigma[a, b])
             share = max(share, min(by_steps, 1.0))
-        if not np.isfinite(apart).any():
+        if not np.isfinite(difference).any():
             return 0.0
         # its 95 % interval covers 95 % of the differences
-        rms = float(np.sqrt(np.nanmean(apart**2)))
-        spread = max(rms, float(np.nanquantile(apart, 0.95)) / 1.96)
+        rms = float(np.sqrt(np.nanmean(difference**2)))
+        spread = max(rms, float(np.nanquantile(difference, 0.95)) / 1.96)
         return (share if share <= most else 1.0) * spread
 
     best, _ = beds.rank(among)

@@ -121,7 +121,7 @@ def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
 
 
 def notes_of(count: int, slope: float) -> tuple[str, ...]:
-    """Return what a user should know of a line of so many check depths."""
+    """Return the notes on a line fitted to this number of check depths."""
     notes = []
     if count < FEW:
         notes.append(

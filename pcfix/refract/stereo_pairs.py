@@ -79,7 +79,7 @@ _DISTANCE, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6
 
 # Columns of a search: Q, the nearest Q so far, F there and its size, the share of a step, whether
 # it goes on, and the ratio of true to apparent depth at the start.
-_, _NEAREST, _AT_NEAREST, _BEST, _SHARE, _GOES_ON, _RATIO, _WIDTH_OF_SEARCH = slots(
+_, _NEAREST, _AT_NEAREST, _BEST, _SHARE, _IS_ACTIVE, _RATIO, _WIDTH_OF_SEARCH = slots(
     3, 3, 3, 1, 1, 1, 1
 )  # fmt: skip
 
@@ -136,7 +136,7 @@ def invert_pairs(batch: Batch) -> Intersection:
             _search, -(-len(rows) // TILE), rows, block, steps == 0, used, result,
             points=0 if steps else len(batch),
         )  # fmt: skip
-        rows = rows[search[rows, _GOES_ON] > 0.0]
+        rows = rows[search[rows, _IS_ACTIVE] > 0.0]
     outcome = result[:, _OUTCOME].astype(np.uint8)
     moved = outcome == Outcome.CORRECTED
     warn_of_unsolved("stereo pairs: no solution", result[moved, _FOUND] > 0.0)
@@ -272,7 +272,7 @@ def _start(
             result[i, 0], result[i, 1], result[i, 2] = q
             result[i, _DISTANCE] = distance
             one[0], one[1], one[2] = q
-            one[_BEST], one[_SHARE], one[_GOES_ON] = np.inf, 1.0, 1.0
+            one[_BEST], one[_SHARE], one[_IS_ACTIVE] = np.inf, 1.0, 1.0
             # a place sinks as the true point does, times the ratio of their depths
             depth = tile[3 * TILE + j] - tile[2 * TILE + j]
             one[_RATIO] = 1.0 - q[2] / depth if depth > 0.0 else 1.0
@@ -285,7 +285,7 @@ def _step(
     tile: FloatArray, near: IntArray, pairs: Pairs, block: Block,
 ) -> bool:  # fmt: skip
     """Do one step of all searches of a tile; return whether any goes on."""
-    optics, search, goes_on = block.images.original, block.search, False
+    optics, search, is_active = block.images.original, block.search, False
     for j in range(rows.size):
         put(now, j, vector(search[rows[j]]))
     for q in range(near.size):
@@ -298,14 +298,14 @@ def _step(
     for p in range(len(pairs.rays)):
         _meet(places[p], rays[pairs.rays[p, 0]], rays[pairs.rays[p, 1]], rows.size)
     for j in range(rows.size):
-        if search[rows[j], _GOES_ON] > 0.0:
+        if search[rows[j], _IS_ACTIVE] > 0.0:
             # the median is relative to P, so that it is F itself
             x = _median(places, values, pairs.own[0, j, : pairs.wide[j]], j)
             y = _median(places, values, pairs.own[1, j, : pairs.wide[j]], TILE + j)
             z = _median(places, values, pairs.own[2, j, : pairs.wide[j]], 2 * TILE + j)
             _advance(search[rows[j]], block.derivative[rows[j]], (x, y, z))
-            goes_on = goes_on or search[rows[j], _GOES_ON] > 0.0
-    return goes_on
+            is_active = is_active or search[rows[j], _IS_ACTIVE] > 0.0
+    return is_active
 
 
 @device
@@ -443,12 +443,12 @@ def _advance(one: FloatArray, b: FloatArray, f: Vector) -> None:
         one[_SHARE] *= 0.5
         _start_derivative(b, one)
     else:  # no image of the start
-        one[_GOES_ON] = 0.0
+        one[_IS_ACTIVE] = 0.0
         return
     step = times(b, vector(one, _AT_NEAREST))
     one[0], one[1], one[2] = minus(vector(one, _NEAREST), step)
     # the last step is small enough for the B so far
-    one[_GOES_ON] = 1.0 if one[_BEST] > CLOSE_M else 0.0
+    one[_IS_ACTIVE] = 1.0 if one[_BEST] > CLOSE_M else 0.0
 
 
 @device

@@ -76,7 +76,7 @@ def gather_three(runs: FloatArray, rows: IntArray, values: FloatArray) -> None:
 
 
 def slots(*widths: int) -> tuple[int, ...]:
-    """Return the first run of each of several quantities of so many numbers, and how many in all.
+    """Return the first slot of quantities with these numbers of values, and the total.
 
     Runs of `TILE` numbers in one array: the compiler sees that they cannot overlap.
     """

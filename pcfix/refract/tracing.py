@@ -193,8 +193,8 @@ class Endpoints(NamedTuple):
         up = 1.0 / np.sqrt(1.0 + b * b + c * c)
         normal, u = np.stack([-b * up, -c * up, up]), self.e - a
         facing, r = _dot(normal, u), 1.0 / self.n
-        bend = r * facing - np.sqrt(_dot(u, u) * (1.0 - r * r) + r * r * facing * facing)
-        t = bend * normal - r * u
+        normal_part = r * facing - np.sqrt(_dot(u, u) * (1.0 - r * r) + r * r * facing * facing)
+        t = normal_part * normal - r * u
         # light reaches only faces that look towards the camera
         return a, np.where((facing > 0.0) & (t[2] < 0.0), t, np.nan)
 
@@ -311,11 +311,11 @@ def _search(pairs: Endpoints, start: FloatArray, level: FloatArray, method: str)
             s[:, far] *= 0.5
             new[:, far] = some.of(far).residual(place[:, far] + s[:, far], method)
         rest[:, rows] = new
-        goes_on = ~np.isnan(new[0])
-        xy[:, rows[goes_on]] += s[:, goes_on]
-        found[rows] = goes_on & (size <= CLOSE_M)
-        goes_on &= size > CLOSE_M
-        rows, some = rows[goes_on], some.of(goes_on)
+        is_active = ~np.isnan(new[0])
+        xy[:, rows[is_active]] += s[:, is_active]
+        found[rows] = is_active & (size <= CLOSE_M)
+        is_active &= size > CLOSE_M
+        rows, some = rows[is_active], some.of(is_active)
         if not len(rows):
             break
     return xy, found & (np.hypot(*pairs.offset(xy)) <= CREASE_M)

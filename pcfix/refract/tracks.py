@@ -58,7 +58,7 @@ def search_tile(
     room: FloatArray, rays: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray,
     rig: Rig, optics: Optics, n: float, tin: Tin | None, fields: Field | None,
 ) -> None:  # fmt: skip
-    """Move Q from the start in `room` to where g is zero; its state says whether it was found.
+    """Move Q from the start in `room` to where g is zero; its state shows success.
 
     `marks`, a row for each of the cameras `near`, say how often each ray counts. A point that is
     found, or lost, stays where it is, so that the others of its tile do not matter.

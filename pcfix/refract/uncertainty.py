@@ -180,17 +180,17 @@ def budget_of(survey: Survey) -> Budget:
 
 # Runs of `TILE` numbers for the points of a tile: how far above the true point P is, along N; the
 # number of rays; what level (3) and n (3) add to S delta; W (6); S T (9); noise (6).
-_ABOVE, RAYS, BY_LEVEL, BY_N, SIGHT, BY_Q, NOISE, ROOM = slots(1, 1, 3, 3, 6, 9, 6)
+_ABOVE, RAYS, BY_LEVEL, BY_N, IMAGES, BY_Q, NOISE, ROOM = slots(1, 1, 3, 3, 6, 9, 6)
 
 
-class Sight(NamedTuple):
+class Camera(NamedTuple):
     """One camera, for kernels: plain numbers, which stay in registers."""
 
     centre: Vector
     offset: float  # how much higher the water stood
     axis: Vector  # optical axis; zeros for images of nearly equal angles
     square: float  # squared focal length, px^2
-    bend: float  # 1 / n
+    ratio: float  # 1 / n
 
 
 class Ray(NamedTuple):
@@ -205,7 +205,7 @@ class Ray(NamedTuple):
     rho2: float  # d.d
     h: float
     y: float
-    bend: float  # r, 1 where light goes straight
+    ratio: float  # r, 1 where light goes straight
     kappa: float
     inv_h: float  # 1 / H
     lean: float  # r / kappa: the tangent in water for each metre across in air
@@ -227,41 +227,41 @@ def room_of(tile: FloatArray, shift: FloatArray, rows: IntArray) -> FloatArray:
 
 
 @device(forceinline=True)
-def _ray_of(room: FloatArray, tile: FloatArray, marks: FloatArray, j: int, sight: Sight) -> Ray:
+def _ray_of(room: FloatArray, tile: FloatArray, marks: FloatArray, j: int, image: Camera) -> Ray:
     """Return the ray of a point; one that does not count goes straight up."""
     p, normal = three(tile, j), three(tile, 4 * TILE + j)
-    e = minus(sight.centre, p) if marks[j] > 0.0 else normal
+    e = minus(image.centre, p) if marks[j] > 0.0 else normal
     height, length2 = dot(normal, e), dot(e, e)
     rho2 = length2 - height * height
-    h = normal[2] * (tile[3 * TILE + j] - (p[2] - sight.offset))
+    h = normal[2] * (tile[3 * TILE + j] - (p[2] - image.offset))
     # light of a point above the water goes straight
-    bend, y = sight.bend if h > 0.0 else 1.0, h + room[_ABOVE * TILE + j]
-    kappa = np.sqrt(length2 - bend * bend * rho2)
+    ratio, y = image.ratio if h > 0.0 else 1.0, h + room[_ABOVE * TILE + j]
+    kappa = np.sqrt(length2 - ratio * ratio * rho2)
     # one division for two
     share = 1.0 / (height * kappa)
     inv_k, inv_h = share * height, share * kappa
-    lean, d = bend * inv_k, beyond(e, -height, normal)
-    away, beta = 1.0 - h * inv_h + y * lean, y * lean * inv_k * inv_k * (bend * bend - 1.0)
+    lean, d = ratio * inv_k, beyond(e, -height, normal)
+    away, beta = 1.0 - h * inv_h + y * lean, y * lean * inv_k * inv_k * (ratio * ratio - 1.0)
     return Ray(
-        marks[j], e, d, normal, height, length2, rho2, h, y, bend, kappa, inv_h, lean, away, beta
+        marks[j], e, d, normal, height, length2, rho2, h, y, ratio, kappa, inv_h, lean, away, beta
     )
 
 
 @device(forceinline=True)
-def _weight(ray: Ray, sight: Sight) -> Symmetric:
+def _weight(ray: Ray, image: Camera) -> Symmetric:
     """Return J'J of a camera at P.
 
     With the optical axis z and Z = -z.e it is (f / Z)^2 (I + x z' + z x'), x = e / Z +
     L^2 / (2 Z^2) z; without an axis (zeros), of angles, (f / L)^2 (I - e e' / L^2).
     """
-    axis, e, length2 = sight.axis, ray.e, ray.length2
+    axis, e, length2 = image.axis, ray.e, ray.length2
     # cameras without an axis, such as fisheyes, have equal angles per pixel
     flat = axis[0] != 0.0 or axis[1] != 0.0 or axis[2] != 0.0
     # depth along the axis, or the squared distance
     deep = -dot(axis, e) if flat else length2
     inv = 1.0 / deep if ray.times > 0.0 else 0.0
     # (f / Z)^2 or (f / L)^2; 0 for rays that do not count
-    w = ray.times * sight.square * (inv * inv if flat else inv)
+    w = ray.times * image.square * (inv * inv if flat else inv)
     a = inv if flat else -0.5 * inv
     b = 0.5 * length2 * inv * inv if flat else 0.0
     zx, zy, zz = axis[0] if flat else e[0], axis[1] if flat else e[1], axis[2] if flat else e[2]
@@ -299,26 +299,26 @@ def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: V
 
 
 @device
-def _add_common(room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight) -> None:
+def _add_common(room: FloatArray, tile: FloatArray, marks: FloatArray, image: Camera) -> None:
     """Add one camera's rays to the sums of a tile's points: what moves Q, level and index."""
     for j in range(marks.size):
-        ray = _ray_of(room, tile, marks, j, sight)
-        w, lean = _weight(ray, sight), ray.lean
+        ray = _ray_of(room, tile, marks, j, image)
+        w, lean = _weight(ray, image), ray.lean
         g, c, b, v = _effect(ray, w)
         # S T
         _add_nine(room, BY_Q * TILE + j, c, w, g, beyond(scaled(b, ray.d), v - lean, ray.normal))
         # delta by n over d: y r^2 L^2 / kappa^3
         inv_k2 = 1.0 / (ray.kappa * ray.kappa)
-        by_n = ray.y * lean * ray.bend * ray.length2 * inv_k2 if ray.bend < 1.0 else 0.0
+        by_n = ray.y * lean * ray.ratio * ray.length2 * inv_k2 if ray.ratio < 1.0 else 0.0
         room[RAYS * TILE + j] += ray.times
         add_three(room, BY_LEVEL * TILE + j, ray.inv_h - lean, g)
         add_three(room, BY_N * TILE + j, by_n, g)
-        _add_six(room, SIGHT * TILE + j, 1.0, w)
+        _add_six(room, IMAGES * TILE + j, 1.0, w)
 
 
 @device
 def _add_noise(
-    room: FloatArray, tile: FloatArray, marks: FloatArray, sight: Sight, budget: Budget
+    room: FloatArray, tile: FloatArray, marks: FloatArray, image: Camera, budget: Budget
 ) -> None:
     """Add the noise of one camera's rays to the normal equations of the straight rays.
 
@@ -328,8 +328,8 @@ def _add_noise(
     -y (1 - r H / kappa) (tau + r^2 / kappa^2 d (d.tau)), which adds S delta delta' S in images.
     """
     for j in range(marks.size):
-        ray = _ray_of(room, tile, marks, j, sight)
-        w = _weight(ray, sight)
+        ray = _ray_of(room, tile, marks, j, image)
+        w = _weight(ray, image)
         g, c, b, v = _effect(ray, w)
         # S delta = across (c W tau + along (d.tau) g), with tau across N, where c W N = -v g
         across = budget.waves * ray.y * (1.0 - ray.height * ray.lean)
@@ -364,7 +364,7 @@ def _of_lists(
 
 @device
 def add_errors(
-    room: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray, rig: Rig, bend: float,
+    room: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray, rig: Rig, ratio: float,
     budget: Budget,
 ) -> None:  # fmt: skip
     """Add the rays of cameras to the points of a tile.
@@ -373,12 +373,12 @@ def add_errors(
     """
     for k in range(len(marks)):
         c = near[k]
-        sight = Sight(
-            row_of(rig.centres, c), rig.offset[c], row_of(rig.axes, c), rig.focal_px[c] ** 2, bend
+        image = Camera(
+            row_of(rig.centres, c), rig.offset[c], row_of(rig.axes, c), rig.focal_px[c] ** 2, ratio
         )
-        _add_common(room, tile, marks[k], sight)
+        _add_common(room, tile, marks[k], image)
         if budget.by_ray:
-            _add_noise(room, tile, marks[k], sight, budget)
+            _add_noise(room, tile, marks[k], image, budget)
 
 
 @device(allocates=True)
@@ -394,7 +394,7 @@ def finish_tile(
     out, sigma, sums = np.empty(6 * TILE), level_sigma[rows], room
     # R = sigma^2 K if all rays have the same image noise
     if not budget.by_ray:
-        sums[NOISE * TILE :] = budget.image_px**2 * sums[SIGHT * TILE : BY_Q * TILE]
+        sums[NOISE * TILE :] = budget.image_px**2 * sums[IMAGES * TILE : BY_Q * TILE]
     for j in range(rows.size):
         m, k = nine(sums, BY_Q * TILE + j), sums[RAYS * TILE + j]
         det, b = inverse_of(m)

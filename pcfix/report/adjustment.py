@@ -27,7 +27,7 @@ _FACTS: RowTable = (
     ("", "centres known to {precision[centre_mean_m]:z.4f} m (X, Y, Z), angles to"
      " {precision[angle_mean_deg]:z.4f} deg (mean standard errors)", "is_precise"),
     ("Bed", "heights known to {bed_m:.3f} m (standard error{bed_if})", "bed_m"),
-    ("Observations", "{o[used]:,} {kind} used, {o[left_out]:,} excluded ({o_share})", "o"),
+    ("Observations", "{o[used]:,} {kind} used, {o[excluded]:,} excluded ({o_share})", "o"),
     ("Fit", "sigma0 {sigma0:.3f}, redundancy {redundancy:,}", "images"),
     ("GNSS", "{gnss[images]:,} images. Centres minus GNSS (east, north, up): mean"
      " {gnss[mean_m]:+z.3f} m, RMS {gnss[rms_m]:z.3f} m", "gnss"),
@@ -99,7 +99,7 @@ def _facts(d: Plain) -> Rows:
     network = ", a free network" if d["unknowns"]["free_network"] else ""
     return filled(_FACTS, d | {
         "poses_words": f"free{network}" if is_free else "fixed", "o": o, "kind": kinds[d["source"]],
-        "o_share": share(o["left_out"], o["used"] + o["left_out"]),
+        "o_share": share(o["excluded"], o["used"] + o["excluded"]),
         "moved": is_free and d["poses"]["moved_rms_m"], "is_precise": is_free,
         "bed_if": "" if is_free else ", if the fixed poses are right",
         "bed_m": (d["residuals"]["water"]["sigma_xyz_m"] or [None])[-1],

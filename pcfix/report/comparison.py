@@ -83,11 +83,11 @@ def measured_of(compared: Plain) -> Plain:
 def comparison_text(c: Comparison) -> str:
     """Return the summary of a comparison; metres throughout."""
     plain, n, checks = c.as_dict(), c.counts, c.measured_at == "reference"
-    in_reference = n.reference - n.reference_left_out
+    in_reference = n.reference - n.reference_excluded
     compared = share(n.compared, in_reference if checks else n.cloud)
     rows = [("Compared", f"{n.compared:,} {'check points' if checks else 'points'} ({compared})")]
     ignored = {
-        "withheld or noise": n.cloud_left_out,
+        "withheld or noise": n.cloud_excluded,
         "not submerged": n.not_submerged,
         "outside the overlap": n.outside_overlap,
     }

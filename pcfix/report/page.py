@@ -106,7 +106,7 @@ class Picture:
 
     @cached_property
     def png(self) -> bytes:
-        """The picture as a file; drawn once, for the page and beside it."""
+        """The picture as a file; drawn once, for the page and its own file."""
         return png_of(self.figure)
 
     @property
@@ -274,7 +274,7 @@ def _of_layer(layer: Layer) -> dict[str, Any]:
     tick = nice_step(max(float(shown[1] - shown[0]), 1e-3) / _TICKS)
     first = np.floor(shown[0] / tick)
     ticks = max(np.ceil(shown[1] / tick) - first, 1.0)
-    whole = np.rint((layer.values - low) / step)
+    whole_steps = np.rint((layer.values - low) / step)
     return {
         "name": layer.name,
         "unit": layer.unit,
@@ -285,11 +285,11 @@ def _of_layer(layer: Layer) -> dict[str, Any]:
         "ticks": int(ticks),
         "colours": [colour for _, colour in stops_of(layer.ramp, _COLOURS)],
         "plusMinus": layer.plus_minus,
-        "values": _packed(np.where(np.isfinite(whole), whole, _NO_DATA)),
+        "values": _packed(np.where(np.isfinite(whole_steps), whole_steps, _NO_DATA)),
     }
 
 
-def _packed(whole: FloatArray) -> str:
-    flat = whole.astype("<i2").ravel()
+def _packed(whole_steps: FloatArray) -> str:
+    flat = whole_steps.astype("<i2").ravel()
     steps = np.diff(flat, prepend=np.zeros(1, "<i2")).astype("<i2")
     return base64.b64encode(zlib.compress(steps.tobytes(), 9)).decode()

@@ -44,7 +44,7 @@ FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras")
 SHOWN_NOTES = 3
 REFERENCE_M = 0.03
 """Noise of a reference such as LiDAR on hard ground; a smaller bias is no cause for a warning."""
-BESIDE_MAP = ("Submerged", "Cameras", "Water", "")
+MAP_FACTS = ("Submerged", "Cameras", "Water", "")
 """Labels of the rows that are also shown beside the map."""
 
 
@@ -93,7 +93,7 @@ def run_report(
         ["CRS", maps.crs or "not stated by the cloud"],
         ["Heights", maps.heights or "vertical datum not stated by the cloud"],
         ["Points", f"{s.points:,}"],
-        *([label, words] for label, words in rows if label in BESIDE_MAP),
+        *([label, words] for label, words in rows if label in MAP_FACTS),
     ]
     depths = f"{depth['min']:.2f} to {depth['max']:.2f} m", f"{depth['mean']:.2f} m"
     # the rows of the terminal, and why the method was chosen
@@ -276,7 +276,7 @@ def notes_of(s: Summary, heights: str, compared: Plain) -> list[str]:
         notes.append(f"Poses: {s.poses['words']}.")
     if not heights:
         notes.append(
-            "The vertical datum is not known: water level, cloud and reference must have the same."
+            "The vertical datum is not known: water level, cloud and reference must share it."
         )
     if s.water_unknown:
         notes.append(f"{s.water_unknown:,} points have no known water surface above them.")

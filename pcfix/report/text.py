@@ -127,8 +127,8 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
         ("Water", "{water}, refractive index {refractive_index:g}", ""),
     )),
     "rebuild": ("Rebuilt in {count} rounds", (
-        ("Result", "{settled:?settled|not settled}: the last round moved the bed by"
-         " {settled:?less|more} than {threshold_m:.3f} m on average", ""),
+        ("Result", "{converged:?converged|not converged}: the last round moved the bed by"
+         " {converged:?less|more} than {threshold_m:.3f} m on average", ""),
         ("Cloud", "{last[cloud]}", ""),
     )),
     "ortho": ("Orthophoto {output} in {seconds:.1f} s", (
@@ -232,7 +232,7 @@ def _repeats(needs: str, needed: Any) -> Iterator[Plain]:
 
 
 def aligned(head: str, rows: Iterable[tuple[str, str]], notes: Iterable[object] = ()) -> str:
-    """Return a summary: a line that says what was done, labelled rows, and notes.
+    """Return a summary: a headline, labelled rows, and notes.
 
     Long texts are wrapped, except for commands, so that these can be copied.
     """
@@ -253,11 +253,11 @@ def wrapped(start: str, text: str) -> str:
     )  # fmt: skip
 
 
-def share(part: int, whole: int) -> str:
+def share(part: int, total: int) -> str:
     """Return a percentage, with a digit more where it is small; 100 % only where it is all."""
-    percent = 100.0 * part / max(whole, 1)
-    if percent >= 99.5 and part < whole:
-        return f"all but {whole - part:,}"
+    percent = 100.0 * part / max(total, 1)
+    if percent >= 99.5 and part < total:
+        return f"all but {total - part:,}"
     return f"{percent:.0f} %" if percent >= 10 or percent == 0 else f"{percent:.1f} %"
 
 

@@ -105,9 +105,9 @@ def simulate_scene(
     truth = points_on(site.terrain, chosen.points, site.rng)
     parts, at_once = [], max(1, PAIRS_AT_ONCE // len(site.true))
     for first in range(0, len(truth), at_once):
-        sight = see(truth[first : first + at_once], site, site.luck)
-        apparent = sight.intersected(site.observed(sight.ideal, site.rng))
-        parts.append((apparent, sight.camera, np.diff(sight.start)))
+        imaged = find_visible(truth[first : first + at_once], site, site.luck)
+        apparent = imaged.intersected(site.observed(imaged.ideal, site.rng))
+        parts.append((apparent, imaged.camera, np.diff(imaged.start)))
         if progress is not None:
             progress(min(first + at_once, len(truth)), len(truth))
     xyz, camera, counts = (np.concatenate(one) for one in zip(*parts, strict=True))
@@ -297,7 +297,7 @@ class Site:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class Visible:
     """The m pairs of one of n points and an image that shows it, sorted by point, then camera.
 
     Point i of `truth`, shape (n, 3), has the pairs from ``start[i]`` to ``start[i + 1]``; `ideal`,
@@ -329,7 +329,7 @@ class Sight:
         return apparent
 
 
-def see(truth: FloatArray, site: Site, rng: np.random.Generator) -> Sight:
+def find_visible(truth: FloatArray, site: Site, rng: np.random.Generator) -> Visible:
     """Trace every point, shape (n, 3), into every image; those in fewer than three have no pairs.
 
     `rng` says what is detected; the luckiest three images of a point always are.
@@ -354,4 +354,4 @@ def see(truth: FloatArray, site: Site, rng: np.random.Generator) -> Sight:
         taken &= (luck < site.detection) | (rank < LEAST_VIEWS)
     point, camera, ideal = point[taken], camera[taken], ideal[taken]
     begin = starts(np.bincount(point, minlength=len(truth)))
-    return Sight(site, truth, begin, point, camera, ideal)
+    return Visible(site, truth, begin, point, camera, ideal)

@@ -128,5 +128,5 @@ class SceneSettings(SceneOptions):
         if self.water_tilt == 0.0:
             return WaterPlane(self.water)
         heading = math.radians(self.tilt_heading_deg)
-        b, c = (-self.water_tilt * way for way in (math.sin(heading), math.cos(heading)))
+        b, c = (-self.water_tilt * part for part in (math.sin(heading), math.cos(heading)))
         return WaterPlane(self.water - (b * extent_m[0] + c * extent_m[1]) / 2.0, b, c)

@@ -104,7 +104,7 @@ def refuse_under_water(cameras: Cameras, level: FloatArray | float, water: str) 
 
 
 def check_submerged(count: int, name: str, water: WaterSurface, heights: str = "") -> None:
-    """Raise GeometryError ``water.below_cloud`` if no point lies below the water.
+    """Raise GeometryError ``water.below_cloud`` if no point is below the water.
 
     `heights` describes those of the cloud.
     """

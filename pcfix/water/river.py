@@ -217,7 +217,7 @@ MOST_NODES, NODES_A_POINT = 400, 2
 STIFF_PENALTY = 1e3  # penalty on rises, and on bends near the ends
 END_POINTS = 7
 """The outermost points are on one straight piece, so that a single one cannot bend it."""
-_TURNS, _BEND_M, _HUBER_M = 12, 1e-3, 0.02
+_TURNS, _CURVATURE_M, _HUBER_M = 12, 1e-3, 0.02
 _LEAST = 1e-12  # keeps the equations solvable without points
 
 
@@ -290,18 +290,18 @@ def _solve(
     before = np.searchsorted(station, nodes[1:-1])
     stiff = np.minimum(before, len(z) - before) < END_POINTS
     weight: FloatArray = np.ones(len(z))
-    bend: FloatArray = np.ones(len(nodes) - 2)
+    curve_weight: FloatArray = np.ones(len(nodes) - 2)
     rise: FloatArray = np.zeros(len(nodes) - 1)
     limit, band = np.inf, np.zeros((3, len(nodes)))
     for turn in range(2 * _TURNS):
-        bends = np.where(stiff, STIFF_PENALTY, penalty * bend)
+        penalties = np.where(stiff, STIFF_PENALTY, penalty * curve_weight)
         # the squares of second differences (1, -2, 1) and of first ones (-1, 1)
-        band[0] = squares @ weight + np.convolve(bends, [1.0, 4.0, 1.0]) + _LEAST
+        band[0] = squares @ weight + np.convolve(penalties, [1.0, 4.0, 1.0]) + _LEAST
         band[0] += np.convolve(STIFF_PENALTY * rise, [1.0, 1.0])
-        band[1, :-1] = products @ weight - np.convolve(bends, [2.0, 2.0]) - STIFF_PENALTY * rise
-        band[2, :-2] = bends
+        band[1, :-1] = products @ weight - np.convolve(penalties, [2.0, 2.0]) - STIFF_PENALTY * rise
+        band[2, :-2] = penalties
         height = solveh_banded(band, splines.T @ (weight * z), lower=True)
-        bend = 1.0 / np.maximum(np.abs(np.diff(height, 2)), _BEND_M)
+        curve_weight = 1.0 / np.maximum(np.abs(np.diff(height, 2)), _CURVATURE_M)
         rise = np.where(np.diff(height) > 0.0, 1.0, 0.0)
         residual = np.abs(z - np.interp(station, nodes, height))
         if turn < _TURNS:

@@ -249,7 +249,7 @@ def locate(tin: Tin, x: float, y: float) -> int:
 
 @device
 def _inside(corners: FloatArray, u: float, v: float) -> bool:
-    """Whether a plan position lies in a triangle, edges included."""
+    """Whether a plan position is in a triangle, edges included."""
     ax, ay = corners[1, 0] - corners[0, 0], corners[1, 1] - corners[0, 1]
     bx, by = corners[2, 0] - corners[0, 0], corners[2, 1] - corners[0, 1]
     px, py = u - corners[0, 0], v - corners[0, 1]
@@ -283,7 +283,7 @@ def _set_heights(
         height[i], slope[i, 0], slope[i, 1] = surface_at(tin, field, x[i], y[i])
 
 
-APART_M = 0.01  # overlapping facets are harmless if their heights differ by less
+SHEET_DISTANCE_M = 0.01  # overlapping facets are harmless if their heights differ by less
 
 
 def in_two_sheets(tin: Tin) -> tuple[BoolArray, FloatArray]:
@@ -299,5 +299,5 @@ def in_two_sheets(tin: Tin) -> tuple[BoolArray, FloatArray]:
     a, b, c = (tin.planes[other] - tin.planes[facet]).T
     u, v = centres[facet].T
     double = np.zeros(len(centres), np.bool_)
-    double[facet[np.abs(a + (b * u + c * v)) > APART_M]] = True
+    double[facet[np.abs(a + (b * u + c * v)) > SHEET_DISTANCE_M]] = True
     return double, shapely.area(triangles)

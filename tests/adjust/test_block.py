@@ -17,47 +17,47 @@ def scene():
 
 
 def gathered(**changes):
-    made = scene()
-    given = {"water": made.water, "refractive_index": made.refractive_index,
-             "control": made.control}  # fmt: skip
-    block = block_of(made.cameras, made.ties, **(given | changes))
-    return replace(block, gnss=made.cameras.gnss)
+    data = scene()
+    given = {"water": data.water, "refractive_index": data.refractive_index,
+             "control": data.control}  # fmt: skip
+    block = block_of(data.cameras, data.ties, **(given | changes))
+    return replace(block, gnss=data.cameras.gnss)
 
 
 def test_usable_ties():
-    made = scene()
-    first = made.ties.views.start[1]
-    lone = Views(np.array([0, 1, 1 + first, 1 + 2 * first]), np.zeros(1 + 2 * first, int))
-    camera = made.ties.views.camera[:first]
-    lone = replace(lone, camera=np.concatenate([camera[:1], camera, camera]))
-    xyz = np.array([made.truth[0], made.truth[0], [np.nan] * 3])
-    ties = TiePoints(xyz, lone, np.zeros((1 + 2 * first, 2)))
-    found = usable_ties(ties, made.cameras)
+    data = scene()
+    first = data.ties.views.start[1]
+    single = Views(np.array([0, 1, 1 + first, 1 + 2 * first]), np.zeros(1 + 2 * first, int))
+    camera = data.ties.views.camera[:first]
+    single = replace(single, camera=np.concatenate([camera[:1], camera, camera]))
+    xyz = np.array([data.truth[0], data.truth[0], [np.nan] * 3])
+    ties = TiePoints(xyz, single, np.zeros((1 + 2 * first, 2)))
+    found = usable_ties(ties, data.cameras)
     np.testing.assert_array_equal(found.xyz, xyz[1:2])
     # 40 m over 5 km is half a degree
     far = replace(ties, xyz=xyz - [0.0, 0.0, 5000.0])
-    assert len(usable_ties(far, made.cameras).xyz) == 0
+    assert len(usable_ties(far, data.cameras).xyz) == 0
 
 
 def test_poor_image():
-    made = scene()
+    data = scene()
     block = gathered(control=None)
     seen = np.flatnonzero(block.camera == 3)
     sigma = block.sigma_px.copy()
     sigma[seen[3:]] = np.inf
     poor = replace(block, sigma_px=sigma)
     rows = well_seen(poor)
-    assert set(range(len(made.cameras))) - set(rows.tolist()) == {3}
+    assert set(range(len(data.cameras))) - set(rows.tolist()) == {3}
     less = restricted(poor, rows)
-    names = [made.cameras.labels[i] for i in rows]
+    names = [data.cameras.labels[i] for i in rows]
     assert list(less.cameras.labels) == names
     back = {(int(p), names[c], *uv) for p, c, uv in
             zip(less.owner, less.camera, map(tuple, less.image_xy), strict=True)}  # fmt: skip
-    all_of = {(int(p), made.cameras.labels[c], *uv) for p, c, uv in
+    all_of = {(int(p), data.cameras.labels[c], *uv) for p, c, uv in
               zip(block.owner, block.camera, map(tuple, block.image_xy), strict=True)
               if c != 3}  # fmt: skip
     assert back == all_of
-    np.testing.assert_array_equal(less.gnss.xyz, made.cameras.gnss.xyz[rows])
+    np.testing.assert_array_equal(less.gnss.xyz, data.cameras.gnss.xyz[rows])
 
 
 def test_control_under_water():

@@ -12,7 +12,7 @@ from pcfix.adjust.result import redundancy_of
 from pcfix.model import WaterPlane
 from tests.utils import tie_blocks
 from tests.utils.adjust_twin import Twin
-from tests.utils.curved_water import under_bent_water
+from tests.utils.curved_water import under_curved_water
 from tests.utils.tie_blocks import block_of
 from tests.utils.tie_points import simulate_tie_points
 
@@ -29,30 +29,30 @@ def scene(points, **settings):
     return simulate_tie_points(points, **(given | settings))
 
 
-def put(made, surfaces):
+def put(data, surfaces):
     """Return a scene with points moved onto surfaces, and the surface of each point.
 
     `surfaces` maps a name to rows of the points and a function from their coordinates to new ones.
     """
-    truth, on = made.truth.copy(), np.full(len(made.truth), "", object)
+    truth, on = data.truth.copy(), np.full(len(data.truth), "", object)
     for name, (rows, place) in surfaces.items():
         truth[rows], on[rows] = place(truth[rows]), name
-    return under_bent_water(replace(made, truth=truth), np.zeros(3)), on
+    return under_curved_water(replace(data, truth=truth), np.zeros(3)), on
 
 
-def at_level(made, b=0.0, c=0.0, depth=0.0):
+def at_level(data, b=0.0, c=0.0, depth=0.0):
     """Return what moves points to a plane so deep under the water at the middle."""
-    x, y = np.round(made.true_cameras.centres.mean(axis=0))[:2]
-    level = made.water.a + made.water.b * x + made.water.c * y - depth
+    x, y = np.round(data.true_cameras.centres.mean(axis=0))[:2]
+    level = data.water.a + data.water.b * x + data.water.c * y - depth
     return lambda q: np.column_stack([q[:, :2], level + (q[:, :2] - [x, y]) @ [b, c]])
 
 
-def block_with(made, on, **how):
+def block_with(data, on, **how):
     """Return a block in which all points are control points, most of them without coordinates."""
-    block = block_of(made, **how)
+    block = block_of(data, **how)
     m, control = len(on), block.control
     if control is None:
-        control = replace(made.control, names=(), xyz=np.zeros((0, 3)), sigma_m=np.zeros((0, 3)))
+        control = replace(data.control, names=(), xyz=np.zeros((0, 3)), sigma_m=np.zeros((0, 3)))
     on = (*on, *[""] * len(control.names))
     control = replace(
         control, names=tuple(f"P{i}" for i in range(len(on))), is_check=np.zeros(len(on), bool),
@@ -73,38 +73,38 @@ def adjusted(block, unknowns):
 
 
 def test_come_home():
-    made = scene(90)
-    made, on = put(made, {
-        "water": (np.arange(8), at_level(made)),
-        "floor": (np.arange(8, 20), at_level(made, 0.02, -0.01, 2.0)),
+    data = scene(90)
+    data, on = put(data, {
+        "water": (np.arange(8), at_level(data)),
+        "floor": (np.arange(8, 20), at_level(data, 0.02, -0.01, 2.0)),
     })  # fmt: skip
-    block = block_with(made, on, exact=True, water=WaterPlane(made.water.a + 0.2))
+    block = block_with(data, on, exact=True, water=WaterPlane(data.water.a + 0.2))
     problem, found, _ = adjusted(block, LEVEL)
     assert problem.names == ["level", "level of floor", "tilt_x of floor", "tilt_y of floor"]
-    truth = made.truth - problem.origin
+    truth = data.truth - problem.origin
     np.testing.assert_allclose(found.state.xyz[: len(truth)], truth, atol=HOME_M)
-    floor = made.water.a - 2.0 - problem.origin[2], 0.02, -0.01
+    floor = data.water.a - 2.0 - problem.origin[2], 0.02, -0.01
     np.testing.assert_allclose(found.state.water[PLANES:], floor, atol=HOME_M)
-    assert found.state.water[0] == pytest.approx(made.water.a - problem.origin[2], abs=HOME_M)
+    assert found.state.water[0] == pytest.approx(data.water.a - problem.origin[2], abs=HOME_M)
 
 
 def test_wall():
-    made = scene(60)
-    middle = np.round(made.true_cameras.centres.mean(axis=0))
-    rows = np.flatnonzero(~made.is_wet)[:9]
-    east = lambda q: np.column_stack([middle[0] + 0.1 * (q[:, 2] - made.water.a), q[:, 1:]])  # noqa: E731
-    made, on = put(made, {"wall": (rows, east)})
-    problem, found, _ = adjusted(block_with(made, on, exact=True), Unknowns(lens=()))
+    data = scene(60)
+    middle = np.round(data.true_cameras.centres.mean(axis=0))
+    rows = np.flatnonzero(~data.is_wet)[:9]
+    east = lambda q: np.column_stack([middle[0] + 0.1 * (q[:, 2] - data.water.a), q[:, 1:]])  # noqa: E731
+    data, on = put(data, {"wall": (rows, east)})
+    problem, found, _ = adjusted(block_with(data, on, exact=True), Unknowns(lens=()))
     assert problem.given.axis.tolist() == [2, 0]
     np.testing.assert_allclose(found.state.water[PLANES + 1 :], [0.0, 0.1], atol=1e-7)
-    np.testing.assert_allclose(found.state.xyz + problem.origin, made.truth, atol=HOME_M)
+    np.testing.assert_allclose(found.state.xyz + problem.origin, data.truth, atol=HOME_M)
 
 
 def test_waterline():
-    made = scene(200)
+    data = scene(200)
     rows = np.arange(10)
-    made, on = put(made, {"water": (rows, at_level(made))})
-    block = block_with(made, on, water=WaterPlane(made.water.a + 0.2), control=True)
+    data, on = put(data, {"water": (rows, at_level(data))})
+    block = block_with(data, on, water=WaterPlane(data.water.a + 0.2), control=True)
     _, found, precision = adjusted(block, LEVEL)
     sigma = precision.sigma_of("level")
     assert abs(found.shared[0] + 0.2) < 3.5 * sigma
@@ -117,15 +117,15 @@ def test_waterline():
 
 @pytest.mark.parametrize("parallel", [("floor", "deck"), ("water", "floor", "deck")])
 def test_parallel(parallel):
-    made = scene(120, tilt_percent=1.0)
-    b, c = made.water.b, made.water.c
-    made, on = put(made, {
-        "floor": (np.arange(8), at_level(made, b, c, 2.0)),
-        "deck": (np.arange(8, 12), at_level(made, b, c, -0.5)),
+    data = scene(120, tilt_percent=1.0)
+    b, c = data.water.b, data.water.c
+    data, on = put(data, {
+        "floor": (np.arange(8), at_level(data, b, c, 2.0)),
+        "deck": (np.arange(8, 12), at_level(data, b, c, -0.5)),
     })  # fmt: skip
     unknowns = Unknowns(lens=(), surface={"tilt": FREE})
-    apart = adjusted(block_with(made, on, control=True), unknowns)[2]
-    block = replace(block_with(made, on, control=True), parallel=parallel)
+    separate = adjusted(block_with(data, on, control=True), unknowns)[2]
+    block = replace(block_with(data, on, control=True), parallel=parallel)
     problem, found, precision = adjusted(block, unknowns)
     floor, deck = found.state.water[PLANES:].reshape(2, 3)
     assert (floor[1:] == deck[1:]).all()
@@ -133,24 +133,24 @@ def test_parallel(parallel):
         assert (floor[1:] == found.state.water[1:3]).all()
         assert problem.names == ["tilt_x", "tilt_y", "level of floor", "level of deck"]
         sigma = precision.sigma_of("tilt_x")
-        assert sigma < apart.sigma_of("tilt_x")
+        assert sigma < separate.sigma_of("tilt_x")
     else:
         sigma = precision.sigma_of("tilt_x of floor")
-        assert sigma < min(apart.sigma_of(f"tilt_x of {name}") for name in ("floor", "deck"))
+        assert sigma < min(separate.sigma_of(f"tilt_x of {name}") for name in ("floor", "deck"))
     assert abs(floor[1] - b) < 3.5 * sigma
 
 
 def test_same_as_scipy():
-    made = simulate_tie_points(
+    data = simulate_tie_points(
         20, seed=2, area_m=(25, 20), greatest_depth_m=6, position_noise_m=0.05,
         attitude_noise_deg=0.05, forward_overlap=0.6, side_overlap=0.5, obliques_deg=25,
         oblique_directions=2, oblique_share=0.3, tilt_percent=1.0,
     )  # fmt: skip
-    made, on = put(made, {
-        "water": (np.arange(4), at_level(made, made.water.b, made.water.c)),
-        "floor": (np.arange(4, 10), at_level(made, 0.01, 0.0, 1.0)),
+    data, on = put(data, {
+        "water": (np.arange(4), at_level(data, data.water.b, data.water.c)),
+        "floor": (np.arange(4, 10), at_level(data, 0.01, 0.0, 1.0)),
     })  # fmt: skip
-    block = block_with(made, on, cameras=made.true_cameras, gnss=False)
+    block = block_with(data, on, cameras=data.true_cameras, gnss=False)
     for parallel in ((), ("water", "floor")):
         # the twin has no word for points that are never wet: a waterline that it meets from above
         block = replace(block, wet=np.ones(len(block.wet), bool), parallel=parallel)

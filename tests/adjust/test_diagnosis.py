@@ -21,8 +21,8 @@ def block(seed):
     return KindBlock("20 % land", seed)
 
 
-def with_gnss(made, cameras):
-    return replace(cameras, gnss=made.cameras.gnss)
+def with_gnss(data, cameras):
+    return replace(cameras, gnss=data.cameras.gnss)
 
 
 def tie_sign(true, cameras, n=N):
@@ -30,8 +30,8 @@ def tie_sign(true, cameras, n=N):
     depth = -straight.xyz[:, 2]
     wet = depth > 0
     begin = true_start(straight.xyz, WATER, n, wet)
-    bent = replace(true.block(cameras, WATER, wet), xyz=begin, refractive_index=n)
-    return tie_point_sign(straight, intersect_fixed(bent), depth), straight.xyz
+    refracted = replace(true.block(cameras, WATER, wet), xyz=begin, refractive_index=n)
+    return tie_point_sign(straight, intersect_fixed(refracted), depth), straight.xyz
 
 
 def gnss_signs(cameras, apparent):
@@ -59,12 +59,12 @@ def test_right_poses(poses):
 
 def test_absorbed():
     true = block(1)
-    bent = with_gnss(true, true.adjusted(true.cameras, LENS))
-    sign, apparent = tie_sign(true, bent)
+    refracted = with_gnss(true, true.adjusted(true.cameras, LENS))
+    sign, apparent = tie_sign(true, refracted)
     assert sign.speaks is True
     figures = sign.figures
     assert figures["wet_refracted_px"] > figures["wet_straight_px"]
-    by_gnss, found = gnss_signs(bent, apparent)
+    by_gnss, found = gnss_signs(refracted, apparent)
     assert by_gnss.speaks is True
     # what the land is off in truth: the straight intersection against the true points; the
     # prediction does not know the GNSS, which placed the block as a whole, hence a third

@@ -28,10 +28,10 @@ def block(points=150, exact=True, **settings):
     return unaware(simulate_tie_points(points, **(SMALL | settings)), exact=exact)
 
 
-def cloud_block(made, *, gnss=True, control=None, exact=True):
+def cloud_block(data, *, gnss=True, control=None, exact=True):
     """Return the apparent points as the only thing that is known of the images."""
-    scene, old = made.scene, made.cameras
-    ties = ties_of_cloud(made.ties.xyz, made.ties.views, old)
+    scene, old = data.scene, data.cameras
+    ties = ties_of_cloud(data.ties.xyz, data.ties.views, old)
     whole = block_of(old, ties, scene.water, scene.refractive_index, control=control)
     if gnss:
         place = scene.true_cameras.centres if exact else scene.cameras.gnss.xyz
@@ -40,8 +40,8 @@ def cloud_block(made, *, gnss=True, control=None, exact=True):
     return whole, old, apparent
 
 
-def centre_error_m(made, cameras):
-    return np.abs(cameras.centres - made.scene.true_cameras.centres).max()
+def centre_error_m(data, cameras):
+    return np.abs(cameras.centres - data.scene.true_cameras.centres).max()
 
 
 @pytest.mark.parametrize(
@@ -50,23 +50,23 @@ def centre_error_m(made, cameras):
     ids=["nadir", "tilted water", "obliques"],
 )
 def test_comes_home(settings):
-    made = block(**settings)
-    assert centre_error_m(made, made.cameras) > 0.1
-    found = adjust_cloud(*cloud_block(made), Unknowns())
-    assert centre_error_m(made, found.cameras) < HOME_M
+    data = block(**settings)
+    assert centre_error_m(data, data.cameras) > 0.1
+    found = adjust_cloud(*cloud_block(data), Unknowns())
+    assert centre_error_m(data, found.cameras) < HOME_M
     # px; a micrometre of 50 m is that of 3648 px in the focal length
-    assert abs(found.cameras.lenses[0].focal - made.scene.true_cameras.lenses[0].focal) < 1e-4
-    assert np.abs(found.xyz - made.scene.truth).max() < 10 * HOME_M  # seen from 50 m apart
+    assert abs(found.cameras.lenses[0].focal - data.scene.true_cameras.lenses[0].focal) < 1e-4
+    assert np.abs(found.xyz - data.scene.truth).max() < 10 * HOME_M  # seen from 50 m apart
     assert found.source == "cloud"
 
 
 def test_control_points():
-    made = block()
+    data = block()
     control = replace(
-        made.scene.control, xyz=made.scene.control_truth, image_xy=made.scene.control_exact_xy
+        data.scene.control, xyz=data.scene.control_truth, image_xy=data.scene.control_exact_xy
     )
-    found = adjust_cloud(*cloud_block(made, gnss=False, control=control), Unknowns())
-    assert centre_error_m(made, found.cameras) < 10 * HOME_M  # four points hold six strips
+    found = adjust_cloud(*cloud_block(data, gnss=False, control=control), Unknowns())
+    assert centre_error_m(data, found.cameras) < 10 * HOME_M  # four points hold six strips
     assert {row.role for row in found.control} == {"control", "check"}
     for row in found.control:
         assert max(abs(row.dx_m), abs(row.dy_m), abs(row.dz_m)) < 10 * HOME_M
@@ -75,14 +75,14 @@ def test_control_points():
 
 def test_noise():
     """As the old columns are nearly those of light through the water, so are the estimates."""
-    made = block(400, exact=False)
-    scene = made.scene
-    mended = adjust_cloud(*cloud_block(made, exact=False), Unknowns())
+    data = block(400, exact=False)
+    scene = data.scene
+    mended = adjust_cloud(*cloud_block(data, exact=False), Unknowns())
     whole = block_of(scene.cameras, scene.ties, scene.water, scene.refractive_index)
     aware = adjust_ties(replace(whole, gnss=scene.cameras.gnss), Unknowns(lens=("f",)))
     sigma_m = aware.precision.centre_sigma_m
     away = np.abs(mended.cameras.centres - scene.true_cameras.centres)
-    apart = np.abs(mended.cameras.centres - aware.cameras.centres)
+    distance = np.abs(mended.cameras.centres - aware.cameras.centres)
     # 1.4 and 0.6 of the standard errors of tie points, which are 16 mm
     assert np.sqrt(np.mean((away / sigma_m) ** 2)) < 2.0
-    assert np.sqrt(np.mean((apart / sigma_m) ** 2)) < 1.0
+    assert np.sqrt(np.mean((distance / sigma_m) ** 2)) < 1.0

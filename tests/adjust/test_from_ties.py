@@ -27,62 +27,62 @@ def scene(image_px=0.5, **settings):
     )  # fmt: skip
 
 
-def block(made, ties=None, gnss=True, control=None):
-    ties = made.ties if ties is None else ties
-    found = block_of(made.cameras, ties, made.water, made.refractive_index, control=control)
-    return replace(found, gnss=made.cameras.gnss) if gnss else found
+def block(data, ties=None, gnss=True, control=None):
+    ties = data.ties if ties is None else ties
+    found = block_of(data.cameras, ties, data.water, data.refractive_index, control=control)
+    return replace(found, gnss=data.cameras.gnss) if gnss else found
 
 
 def codes(found):
     return [note.code for note in found.notes]
 
 
-def with_gross_errors(made, share=0.05):
+def with_gross_errors(data, share=0.05):
     """Return tie points of which some are 5 to 50 px off, and which."""
     rng = np.random.default_rng(4)
-    bad = rng.random(len(made.views.camera)) < share
-    way, length = rng.uniform(0.0, 2.0 * np.pi, len(bad)), rng.uniform(5.0, 50.0, len(bad))
-    error = np.where(bad, length, 0.0)[:, None] * np.column_stack([np.cos(way), np.sin(way)])
-    return replace(made.ties, image_xy=made.ties.image_xy + error), bad
+    bad = rng.random(len(data.views.camera)) < share
+    angle, length = rng.uniform(0.0, 2.0 * np.pi, len(bad)), rng.uniform(5.0, 50.0, len(bad))
+    error = np.where(bad, length, 0.0)[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return replace(data.ties, image_xy=data.ties.image_xy + error), bad
 
 
 @pytest.mark.parametrize("image_px", [0.15, 1.5])
 @pytest.mark.parametrize("gross", [False, True])
 def test_noise(image_px, gross):
     """In 8000 coordinates, the median's own error is 1 %, and unit weight's the same."""
-    made = scene(image_px)
-    ties = with_gross_errors(made)[0] if gross else made.ties
-    found = adjust_ties(block(made, ties), FOCAL)
+    data = scene(image_px)
+    ties = with_gross_errors(data)[0] if gross else data.ties
+    found = adjust_ties(block(data, ties), FOCAL)
     # sigma0 says that the weights were right, the residuals what they were
     assert found.sigma0 == pytest.approx(1.0, abs=0.1)
     r = found.residual_px[found.used]
-    share = found.redundancy / (2 * len(r) + 3 * len(made.cameras))
+    share = found.redundancy / (2 * len(r) + 3 * len(data.cameras))
     # of errors of 5 px and noise of 1.5 some pass for good ones: 4 % more
     assert np.sqrt(np.mean(r * r) / share) == pytest.approx(image_px, rel=0.1)
 
 
 def test_outliers():
-    made = scene()
-    ties, bad = with_gross_errors(made)
-    found = adjust_ties(block(made, ties), FOCAL)
+    data = scene()
+    ties, bad = with_gross_errors(data)
+    found = adjust_ties(block(data, ties), FOCAL)
     # the smallest are ten standard deviations
     assert not found.used[bad].any()
     # longer than four standard deviations are 3 in 10,000 vectors
     assert (~found.used[~bad]).sum() <= 5
-    clean = adjust_ties(block(made), FOCAL)
-    apart = found.cameras.centres - clean.cameras.centres
+    clean = adjust_ties(block(data), FOCAL)
+    distance = found.cameras.centres - clean.cameras.centres
     # with 5 % less to go by, they differ by a quarter of the standard error
-    assert np.sqrt(np.mean((apart / clean.precision.centre_sigma_m) ** 2)) < 0.5
+    assert np.sqrt(np.mean((distance / clean.precision.centre_sigma_m) ** 2)) < 0.5
 
 
 def test_check_points():
-    made = scene()
-    control = made.control
+    data = scene()
+    control = data.control
     first = int(np.argmax(control.is_check))
     off = control.is_check[:, None] * [10.0, -5.0, 3.0]
     marks = control.is_check[control.point][:, None] * np.array([80.0, 40.0])
     wild = replace(control, xyz=control.xyz + off, image_xy=control.image_xy + marks)
-    one, two = (adjust_ties(block(made, control=c), FOCAL) for c in (control, wild))
+    one, two = (adjust_ties(block(data, control=c), FOCAL) for c in (control, wild))
     np.testing.assert_array_equal(one.cameras.centres, two.cameras.centres)
     np.testing.assert_array_equal(one.cameras.rotations, two.cameras.rotations)
     assert one.cameras.lenses == two.cameras.lenses
@@ -100,14 +100,14 @@ def test_check_points():
 
 
 def test_marks_are_no_outliers():
-    made = scene()
-    control = made.control
+    data = scene()
+    control = data.control
     mine = np.flatnonzero(control.point == 0)
     marks = control.image_xy.copy()
     marks[mine[0]] += 100.0
     wrong = replace(control, image_xy=marks)
-    found = adjust_ties(block(made, control=wrong), FOCAL)
-    m = len(made.truth)
+    found = adjust_ties(block(data, control=wrong), FOCAL)
+    m = len(data.truth)
     assert found.used[found.block.owner == m].all()
     worst = max(found.control, key=lambda row: row.rms_px)
     assert worst.name == control.names[0]
@@ -115,17 +115,17 @@ def test_marks_are_no_outliers():
 
 
 def test_weak_lens():
-    made = scene()
+    data = scene()
     lens = ("f", "cx", "cy", "k1", "k2", "p2")
-    found = adjust_ties(block(made), replace(FOCAL, lens=lens))
+    found = adjust_ties(block(data), replace(FOCAL, lens=lens))
     note = next(note for note in found.notes if note.code == "adjust.weak_lens")
     weak = set(lens) - set(found.unknowns.lens)
     assert {"cx", "cy"} <= weak  # nadir images over an even bed: a shift of all centres does it
     assert set(note.values["fixed"]) == weak
-    before, after = made.cameras.lenses[0], found.cameras.lenses[0]
+    before, after = data.cameras.lenses[0], found.cameras.lenses[0]
     assert (after.principal_x, after.principal_y) == (before.principal_x, before.principal_y)
     assert after.focal != before.focal
-    named = adjust_ties(block(made), replace(FOCAL, lens=lens), choose_lens=False)
+    named = adjust_ties(block(data), replace(FOCAL, lens=lens), choose_lens=False)
     assert named.unknowns.lens == lens
     assert not named.notes
 

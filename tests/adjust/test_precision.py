@@ -42,8 +42,8 @@ def blocks_of(covariance, size):
 @pytest.mark.parametrize("tilt", [None, 2.0], ids=["level", "tilted"])
 def test_same_as_twin(poses, tilt):
     """The twin inverts the normal matrix of everything, its Jacobian by differences."""
-    made = tiny(tilt_percent=tilt)
-    block = block_of(made, control=True, gnss=poses == "free")
+    data = tiny(tilt_percent=tilt)
+    block = block_of(data, control=True, gnss=poses == "free")
     unknowns = Unknowns(
         poses=poses, lens=("f",), surface={"level": FREE, "tilt": FREE, "index": 0.01}
     )
@@ -121,11 +121,11 @@ def test_sloping_bed():
 
     The depth grows with x, and with it what an error of the index does: so does a tilt along x.
     """
-    made = simulate_tie_points(
+    data = simulate_tie_points(
         150, bed="shore", greatest_depth_m=3, area_m=(40, 30), forward_overlap=0.7,
         side_overlap=0.6, seed=4,
     )  # fmt: skip
-    block, sigma = block_of(made, control=True), {}
+    block, sigma = block_of(data, control=True), {}
     for name, free in (
         ("level", ("level",)), ("index", ("index",)), ("all", ("level", "tilt", "index")),
     ):  # fmt: skip
@@ -144,8 +144,8 @@ def test_sloping_bed():
 
 
 def test_large_block(monkeypatch):
-    made = tiny()
-    block = block_of(made, control=True)
+    data = tiny()
+    block = block_of(data, control=True)
     problem, found = adjusted(block, Unknowns(lens=("f",), surface={"level": FREE}))
     whole = precision_of(problem, found)
     monkeypatch.setattr("pcfix.adjust.precision.DENSE_UP_TO", 0)

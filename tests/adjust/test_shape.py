@@ -13,13 +13,13 @@ from pcfix.model import WaterPlane, WaterRaster
 from pcfix.water.surface import surface_above
 from tests.utils import tie_blocks
 from tests.utils.adjust_twin import Twin
-from tests.utils.curved_water import under_bent_water
+from tests.utils.curved_water import under_curved_water
 from tests.utils.tie_blocks import block_of, clear_of_the_waterline
 from tests.utils.tie_points import simulate_tie_points
 
 FREE = np.inf
 SHAPED = Unknowns(lens=(), surface={"level": FREE, "tilt": FREE, "shape": FREE})
-BEND = np.array([1.2e-4, -6e-5, -9e-5])
+CURVATURE = np.array([1.2e-4, -6e-5, -9e-5])
 """1/m: 6 cm at 25 m from the middle, as before a weir."""
 SCENE = {
     "area_m": (50, 40), "greatest_depth_m": 5, "position_noise_m": 0.2, "attitude_noise_deg": 0.2,
@@ -28,10 +28,10 @@ SCENE = {
 
 
 @cache
-def scene(points, bend=tuple(BEND), **settings):
-    made = simulate_tie_points(points, **(SCENE | settings))
+def scene(points, curvature=tuple(CURVATURE), **settings):
+    data = simulate_tie_points(points, **(SCENE | settings))
     # the straight images of points that the bend puts under water or lifts out of it have a kink
-    return under_bent_water(clear_of_the_waterline(made, 0.4), np.array(bend))
+    return under_curved_water(clear_of_the_waterline(data, 0.4), np.array(curvature))
 
 
 def adjusted(block, unknowns=SHAPED):
@@ -40,36 +40,41 @@ def adjusted(block, unknowns=SHAPED):
 
 
 def test_comes_home():
-    made = scene(150)
-    start = WaterPlane(made.water.a + 0.1)
-    block = block_of(made, exact=True, control=True, water=start)
+    data = scene(150)
+    start = WaterPlane(data.water.a + 0.1)
+    block = block_of(data, exact=True, control=True, water=start)
     problem, found, _ = adjusted(block)
-    np.testing.assert_allclose(found.state.water[4:7], BEND, atol=1e-10)  # 1/m: 0.06 um at 25 m
-    ties = found.state.xyz[: len(made.truth)] + problem.origin
-    np.testing.assert_allclose(ties, made.truth, atol=1e-6)  # m: Newton's last step
+    np.testing.assert_allclose(
+        found.state.water[4:7], CURVATURE, atol=1e-10
+    )  # 1/m: 0.06 um at 25 m
+    ties = found.state.xyz[: len(data.truth)] + problem.origin
+    np.testing.assert_allclose(ties, data.truth, atol=1e-6)  # m: Newton's last step
     water = water_of(problem, found.state)
     assert isinstance(water, WaterRaster)
-    x, y = (made.truth - problem.origin)[:, :2].T
-    wanted = made.water.a + BEND @ [x * x, x * y, y * y]
+    x, y = (data.truth - problem.origin)[:, :2].T
+    wanted = data.water.a + CURVATURE @ [x * x, x * y, y * y]
     # m: between the centres of cells of half a metre the raster is bilinear, and this much bent
-    np.testing.assert_allclose(surface_above(water, made.truth).height_m, wanted, atol=2e-5)
+    np.testing.assert_allclose(surface_above(water, data.truth).height_m, wanted, atol=2e-5)
 
 
 def test_undetermined_shape():
-    made = scene(60)
-    precision = adjusted(block_of(made, control=True, sigma_px=8.0))[2]
+    data = scene(60)
+    precision = adjusted(block_of(data, control=True, sigma_px=8.0))[2]
     shape = {"shape_xx", "shape_xy", "shape_yy"}
     assert shape <= {one.values["unknown"] for one in undetermined(precision)}
 
 
 def test_same_as_scipy():
-    made = simulate_tie_points(
+    data = simulate_tie_points(
         14, seed=2, area_m=(25, 20), greatest_depth_m=6, position_noise_m=0.05,
         attitude_noise_deg=0.05, forward_overlap=0.6, side_overlap=0.5, obliques_deg=25,
         oblique_directions=2, oblique_share=0.3,
     )  # fmt: skip
     block = block_of(
-        under_bent_water(made, 4.0 * BEND), control=True, cameras=made.true_cameras, gnss=False
+        under_curved_water(data, 4.0 * CURVATURE),
+        control=True,
+        cameras=data.true_cameras,
+        gnss=False,
     )
     problem, found, precision = adjusted(block, replace(SHAPED, poses="fixed"))
     twin = Twin(block, tuple(problem.names), free_poses=False)
@@ -85,16 +90,16 @@ def test_same_as_scipy():
 
 
 def test_members():
-    made = scene(60)
-    problem, found, precision = adjusted(block_of(made, control=True))
+    data = scene(60)
+    problem, found, precision = adjusted(block_of(data, control=True))
     step = np.zeros((1, 6 * len(found.lenses) + len(problem.names)))
     step[0, -6:] = [0.02, 1e-3, -2e-3, 1e-5, 2e-5, -3e-5]
     member = members_of(problem, found, step)
-    raster, cameras = water_of(problem, found.state), made.true_cameras
+    raster, cameras = water_of(problem, found.state), data.true_cameras
     cameras = replace(cameras, centres=found.state.centres + problem.origin)
     moved = member.surface(0, raster, cameras)
-    x, y = (made.truth - problem.origin)[:, :2].T
+    x, y = (data.truth - problem.origin)[:, :2].T
     by = step[0, -6:] @ [np.ones(len(x)), x, y, x * x, x * y, y * y]
-    risen = surface_above(moved, made.truth).height_m - surface_above(raster, made.truth).height_m
+    risen = surface_above(moved, data.truth).height_m - surface_above(raster, data.truth).height_m
     np.testing.assert_allclose(risen, by, atol=5e-6)  # m: as above
     assert precision.members.water.shape == (32, 7)

@@ -33,8 +33,11 @@ def with_errors(rng, kind):
     if kind == "lens":  # a plate that is bent by a wave of half the diagonal
         lens = block.cameras.lenses[0]
         half = 0.5 * np.hypot(lens.width, lens.height)
-        way, phase = rng.uniform(0.0, 2.0 * np.pi, 2)
-        along = (block.image_xy - [lens.principal_x, lens.principal_y]) @ [np.cos(way), np.sin(way)]
+        angle, phase = rng.uniform(0.0, 2.0 * np.pi, 2)
+        along = (block.image_xy - [lens.principal_x, lens.principal_y]) @ [
+            np.cos(angle),
+            np.sin(angle),
+        ]
         wave = 1.5 * NOISE_PX * np.cos(2.0 * np.pi * along / half + phase)
         off = wave[:, None] * [np.cos(phase), np.sin(phase)]
         return replace(block, image_xy=block.image_xy + off)
@@ -48,13 +51,13 @@ def with_errors(rng, kind):
 
 def draws(kind, count=DRAWS):
     """Return errors over standard errors of each kind of unknown, formal ones and larger ones."""
-    rng, made, both = np.random.default_rng(8), scene(), []
+    rng, data, both = np.random.default_rng(8), scene(), []
     for _ in range(count):
         problem, found = adjusted(with_errors(rng, kind), Unknowns(lens=("f",)))
         formal = precision_of(problem, found, sigma0_of(problem, found))
         factor = disagreement_of(problem, found, formal)
-        off = found.state.centres + problem.origin - made.true_cameras.centres
-        turn = found.state.rotations @ made.true_cameras.rotations.transpose(0, 2, 1)
+        off = found.state.centres + problem.origin - data.true_cameras.centres
+        turn = found.state.rotations @ data.true_cameras.rotations.transpose(0, 2, 1)
         angles = np.degrees(Rotation.from_matrix(turn).as_rotvec())
         rows = []
         for precision in (formal, precision_of(problem, found, formal.sigma0, factor)):

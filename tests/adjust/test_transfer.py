@@ -91,11 +91,11 @@ def test_come_home(cameras, points):
     """The disturbed cameras' points are where their own straight rays nearly meet."""
     old = disturbed(cameras, np.random.default_rng(2))
     some = points[:40]
-    made = np.array([met(images_of(xyz, cameras), old, xyz) for xyz in some])
-    shift, moved = transfer(made, everybody(40, 12), old, cameras)
+    data = np.array([met(images_of(xyz, cameras), old, xyz) for xyz in some])
+    shift, moved = transfer(data, everybody(40, 12), old, cameras)
     assert moved.all()
-    away = np.sqrt(((made - some) ** 2).sum(axis=1).mean())
-    left = np.sqrt(((made + shift - some) ** 2).sum(axis=1).mean())
+    away = np.sqrt(((data - some) ** 2).sum(axis=1).mean())
+    left = np.sqrt(((data + shift - some) ** 2).sum(axis=1).mean())
     assert away > 0.2
     # what is lost is the residual of the old rays (1 px) times the change of the gradients
     assert left < 0.01 * away

@@ -22,7 +22,7 @@ import pcfix
 from tests.benchmarks.accuracy import true_surface
 
 LEVEL, GSD, MARGIN = 0.37, 0.05, 0.1
-WAYS = {
+CASES = {
     "tie points, GNSS": {"ties": "auto"},
     "tie points, GNSS, GCPs": {"ties": "auto", "gcps": True},
     "cloud alone, GNSS": {"ties": "cloud"},
@@ -66,18 +66,18 @@ def main() -> None:
     where = dict(zip(true.labels, true.centres + offset, strict=True))
     print(f"apparent                      {errors(folder / 'cloud.las', truth, given.every)}")
     with tempfile.TemporaryDirectory() as scratch:
-        for name, way in WAYS.items():
-            adjust_and_correct(name, dict(way), folder, Path(scratch), offset, where, truth, given)
+        for name, case in CASES.items():
+            adjust_and_correct(name, dict(case), folder, Path(scratch), offset, where, truth, given)
 
 
-def adjust_and_correct(name, way, folder, scratch, offset, where, truth, given) -> None:
+def adjust_and_correct(name, case, folder, scratch, offset, where, truth, given) -> None:
     """Print the errors of one way."""
     out = scratch / name.replace(" ", "_").replace(",", "")
-    gcps = folder / "gcps.csv" if way.pop("gcps", False) else None
+    gcps = folder / "gcps.csv" if case.pop("gcps", False) else None
     started = time.perf_counter()
     found = pcfix.adjust_cameras(
         folder / "sparse", out, water=LEVEL, cloud=folder / "cloud.las", gcps=gcps,
-        gnss=folder / "gnss.csv", cameras_offset=offset, views=folder / "dense.vis", **way,
+        gnss=folder / "gnss.csv", cameras_offset=offset, views=folder / "dense.vis", **case,
     )  # fmt: skip
     seconds = time.perf_counter() - started
     off = found.cameras.centres - np.array([where[label] for label in found.cameras.labels])

@@ -71,14 +71,14 @@ def errors(given):
     for kind in (*model_errors.KINDS, "all"):
         for seed in range(given.seed, given.seed + given.blocks) if kind != "all" else ():
             try:
-                made = model_errors.run(kind, seed)
+                data = model_errors.run(kind, seed)
             except PcfixError as error:
                 print(kind, seed, error)
                 continue
-            rows = [float((made.normalised[name] ** 2).mean()) for name in COLUMNS]
+            rows = [float((data.normalised[name] ** 2).mean()) for name in COLUMNS]
             for name in (kind, "all"):
                 squares[name].append(rows)
-                beds[name].append(made.bed_gsd)
+                beds[name].append(data.bed_gsd)
         known = np.isfinite(squares[kind]).sum(axis=0)  # a principal point that is held has none
         means = np.nansum(squares[kind], axis=0) / np.where(known, known, np.nan)
         figures = " ".join(f"{value:6.2f}" for value in np.sqrt(means))
@@ -133,7 +133,7 @@ def one_kind(folder, kind, seed, ties):
         warnings.simplefilter("ignore", PcfixWarning)
         before, _ = corrected(model)
         best, _ = corrected(folder / "true", adjusted_from=model)
-    with warnings.catch_warnings(record=True) as heard:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", PcfixWarning)
         try:
             found = pcfix.adjust_cameras(
@@ -142,7 +142,7 @@ def one_kind(folder, kind, seed, ties):
             off, sigma = corrected(out / "colmap", adjusted_from=model)
         except PcfixError as error:
             return rms(best), rms(before), *[np.nan] * 4, [error.code]
-    shown = [one.message for one in heard if isinstance(one.message, PcfixWarning)]
+    shown = [one.message for one in caught if isinstance(one.message, PcfixWarning)]
     codes = sorted({one.code for one in [*found.notes, *shown] if isinstance(one, PcfixWarning)})
     bias, within = np.mean(off) / block_kinds.GSD_M, (np.abs(off) <= 1.96 * sigma).mean()
     return rms(best), rms(before), rms(off), float(bias), rms(sigma), float(within), codes

@@ -42,7 +42,9 @@ NOT_COMPARED = {"seconds", "pcfix", "made_by", "changed_ns", "bytes", "identity"
 """Keys of JSON that hold times, versions, or sizes and checksums of texts that contain them."""
 RENAMED = {
     "made": "reconstruction", "made_of": "type", "doubt_per_depth": "per_depth",
-    "doubts": "problems", "beside_entries": "outside_entries", "beside_points": "outside_points",
+    "doubts": "problems", "left_out": "excluded", "cloud_left_out": "cloud_excluded",
+    "reference_left_out": "reference_excluded", "settled": "converged",
+    "beside_entries": "outside_entries", "beside_points": "outside_points",
 }  # fmt: skip
 """Keys of JSON with the names that they have now."""
 ZERO = 1e-9
@@ -141,9 +143,9 @@ def compare(given):
             print(f"{name}: {line}")
         if len(found) > SHOWN:
             print(f"{name}: and {len(found) - SHOWN} more")
-    alone = sorted(name for name in sides[0] ^ sides[1] if matches(name, given.only))
-    if alone:
-        print(f"{len(alone)} commands are in one record only: {' '.join(alone)}")
+    one_sided = sorted(name for name in sides[0] ^ sides[1] if matches(name, given.only))
+    if one_sided:
+        print(f"{len(one_sided)} commands are in one record only: {' '.join(one_sided)}")
     print(f"{count} differences in {len(names)} commands")
     return int(count > 0 or not names)
 
@@ -216,15 +218,19 @@ def differ_as_arrays(one, other, tolerance, step=None):
         count = int(np.count_nonzero(one != other))
         return f"{count:,} of {one.size:,} values differ" if count else ""
     with np.errstate(invalid="ignore"):
-        apart = np.where((one == other) | (np.isnan(one) & np.isnan(other)), 0.0, one - other)
-    apart = np.abs(np.where(np.isnan(apart), np.inf, apart))
-    wrong = apart > tolerance
+        difference = np.where((one == other) | (np.isnan(one) & np.isnan(other)), 0.0, one - other)
+    difference = np.abs(np.where(np.isnan(difference), np.inf, difference))
+    wrong = difference > tolerance
     if step is not None and step > tolerance:
-        moved = (apart < 1.5 * step) & wrong
+        moved = (difference < 1.5 * step) & wrong
         if np.count_nonzero(moved) <= 3 + 2 * one.size * tolerance / step:
             wrong &= ~moved
     count = int(np.count_nonzero(wrong))
-    return f"{count:,} of {one.size:,} values differ, by at most {apart.max():.3g}" if count else ""
+    return (
+        f"{count:,} of {one.size:,} values differ, by at most {difference.max():.3g}"
+        if count
+        else ""
+    )
 
 
 def differ_as_rasters(one, other, given):
@@ -321,9 +327,9 @@ def differ_by_text(one, other, given):
         yield f"{len(texts[0])} and {len(texts[1])} numbers"
         return
     pairs = [(float(a), float(b)) for a, b in zip(*texts, strict=True)]
-    apart = [pair for pair in pairs if not is_close(*pair, given.relative)]
-    if apart:
-        yield f"{len(apart)} of {len(pairs)} numbers differ, the first {apart[0]}"
+    difference = [pair for pair in pairs if not is_close(*pair, given.relative)]
+    if difference:
+        yield f"{len(difference)} of {len(pairs)} numbers differ, the first {difference[0]}"
 
 
 def differ_as_pages(one, other, given):

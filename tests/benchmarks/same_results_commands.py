@@ -33,7 +33,7 @@ FREE = "{shared}/rendered_a_free"
 KNOWN = f"out --water 0.37 {OFFSET} --gnss {FREE}/gnss.csv --jobs 1"
 ADJUST = f"adjust {{shared}}/rendered_a/colmap {KNOWN}"  # 6,000 tie points, for 42,000 of the other
 CLOUD = "--cloud {inputs}/free.las --views {inputs}/free.vis"
-SICK = f"{FREE}/sparse --cloud {{inputs}}/free.las --water 0.37 {OFFSET}"
+FREE_MODEL = f"{FREE}/sparse --cloud {{inputs}}/free.las --water 0.37 {OFFSET}"
 PORT = (
     "correct {inputs}/port.las out.las --cameras {inputs}/port --sigma-waves 0"
     " --summary summary.json"
@@ -305,11 +305,15 @@ def table() -> dict[str, str]:
         " --summary summary.json"
     )
     signs = f"--gnss {FREE}/gnss.csv --gcps {FREE}/gcps.csv --summary summary.json"
-    commands["cameras.free"] = f"cameras {SICK} {signs} --reference {{shared}}/rendered_a/lidar.laz"
-    carried = f"correct {{inputs}}/free.las out.las --water 0.37 {OFFSET} --summary summary.json"
-    carried += f" --cameras {{adjust.ties/out}}/colmap --adjusted-from {FREE}/sparse"
+    commands["cameras.free"] = (
+        f"cameras {FREE_MODEL} {signs} --reference {{shared}}/rendered_a/lidar.laz"
+    )
+    transferred = (
+        f"correct {{inputs}}/free.las out.las --water 0.37 {OFFSET} --summary summary.json"
+    )
+    transferred += f" --cameras {{adjust.ties/out}}/colmap --adjusted-from {FREE}/sparse"
     views = "--views {inputs}/free.vis --method consistent"
-    add("carried", carried, {"snell": "", "views": views})
+    add("carried", transferred, {"snell": "", "views": views})
     tiles = "--cameras {samples}/scene/cameras.csv --water 0.37 --summary summary.json"
     commands["tiles.correct"] = f"correct {{inputs}}/tiles out {tiles}"
     commands["tiles.clean"] = "clean {tiles.correct/out} out --summary summary.json"

@@ -98,8 +98,8 @@ def correct(given):
     folder, points = given.folder, given.points or 5_000_000
     scene = folder / f"{given.cloud}_{points}_{given.cameras}"
     if not scene.exists():
-        made = {"points": points, "cameras": given.cameras, "cloud": given.cloud}
-        run([*PYTHON, MAKE.format(**made, folder=str(scene))])
+        scene_options = {"points": points, "cameras": given.cameras, "cloud": given.cloud}
+        run([*PYTHON, MAKE.format(**scene_options, folder=str(scene))])
     cloud, corrected = scene / "cloud.laz", folder / "corrected.laz"
     words = ["--cameras", scene / "cameras.csv", "--water", "0.37", *OVER]
     default = [*PCFIX, "correct", cloud, corrected, *words]

@@ -54,9 +54,9 @@ def _assert_nothing_lost(before: RawLas, after: RawLas, noise: np.ndarray) -> No
     assert after.scales == before.scales
     assert after.offsets == before.offsets
     records = [r for r in after.foreign() if r.kind != OURS]
-    kept = [r for r in records if r in before.foreign()]
-    assert kept == before.foreign()
-    assert {r.kind for r in records if r not in kept} <= {(b"LASF_Projection", 2112)}
+    foreign_records = [r for r in records if r in before.foreign()]
+    assert foreign_records == before.foreign()
+    assert {r.kind for r in records if r not in foreign_records} <= {(b"LASF_Projection", 2112)}
     assert after.extended == before.extended
     assert after.extra_bytes()[: len(before.extra_bytes())] == before.extra_bytes()
 
@@ -100,9 +100,9 @@ def test_record(tmp_path: Path) -> None:
     source = write_las(tmp_path / "in.las", s.xyz, crs=None)
     result = clean_file(source, tmp_path / "out.las", water=s.water_level_m)
     (record,) = [r for r in read_raw(tmp_path / "out.las").records if r.kind == OURS]
-    said = json.loads(record.data)
-    assert (said["settings"], said["reasons"]) == (result.settings, result.reasons)
-    assert (said["pcfix"], said["drop"]) == (pcfix.__version__, False)
+    recorded = json.loads(record.data)
+    assert (recorded["settings"], recorded["reasons"]) == (result.settings, result.reasons)
+    assert (recorded["pcfix"], recorded["drop"]) == (pcfix.__version__, False)
     assert len(result.not_run) == 1
     clean_file(tmp_path / "out.las", tmp_path / "twice.las", water=s.water_level_m)
     records = [r for r in read_raw(tmp_path / "twice.las").records if r.kind == OURS]
@@ -150,9 +150,9 @@ def test_command(tmp_path: Path) -> None:
     words = [str(source), str(tmp_path / "out.laz"), "--water", str(s.water_level_m)]
     done = run_pcfix("clean", *words, "--summary", tmp_path / "s.json")
     assert done.returncode == 0, done.stderr
-    said = json.loads((tmp_path / "s.json").read_text())
-    assert f"{said['noise']:,}" in done.stdout
-    assert said["settings"]["neighbours"] == 20
+    recorded = json.loads((tmp_path / "s.json").read_text())
+    assert f"{recorded['noise']:,}" in done.stdout
+    assert recorded["settings"]["neighbours"] == 20
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.laz", "out.laz", "s.json"]
 
 

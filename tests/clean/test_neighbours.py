@@ -27,8 +27,8 @@ def _clustered(n: int = 500) -> np.ndarray:
 
 def _pairs(xyz: np.ndarray, axes: int) -> np.ndarray:
     """The distance of every point from every other."""
-    apart = xyz[:, None, :axes] - xyz[None, :, :axes]
-    return np.sqrt((apart**2).sum(axis=-1))
+    difference = xyz[:, None, :axes] - xyz[None, :, :axes]
+    return np.sqrt((difference**2).sum(axis=-1))
 
 
 def test_neighbours_of_all_pairs() -> None:
@@ -40,8 +40,8 @@ def test_neighbours_of_all_pairs() -> None:
             near, found = Neighbours(cut, axes), np.empty(twin.shape)
             for piece in cut.pieces(100):
                 found[cut.row[piece]], place = near.nearest(cut.xyz[piece], K)
-                apart = cut.xyz[place][..., :axes] - cut.xyz[piece][:, None, :axes]
-                far = np.linalg.norm(apart, axis=2)
+                difference = cut.xyz[place][..., :axes] - cut.xyz[piece][:, None, :axes]
+                far = np.linalg.norm(difference, axis=2)
                 np.testing.assert_allclose(far, found[cut.row[piece]], rtol=1e-12)
             np.testing.assert_allclose(found, twin, rtol=1e-12)
 
@@ -73,8 +73,8 @@ OPEN3D = [
 def test_outliers_of_open3d(test: str, rules: dict, arguments: tuple) -> None:
     o3d, xyz = load_open3d(), spoilt_scene(FEW, OUTLIERS).xyz
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz))
-    _, kept = getattr(cloud, f"remove_{test}_outlier")(*arguments)
+    _, inliers = getattr(cloud, f"remove_{test}_outlier")(*arguments)
     settings = CleanRules(**rules, below=None, floating=None)
     found = reasons_of(xyz, rules=settings)
-    assert np.array_equal(np.flatnonzero(found == 0), np.asarray(kept))
-    assert len(kept) < len(xyz)
+    assert np.array_equal(np.flatnonzero(found == 0), np.asarray(inliers))
+    assert len(inliers) < len(xyz)

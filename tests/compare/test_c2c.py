@@ -16,7 +16,7 @@ from tests.compare.test_files import LIDAR, SCENE, lifted, plane, write_las
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
 
-WHOLE = {"max_gap": 1000.0}  # no point is too far outside the other cloud
+ALL_POINTS = {"max_gap": 1000.0}  # no point is too far outside the other cloud
 BANDS = [(0.6, 1.0), (3.0, 6.0)]
 """Those of which Skarlatos & Agrafiotis 2018 give the share, at Amathounta and at Agia Napa."""
 
@@ -42,7 +42,7 @@ def other(tmp_path_factory):
 @pytest.fixture(scope="module")
 def both(corrected, other):
     given = {"direction": "both", "share": BANDS, "also": {"Dietrich": other}}
-    return compare_clouds(corrected, LIDAR, sections=1, **given, **WHOLE)
+    return compare_clouds(corrected, LIDAR, sections=1, **given, **ALL_POINTS)
 
 
 def places(path):
@@ -73,11 +73,11 @@ def agrees(found, expected):
 def test_directions(both, corrected):
     las, lidar = laspy.read(corrected), places(LIDAR)
     now = np.asarray(las.xyz)
-    came = now - np.column_stack([las["ShiftX"], las["ShiftY"], las["ShiftZ"]])
+    apparent = now - np.column_stack([las["ShiftX"], las["ShiftY"], las["ShiftZ"]])
     agrees(both.c2c.after, far(now, lidar))
-    agrees(both.c2c.before, far(came, lidar))
+    agrees(both.c2c.before, far(apparent, lidar))
     agrees(both.c2c_from_reference.after, far(lidar, now))
-    agrees(both.c2c_from_reference.before, far(lidar, came))
+    agrees(both.c2c_from_reference.before, far(lidar, apparent))
     assert both.counts.reference_compared == len(lidar)
 
 
@@ -88,14 +88,16 @@ def test_further_cloud(both, other):
     agrees(one.c2c_from_reference, far(places(LIDAR), places(other)))
     (section,) = both.sections
     assert list(section.heights_m)[-2:] == ["reference", "Dietrich"]
-    alone = compare_clouds(other, LIDAR, section=[section.line]).sections[0]
-    np.testing.assert_array_equal(section.heights_m["Dietrich"], alone.heights_m["corrected"])
+    single = compare_clouds(other, LIDAR, section=[section.line]).sections[0]
+    np.testing.assert_array_equal(section.heights_m["Dietrich"], single.heights_m["corrected"])
 
 
 def test_submerged(corrected):
     lidar, las = places(LIDAR), laspy.read(corrected)
     given = {"submerged": True, "direction": "from-reference", "water": 0.37}
-    found = compare_clouds(corrected, LIDAR, also={"raw": SCENE / "cloud.laz"}, **given, **WHOLE)
+    found = compare_clouds(
+        corrected, LIDAR, also={"raw": SCENE / "cloud.laz"}, **given, **ALL_POINTS
+    )
     wet = lidar[lidar[:, 2] < 0.37]
     assert 0 < found.counts.reference_compared == len(wet) < len(lidar)
     bed = np.asarray(las.xyz)[np.asarray(las.z) < 0.37]
@@ -179,10 +181,10 @@ def test_command(tmp_path, both, corrected, other):
         "--out-dir", "out", folder=tmp_path,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")
-    said = json.loads((tmp_path / "out" / "compare.json").read_text())
+    written = json.loads((tmp_path / "out" / "compare.json").read_text())
     for name in ("c2c", "c2c_from_reference", "also"):
-        assert said[name] == json.loads(json.dumps(both.as_dict()[name]))
-    assert said["settings"]["also"] == [["Dietrich", str(other)]]
+        assert written[name] == json.loads(json.dumps(both.as_dict()[name]))
+    assert written["settings"]["also"] == [["Dietrich", str(other)]]
     assert (tmp_path / "c.png").read_bytes().startswith(b"\x89PNG")
     with (tmp_path / "out" / "section_01.csv").open() as stream:
         assert next(csv.reader(stream))[-1] == "Dietrich_m"

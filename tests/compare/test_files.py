@@ -84,12 +84,12 @@ def test_uncorrected_cloud(sample):
     assert plain.depth is None
     assert plain.vertical.before is None
     assert "water.missing" in [note.code for note in plain.notes]
-    told = compare_clouds(SCENE / "cloud.laz", LIDAR, water="0.37")
-    assert told.vertical.after.statistics == plain.vertical.after.statistics
+    with_water = compare_clouds(SCENE / "cloud.laz", LIDAR, water="0.37")
+    assert with_water.vertical.after.statistics == plain.vertical.after.statistics
     # the shift dimensions give the same apparent cloud, to rounding of the coordinates
-    assert told.depth.after.slope == pytest.approx(sample.depth.before.slope, abs=1e-4)
+    assert with_water.depth.after.slope == pytest.approx(sample.depth.before.slope, abs=1e-4)
     before = sample.vertical.before.statistics
-    assert told.vertical.after.statistics.rmse_m == pytest.approx(before.rmse_m, abs=1e-6)
+    assert with_water.vertical.after.statistics.rmse_m == pytest.approx(before.rmse_m, abs=1e-6)
 
 
 @pytest.mark.parametrize("lift", [0.03, -0.03])
@@ -125,7 +125,7 @@ def test_ignored_points(tmp_path):
     found = compare_clouds(
         write_las(tmp_path / "a.las", xyz, classes, withheld=withheld), reference
     )
-    assert (found.counts.cloud_left_out, found.counts.reference_left_out) == (500, 500)
+    assert (found.counts.cloud_excluded, found.counts.reference_excluded) == (500, 500)
     assert found.counts.compared == 2500
     assert found.vertical.after.statistics.max_m < 0.1
 
@@ -170,7 +170,7 @@ def test_raster(tmp_path):
     xyz = np.column_stack([u + EAST_M, v + NORTH_M, -2.0 - 0.05 * u + 0.02 * v + 0.25])
     found = compare_clouds(write_las(tmp_path / "a.las", xyz), tmp_path / "ref.tif")
     assert found.counts.reference == side * side
-    assert found.counts.reference_left_out == 25
+    assert found.counts.reference_excluded == 25
     # a wrong corner would give 0.035 m; coordinates are rounded to 1 mm
     assert found.vertical.after.statistics.mean_m == pytest.approx(0.25, abs=1e-4)
     assert found.vertical.after.statistics.max_m < 0.251
@@ -271,9 +271,9 @@ def test_output_files(tmp_path, corrected):
         "compare.json", "depth_bins.csv",
         "section_01.csv", "section_02.csv", "section_03.csv",
     ]  # fmt: skip
-    said = json.loads((out / "compare.json").read_text())
-    assert said == json.loads((tmp_path / "s.json").read_text()) == found.as_dict()
-    assert said["vertical"]["after"]["statistics"]["rmse_m"] < 0.05
+    written = json.loads((out / "compare.json").read_text())
+    assert written == json.loads((tmp_path / "s.json").read_text()) == found.as_dict()
+    assert written["vertical"]["after"]["statistics"]["rmse_m"] < 0.05
     with (out / "depth_bins.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == len(found.depth_bins)

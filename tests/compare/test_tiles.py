@@ -35,8 +35,10 @@ def bed(count, seed, lift_m=0.0):
 
 
 def least_distances(cloud, reference):
-    apart = cloud[:, None] - reference
-    return np.sqrt((apart**2)[..., 0] + (apart**2)[..., 1] + (apart**2)[..., 2]).min(axis=1)
+    difference = cloud[:, None] - reference
+    return np.sqrt((difference**2)[..., 0] + (difference**2)[..., 1] + (difference**2)[..., 2]).min(
+        axis=1
+    )
 
 
 def clustered(seed):
@@ -72,9 +74,9 @@ def figures(folder, name):
         direction="both", max_gap=2.0, overwrite=True,
     )  # fmt: skip
     found = {path.name: path.read_text() for path in out.iterdir()}
-    said = json.loads(found["compare.json"])
-    del said["seconds"]
-    return found | {"compare.json": said}
+    written = json.loads(found["compare.json"])
+    del written["seconds"]
+    return found | {"compare.json": written}
 
 
 @pytest.fixture(scope="module")

@@ -60,8 +60,8 @@ def whole(commands, tmp_path_factory):
     """What the commands leave when nothing happens, by the name of the file."""
     out = tmp_path_factory.mktemp("whole")
     for arguments, _ in commands.values():
-        _, said = (process := start(arguments, out)).communicate()
-        assert process.returncode == 0, said
+        _, printed = (process := start(arguments, out)).communicate()
+        assert process.returncode == 0, printed
     return {path.name: path.read_bytes() for path in out.iterdir()}
 
 
@@ -85,8 +85,8 @@ def killed(arguments, out, signal_sent, delay_s):
         time.sleep(0.001)
     time.sleep(delay_s)
     process.send_signal(signal_sent)
-    said = process.communicate()[1]
-    return process.returncode, said
+    printed = process.communicate()[1]
+    return process.returncode, printed
 
 
 @pytest.mark.parametrize(
@@ -100,10 +100,10 @@ def test_kills(seed, inputs, commands, whole, tmp_path):
         arguments, files = commands[name]
         signal_sent = random_moment.choice([signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
         delay_s = LONGEST_S * random_moment.uniform(0.0, 1.0) ** 2
-        code, said = killed(arguments, tmp_path, signal_sent, delay_s)
+        code, printed = killed(arguments, tmp_path, signal_sent, delay_s)
         case = f"kill {number}: {name}, {signal_sent.name} after {delay_s:.3f} s, code {code}"
         ended.append(code)
-        assert code in (0, -signal_sent, 128 + signal_sent), f"{case}: {said}"
+        assert code in (0, -signal_sent, 128 + signal_sent), f"{case}: {printed}"
         earlier, hidden = hidden, hidden_in(tmp_path)
         most = 2 if code == -signal.SIGKILL else 0  # a cloud and its summary
         assert len(hidden - earlier) <= most, case

@@ -139,18 +139,18 @@ def test_shape_and_waterline(files, tmp_path):
         files, out=tmp_path / "out", water=files.water + 0.25, free=("level", "tilt", "shape"),
         gcps=tmp_path / "marks.csv", lens=files.folder / "lens.csv",
     )  # fmt: skip
-    told = json.loads((tmp_path / "out" / "adjustment.json").read_text())
-    assert {row["name"] for row in told["control"]["points"]} == {
+    as_written = json.loads((tmp_path / "out" / "adjustment.json").read_text())
+    assert {row["name"] for row in as_written["control"]["points"]} == {
         row.name for row in found.control if row.role == "control"
     }
     for where in ("land", "water"):
-        fit = told["residuals"][where]
+        fit = as_written["residuals"][where]
         assert np.hypot(*fit["rms_xy_px"]) == pytest.approx(np.sqrt(2.0) * fit["rms_px"])
     words = correct_words(found, "model", tmp_path / "out", AdjustOptions(water=files.water))
     assert f"--water {tmp_path / 'out' / 'water.tif'}" in words
     bed, _ = home(files, tmp_path / "out" / "colmap", water=tmp_path / "out" / "water.tif")
     assert bed < 0.02
-    level = told["water"]["level"]
+    level = as_written["water"]["level"]
     assert abs(level["after"] - files.water) < 3.5 * level["sigma"] < 0.04
 
 
@@ -185,10 +185,10 @@ def test_written(files, written):
         np.testing.assert_allclose(*turns, atol=1e-7)
         assert read.lenses[0].focal == pytest.approx(found.cameras.lenses[0].focal, abs=1e-4)
         np.testing.assert_allclose(read.centres[order], found.cameras.centres, atol=1e-3)
-    told = json.loads((out / "adjustment.json").read_text("utf-8"))
-    assert told["sigma0"] == pytest.approx(found.sigma0)
+    as_written = json.loads((out / "adjustment.json").read_text("utf-8"))
+    assert as_written["sigma0"] == pytest.approx(found.sigma0)
     assert all(
-        told["residuals"][key]["rms_before_px"] > 2.0 * IMAGE_PX for key in ("land", "water")
+        as_written["residuals"][key]["rms_before_px"] > 2.0 * IMAGE_PX for key in ("land", "water")
     )
     page = (out / "report.html").read_text("utf-8")
     assert "<html" in page

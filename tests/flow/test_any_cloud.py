@@ -160,21 +160,21 @@ def test_listed_elsewhere(data, scene):
     wrong = [np.arange(rng.integers(not len(one), 3)) for one in right]
     both = [np.concatenate(pair) for pair in zip(wrong, right, strict=True)]
     apart = sum(map(len, wrong))
-    told, only = (
+    given_views, only = (
         pcfix.Views(np.cumsum([0, *map(len, rows)]), np.concatenate(rows), None, kind)
         for rows in (both, right)
     )
-    kept = [i for i in range(n) if len(right[i])]
-    assume(kept and apart)
+    rows_used = [i for i in range(n) if len(right[i])]
+    assume(rows_used and apart)
     given = of_a_point(method)
     with warned("views.outside"):
-        found = pcfix.correct_points(scene.xyz, cameras, scene.water, views=told, **given)
+        found = pcfix.correct_points(scene.xyz, cameras, scene.water, views=given_views, **given)
     expected = pcfix.correct_points(
-        scene.xyz[kept], cameras, scene.water, views=only.take(np.array(kept)), **given
+        scene.xyz[rows_used], cameras, scene.water, views=only.take(np.array(rows_used)), **given
     )
-    np.testing.assert_array_equal(found.xyz[kept], expected.xyz)
-    np.testing.assert_array_equal(found.ray_count[kept], expected.ray_count)
-    without = np.setdiff1d(np.flatnonzero(found.submerged), kept)
+    np.testing.assert_array_equal(found.xyz[rows_used], expected.xyz)
+    np.testing.assert_array_equal(found.ray_count[rows_used], expected.ray_count)
+    without = np.setdiff1d(np.flatnonzero(found.submerged), rows_used)
     assert (found.outcome[without] == pcfix.Outcome.NO_CAMERA).all()
 
 

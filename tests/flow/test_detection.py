@@ -144,8 +144,8 @@ def test_list_of_half(tmp_path):
         summary = pcfix.correct_file(path, tmp_path / f"{name}.las", views=views, **given)
         out[name] = laspy.read(tmp_path / f"{name}.las")
         assert summary.corrected > 0.95 * summary.submerged
-        said = " ".join(one["message"] for one in summary.warnings)
-        assert ("Points missing in the view list" in said) == (name == "half")
+        messages = " ".join(one["message"] for one in summary.warnings)
+        assert ("Points missing in the view list" in messages) == (name == "half")
     # within a twentieth of the spacing a point gets its neighbour's list
     near_m = cKDTree(scene.apparent_xyz[rows]).query(scene.apparent_xyz)[0]
     unlisted = near_m > 0.1

@@ -16,7 +16,7 @@ from tests.utils.crops import middle_of
 from tests.utils.shared import SCENE, needs
 
 TRUE, rendered = needs("rendered_a")
-BENT, bent = needs("rendered_a_free")
+ABSORBED, needs_absorbed = needs("rendered_a_free")
 OFFSET_M = (319900.0, 3842700.0, 0.0)
 LEVEL_M = 0.37
 
@@ -30,9 +30,9 @@ def warnings_of(source, output, **given):
     return [one for one in found if one.code == "poses.absorbed"], summary
 
 
-@bent
+@needs_absorbed
 def test_bent_poses(tmp_path):
-    model, cloud = BENT / "sparse", middle_of(BENT, tmp_path) / "cloud.las"
+    model, cloud = ABSORBED / "sparse", middle_of(ABSORBED, tmp_path) / "cloud.las"
     found, summary = warnings_of(
         cloud, tmp_path / "out.laz", cameras=model, cameras_offset=OFFSET_M, water=LEVEL_M
     )
@@ -57,12 +57,12 @@ def test_true_poses(tmp_path):
         assert warnings_of(cloud, tmp_path / "out.laz", overwrite=True, **given)[0] == []
 
 
-@bent
+@needs_absorbed
 @pytest.mark.filterwarnings("ignore:.*names no CRS")
 def test_every_sign():
     report = check_cameras(
-        BENT / "sparse", cloud=BENT / "cloud.las", water=LEVEL_M, cameras_offset=OFFSET_M,
-        gnss=BENT / "gnss.csv", gcps=BENT / "gcps.csv", reference=TRUE / "lidar.laz",
+        ABSORBED / "sparse", cloud=ABSORBED / "cloud.las", water=LEVEL_M, cameras_offset=OFFSET_M,
+        gnss=ABSORBED / "gnss.csv", gcps=ABSORBED / "gcps.csv", reference=TRUE / "lidar.laz",
     )  # fmt: skip
     signs = report.figures["refraction"]["signs"]
     assert {sign["name"] for sign in signs} == {
@@ -76,21 +76,24 @@ def test_every_sign():
     assert "--gcps" in text
 
 
-@bent
+@needs_absorbed
 def test_gnss_is_enough():
     report = check_cameras(
-        BENT / "cameras.xml", cloud=BENT / "cloud.las", water=LEVEL_M, gnss=BENT / "gnss.csv"
+        ABSORBED / "cameras.xml",
+        cloud=ABSORBED / "cloud.las",
+        water=LEVEL_M,
+        gnss=ABSORBED / "gnss.csv",
     )
     assert report.diagnosis.decided_by.name == "GNSS positions"
     assert report.diagnosis.absorbed is True
 
 
-@bent
+@needs_absorbed
 @pytest.mark.filterwarnings("ignore:.*names no CRS")
 def test_no_sign():
     report = check_cameras(
         TRUE / "colmap", cloud=TRUE / "cloud.las", water=LEVEL_M, cameras_offset=OFFSET_M,
-        gnss=BENT / "gnss.csv", gcps=BENT / "gcps.csv", reference=TRUE / "lidar.laz",
+        gnss=ABSORBED / "gnss.csv", gcps=ABSORBED / "gcps.csv", reference=TRUE / "lidar.laz",
     )  # fmt: skip
     assert report.diagnosis.absorbed is False
     assert not any(sign.speaks for sign in report.diagnosis.signs)

@@ -23,8 +23,8 @@ RIVER, river = needs("river")
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
-    made = pcfix.simulate_scene(3000, seed=3)
-    write_scene(made, folder, overwrite=False)
+    simulated = pcfix.simulate_scene(3000, seed=3)
+    write_scene(simulated, folder, overwrite=False)
     return folder
 
 

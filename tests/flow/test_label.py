@@ -78,9 +78,9 @@ def test_rest_kept(tmp_path, mask, point_format, suffix):
         np.testing.assert_array_equal(new[name], old[name], name)
     ours = [r for r in after.records if r.user_id.startswith(b"pcfix")]
     assert [r.record_id for r in ours] == [3]
-    said = json.loads(ours[0].data)
-    assert said["water_mask"] == str(mask)
-    assert said["water_plane"] == [WATER_M, 0.0, 0.0]
+    recorded = json.loads(ours[0].data)
+    assert recorded["water_mask"] == str(mask)
+    assert recorded["water_plane"] == [WATER_M, 0.0, 0.0]
 
 
 def test_corrected_and_restored(path, tmp_path):

@@ -41,8 +41,8 @@ def test_correction_agrees(plan, noise_px, most):
     found = pcfix.correct_points(
         scene.apparent_xyz, scene.cameras, 0.0, views=scene.views, **SIGMAS
     )
-    said = np.sqrt(np.mean(found.sigma_z_m[found.corrected] ** 2))
-    assert 0.99 < said / plan.depths[-1].sigma_m < most
+    predicted = np.sqrt(np.mean(found.sigma_z_m[found.corrected] ** 2))
+    assert 0.99 < predicted / plan.depths[-1].sigma_m < most
     # of 3,000 points with true level, index, poses: 1.3 % for one sigma
     off = (found.xyz - scene.true_xyz)[found.corrected, 2]
     expected = plan.depths[-1].parts_m["image"] if noise_px else 0.0

@@ -81,12 +81,12 @@ UNCHECKED = {
 
 
 def codes(found):
-    return [doubt.code for doubt in found.doubts]
+    return [problem.code for problem in found.problems]
 
 
 def test_good_block(scene):
     found = plausible(scene.cameras, scene.xyz)
-    assert not found.doubts
+    assert not found.problems
     assert (len(found.fits), len(found.unchecked)) == (2, 2)
     bare = plausible(replace(scene.cameras, rotations=None, lenses=None), scene.xyz)
     assert not bare.fits
@@ -101,7 +101,7 @@ def test_faults(scene, fault):
     if fault in DOUBTED:
         assert DOUBTED[fault] in codes(found)
     else:
-        assert not found.doubts
+        assert not found.problems
         assert UNCHECKED[fault] in ", ".join(found.unchecked)
 
 
@@ -119,8 +119,8 @@ def test_residuals_of_one_image(with_ties):
     turns = with_ties.cameras.rotations.copy()
     turns[3] = turns[3] @ Rotation.from_euler("x", 10, degrees=True).as_matrix()
     cameras = replace(with_ties.cameras, rotations=turns)
-    (doubt,) = plausible(cameras, with_ties.xyz, with_ties.ties).doubts
-    assert (doubt.code, doubt.values["image"]) == ("cameras.residuals", cameras.labels[3])
+    (problem,) = plausible(cameras, with_ties.xyz, with_ties.ties).problems
+    assert (problem.code, problem.values["image"]) == ("cameras.residuals", cameras.labels[3])
 
 
 @rendered
@@ -128,7 +128,7 @@ def test_heights_of_tie_points(with_ties):
     """Cameras and tie points moved alike: an offset, or another datum."""
     ties = replace(with_ties.ties, xyz=with_ties.ties.xyz + np.array([0.0, 0.0, 47.0]))
     found = plausible(moved(with_ties, 0, 0, 47), with_ties.xyz, ties)
-    (off_m,) = (one.values["off_m"] for one in found.doubts if one.code == "cameras.height")
+    (off_m,) = (one.values["off_m"] for one in found.problems if one.code == "cameras.height")
     assert off_m == pytest.approx(47.0, abs=0.05)
 
 
@@ -144,9 +144,9 @@ def sample_of(path, above_m):
 
 @pytest.mark.parametrize(("off_m", "found_m"), [(0.0, []), (3.0, [-3.03])])
 def test_shoreline_of_the_cloud(off_m, found_m):
-    doubts = sample_of(SCENE / "cloud.laz", off_m).level_doubts()
-    assert [doubt.code for doubt in doubts] == ["water.shoreline_level"] * len(found_m)
-    assert [doubt.values["off_m"] for doubt in doubts] == pytest.approx(found_m, abs=0.005)
+    problems = sample_of(SCENE / "cloud.laz", off_m).level_notes()
+    assert [problem.code for problem in problems] == ["water.shoreline_level"] * len(found_m)
+    assert [problem.values["off_m"] for problem in problems] == pytest.approx(found_m, abs=0.005)
 
 
 REAL = {
@@ -175,8 +175,8 @@ def test_real_blocks(name):
     sample = sample_of(RENDERED.parent / cloud, above_m)
     ties = quick_ties(inputs, view.crs)
     block = inputs.block(view.crs)[0]
-    found = plausible(block, sample.rows[:, :3], ties, sample.level_doubts(), file=path)
-    assert not found.doubts
+    found = plausible(block, sample.rows[:, :3], ties, sample.level_notes(), file=path)
+    assert not found.problems
     assert found.fits[0].startswith("100 % of the points")
 
 
@@ -185,8 +185,8 @@ def test_gnss_positions():
     cameras = Inputs(cameras=RENDERED / "cameras.xml", water=LEVEL_M).block("EPSG:32636")[0]
     xyz = read_xyz(RENDERED / "cloud.las")[::50]
     assert "positions 1.6 m in plan from their GNSS" in plausible(cameras, xyz).fits
-    beside = replace(cameras, centres=cameras.centres + np.array([40.0, 0.0, 0.0]))
-    assert codes(plausible(beside, xyz)) == ["cameras.no_overlap", "cameras.gnss"]
+    shifted = replace(cameras, centres=cameras.centres + np.array([40.0, 0.0, 0.0]))
+    assert codes(plausible(shifted, xyz)) == ["cameras.no_overlap", "cameras.gnss"]
 
 
 @pytest.mark.parametrize("drone_m", [78.0, 33.0, 130.0])

@@ -75,8 +75,8 @@ class SlowTwin:
 
         def miss(flat):
             xyz = np.repeat(flat.reshape(-1, 3), 3, axis=0)
-            bent = piercing_points(xyz, cameras.centres[self.camera], LEVEL_M + level, N + n)
-            image, _ = project(bent, cameras, self.camera, cameras.lenses[0])
+            piercing = piercing_points(xyz, cameras.centres[self.camera], LEVEL_M + level, N + n)
+            image, _ = project(piercing, cameras, self.camera, cameras.lenses[0])
             return (self.straight(image, cameras, met) - met).ravel()
 
         return fsolve(miss, near.ravel(), xtol=1e-10).reshape(-1, 3)
@@ -153,26 +153,26 @@ def corrected(files, **more):
     cloud, cameras = files
     out = cloud.with_name("c.las")
     given = {"method": "snell", "max_angle": None, **more}
-    told = pcfix.correct_file(
+    summary = pcfix.correct_file(
         cloud, out, cameras=cameras, water=WATER_M, overwrite=True, sigma_level=0.0, **given
     )
-    return told, laspy.read(out)
+    return summary, laspy.read(out)
 
 
 def test_file(files):
     before, bare = corrected(files)
     assert "poses_m" not in before.uncertainty
     write_members(files[1].parent, members_of(pcfix.read_cameras(files[1]), 0.1))
-    told, las = corrected(files)
+    summary, las = corrected(files)
     moved = np.array(bare.SigmaZ) > 0.0
     # a block that stands higher by 0.1 m over fixed water has its bed higher by about that
-    assert told.uncertainty["poses_m"] == pytest.approx(0.1, rel=0.5)
+    assert summary.uncertainty["poses_m"] == pytest.approx(0.1, rel=0.5)
     more = np.sqrt(np.array(las.SigmaZ)[moved] ** 2 - np.array(bare.SigmaZ)[moved] ** 2)
-    assert np.median(more) == pytest.approx(told.uncertainty["poses_m"], rel=0.1)
+    assert np.median(more) == pytest.approx(summary.uncertainty["poses_m"], rel=0.1)
     assert not np.array(las.SigmaZ)[~moved].any()
     np.testing.assert_array_equal(las.xyz, bare.xyz)
     since, _ = corrected(files, adjusted_from=files[1])
-    assert since.uncertainty["poses_m"] == pytest.approx(told.uncertainty["poses_m"], rel=0.01)
+    assert since.uncertainty["poses_m"] == pytest.approx(summary.uncertainty["poses_m"], rel=0.01)
 
 
 def test_other_ensemble(files):
@@ -181,14 +181,16 @@ def test_other_ensemble(files):
     lenses = tuple(replace(lens, focal=1.001 * lens.focal) for lens in cameras.lenses)
     where = files[1].parent
     write_members(where, members_of(replace(cameras, lenses=lenses), 0.1))
-    told, las = corrected(files)
+    summary, las = corrected(files)
     assert any(
-        "ensemble.npz: belongs to other cameras" in note["message"] for note in told.warnings
+        "ensemble.npz: belongs to other cameras" in note["message"] for note in summary.warnings
     )
     np.testing.assert_array_equal(las.SigmaZ, bare.SigmaZ)
     (where / ENSEMBLE).write_bytes(b"nothing of use")
-    told, las = corrected(files)
-    assert any("is not an ensemble of an adjustment" in note["message"] for note in told.warnings)
+    summary, las = corrected(files)
+    assert any(
+        "is not an ensemble of an adjustment" in note["message"] for note in summary.warnings
+    )
     np.testing.assert_array_equal(las.SigmaZ, bare.SigmaZ)
-    told, _ = corrected(files, dimensions="minimal")  # then nobody asks for it
-    assert not any("ensemble" in note["message"] for note in told.warnings)
+    summary, _ = corrected(files, dimensions="minimal")  # then nobody asks for it
+    assert not any("ensemble" in note["message"] for note in summary.warnings)

@@ -115,11 +115,11 @@ def test_heights(tmp_path):
 def test_noise_and_land(tmp_path):
     xy, xyz = places(), cloud()
     path = table(tmp_path, xy, true_at(xy))
-    alone = fit_check_depths(path, parts(xyz))
+    single = fit_check_depths(path, parts(xyz))
     low, land = xyz - [0, 0, 9.0], xyz - [0, 0, -30.0]
     classes = np.repeat([1, 7, 1], len(xyz)).astype(np.uint8)
     mixed = fit_check_depths(path, parts(np.vstack([xyz, low, land]), classes=classes))
-    assert mixed == alone
+    assert mixed == single
 
 
 def test_nearest_points():

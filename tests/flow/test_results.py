@@ -52,12 +52,12 @@ def test_notebook(names):
 
 
 def test_opened(result):
-    said = []
+    printed = []
     again = pcfix.run(
         "scene/cloud.laz", "out", cameras="scene/cameras.csv", water="0.37",
-        reference="scene/lidar.laz", say=said.append,
+        reference="scene/lidar.laz", say=printed.append,
     )  # fmt: skip
-    assert said and all("already done" in line for line in said[1:])
+    assert printed and all("already done" in line for line in printed[1:])
     assert pcfix.open_run("out") == again == result
 
 

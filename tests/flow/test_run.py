@@ -63,9 +63,9 @@ def copied(finished, tmp_path):
 
 
 def test_files_of_steps(finished):
-    folder, said = finished
+    folder, printed = finished
     assert sorted(path.name for path in folder.iterdir()) == RESULTS
-    assert [line.split()[0] for line in said.splitlines()] == [
+    assert [line.split()[0] for line in printed.splitlines()] == [
         "adjust", "correct", "clean", "dsm", "compare", "map", "report",
     ]  # fmt: skip
 
@@ -330,9 +330,9 @@ def test_tiles(finished, tiled, tmp_path):
         before = finished_in(out / "corrected")
         found = pcfix.run(tiled / "cloud", out, **asked)
         assert before.items() < finished_in(out / "corrected").items()
-        said = []
-        pcfix.run(tiled / "cloud", out, say=said.append, **asked)
-    assert [line.split()[1:3] for line in said[1:]] == [["already", "done:"]] * 6
+        printed = []
+        pcfix.run(tiled / "cloud", out, say=printed.append, **asked)
+    assert [line.split()[1:3] for line in printed[1:]] == [["already", "done:"]] * 6
     for name in ("corrected", "cleaned"):
         whole = laspy.read(finished[0] / f"{name}.laz").points.array
         np.testing.assert_array_equal(records(*sorted((out / name).glob("*.laz"))), whole)
@@ -352,7 +352,7 @@ def test_tiles(finished, tiled, tmp_path):
 
 @pytest.mark.usefixtures("undrawn")
 def test_without_reference_and_vectors(tmp_path, monkeypatch):
-    said: list[str] = []
+    printed: list[str] = []
 
     def lacking():
         raise InputError("library.missing", "Vector files need pyogrio.")
@@ -360,9 +360,9 @@ def test_without_reference_and_vectors(tmp_path, monkeypatch):
     monkeypatch.setattr(vectors, "load_pyogrio", lacking)
     found = pcfix.run(
         SCENE / "cloud.laz", tmp_path / "out", cameras=SCENE / "cameras.csv", water=0.37,
-        say=said.append,
+        say=printed.append,
     )  # fmt: skip
-    assert sum(line.startswith("map       not written: ") for line in said) == 1
+    assert sum(line.startswith("map       not written: ") for line in printed) == 1
     text = found.report.read_text()
     assert "Cross-section" not in text
     assert "<td>Exclusive</td>" not in text

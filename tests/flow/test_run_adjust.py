@@ -50,9 +50,9 @@ class Scene(NamedTuple):
     def run(self, folder, **options):
         return run(self.folder / "cloud.las", folder, cameras=self.model, water="0", **options)
 
-    def adjusted(self, folder, said):
+    def adjusted(self, folder, printed):
         surveys = {"gnss": self.gnss, "reference": self.folder / "truth.las"}
-        return self.run(folder, adjust="yes", say=said.append, **surveys)
+        return self.run(folder, adjust="yes", say=printed.append, **surveys)
 
 
 @pytest.fixture(scope="module")
@@ -72,9 +72,9 @@ def errors_gsd(path, truth):
 
 @pytest.fixture(scope="module")
 def finished(scene, tmp_path_factory):
-    folder, said = tmp_path_factory.mktemp("run") / "out", []
-    scene.adjusted(folder, said)
-    return folder, said
+    folder, printed = tmp_path_factory.mktemp("run") / "out", []
+    scene.adjusted(folder, printed)
+    return folder, printed
 
 
 def test_cloud_comes_home(scene, finished):
@@ -89,11 +89,11 @@ def test_cloud_comes_home(scene, finished):
 
 
 def test_first_step(finished):
-    folder, said = finished
-    assert [line.split()[0] for line in said if not line.startswith(" ")] == STEPS
-    assert said[0] == f"adjust    done: {folder / 'adjusted' / 'report.html'}"
-    assert "focal length" in said[1]
-    assert "under water" in said[1]
+    folder, printed = finished
+    assert [line.split()[0] for line in printed if not line.startswith(" ")] == STEPS
+    assert printed[0] == f"adjust    done: {folder / 'adjusted' / 'report.html'}"
+    assert "focal length" in printed[1]
+    assert "under water" in printed[1]
     record = json.loads((folder / "run.json").read_text())
     assert record["steps"]["adjust"]["result"]["model"] == "colmap"
     assert record["options"]["cameras"].endswith("model")
@@ -101,9 +101,9 @@ def test_first_step(finished):
 
 def test_resumed(scene, finished):
     folder, _ = finished
-    said = []
-    scene.adjusted(folder, said)
-    assert sum("already done" in line for line in said) == len(STEPS)
+    printed = []
+    scene.adjusted(folder, printed)
+    assert sum("already done" in line for line in printed) == len(STEPS)
 
 
 def test_auto(scene, tmp_path, monkeypatch):
@@ -115,9 +115,9 @@ def test_auto(scene, tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("undrawn")
 def test_auto_without_datum(scene, tmp_path):
-    said = []
+    printed = []
     with warned("poses.absorbed"):
-        page = scene.run(tmp_path / "out", say=said.append).report
+        page = scene.run(tmp_path / "out", say=printed.append).report
     with warned("poses.absorbed"):
         correct_file(
             scene.folder / "cloud.las", tmp_path / "plain.laz", cameras=scene.folder / "model",
@@ -126,7 +126,7 @@ def test_auto_without_datum(scene, tmp_path):
     one, other = (laspy.read(tmp_path / name) for name in ("out/corrected.laz", "plain.laz"))
     np.testing.assert_array_equal(one.points.array, other.points.array)
     assert not (tmp_path / "out" / "adjusted").exists()
-    lines = [line for line in said if line.startswith("adjust")]
+    lines = [line for line in printed if line.startswith("adjust")]
     assert len(lines) == 1
     assert lines[0].startswith("adjust    skipped: the camera file has no GNSS positions")
     assert "not adjusted: the camera file has no GNSS positions" in page.read_text()

@@ -63,8 +63,8 @@ snell = partial(pcfix.correct_points, **SNELL)
 
 def correct(cloud, **more):
     output = cloud.with_name("out.las")
-    told = pcfix.correct_file(cloud, output, water=WATER_M, overwrite=True, **SNELL, **more)
-    return told, laspy.read(cloud), laspy.read(output)
+    summary = pcfix.correct_file(cloud, output, water=WATER_M, overwrite=True, **SNELL, **more)
+    return summary, laspy.read(cloud), laspy.read(output)
 
 
 def shift_of(las):
@@ -72,51 +72,53 @@ def shift_of(las):
 
 
 def test_same_cameras(cloud, old):
-    told, _, carried = correct(cloud, cameras=old, adjusted_from=old)
+    summary, _, transferred = correct(cloud, cameras=old, adjusted_from=old)
     _, before, plain = correct(cloud, cameras=old)
     # the last step of the intersection may be 1e-6 m: a thousandth of one of the file's
-    assert np.abs(shift_of(carried) - shift_of(plain)).max() <= 1
+    assert np.abs(shift_of(transferred) - shift_of(plain)).max() <= 1
     land = np.array(before.z) > WATER_M + 0.01
     assert land.sum() > 900
-    assert not shift_of(carried)[land].any()
-    assert told.transfer["shift_m"]["rms"] == 0.0
-    seen = told.transfer["not_transferred"]
-    assert told.transfer["points"] + seen + sum(told.uncorrected.values()) == len(before)
+    assert not shift_of(transferred)[land].any()
+    assert summary.transfer["shift_m"]["rms"] == 0.0
+    seen = summary.transfer["not_transferred"]
+    assert summary.transfer["points"] + seen + sum(summary.uncorrected.values()) == len(before)
 
 
 def test_land_and_bed(cloud, old):
     new = adjusted(old)
-    told, before, after = correct(cloud, cameras=new, adjusted_from=old)
-    came = np.array(before.xyz)
-    expected = snell(similar(came), new, WATER_M)
+    summary, before, after = correct(cloud, cameras=new, adjusted_from=old)
+    apparent = np.array(before.xyz)
+    expected = snell(similar(apparent), new, WATER_M)
     stuck = np.array(after.RayCount) == 0
     land = expected.outcome == Outcome.LAND
     # what is under water is decided where the points are taken to
-    sank = land != (came[:, 2] > WATER_M)
+    sank = land != (apparent[:, 2] > WATER_M)
     assert sank.sum() > 30
     went = np.array(after.xyz) - expected.xyz
-    carried = (land & shift_of(after).any(axis=1)) | ~stuck
-    assert carried.sum() > 500  # of 2000: the frames leave gaps
+    transferred = (land & shift_of(after).any(axis=1)) | ~stuck
+    assert transferred.sum() > 500  # of 2000: the frames leave gaps
     # half a step of the file
-    assert (np.abs(went[carried]) <= 0.5 * np.array(SCALES) + 2e-6).all()
+    assert (np.abs(went[transferred]) <= 0.5 * np.array(SCALES) + 2e-6).all()
     assert (np.array(after.classification)[~stuck] == 40).all()
     assert np.array_equal(
         np.array(after.classification)[land], np.array(before.classification)[land]
     )
     assert not np.array(after.RayCount)[land].any()
-    assert not np.array(after.SourceClass)[land & carried].any()
-    assert told.transfer["land"] == (land & carried).sum()
-    way = np.linalg.norm(similar(came) - came, axis=1)[carried]
-    assert told.transfer["points"] == carried.sum()
-    assert told.transfer["shift_m"]["rms"] == pytest.approx(np.sqrt((way**2).mean()), abs=1e-4)
-    assert f"({told.transfer['land']:,} on land)" in text_of("correct", told)
+    assert not np.array(after.SourceClass)[land & transferred].any()
+    assert summary.transfer["land"] == (land & transferred).sum()
+    distance = np.linalg.norm(similar(apparent) - apparent, axis=1)[transferred]
+    assert summary.transfer["points"] == transferred.sum()
+    assert summary.transfer["shift_m"]["rms"] == pytest.approx(
+        np.sqrt((distance**2).mean()), abs=1e-4
+    )
+    assert f"({summary.transfer['land']:,} on land)" in text_of("correct", summary)
 
 
 def test_unseen_points(cloud, old):
-    told, before, after = correct(cloud, cameras=adjusted(old), adjusted_from=old)
+    summary, before, after = correct(cloud, cameras=adjusted(old), adjusted_from=old)
     result = snell(before.xyz, adjusted(old), WATER_M, adjusted_from=old)
     behind = result.outcome == Outcome.NOT_TRANSFERRED
-    assert told.transfer["not_transferred"] == behind.sum() > 10
+    assert summary.transfer["not_transferred"] == behind.sum() > 10
     assert not shift_of(after)[behind].any()
     assert np.array(after.withheld)[behind].all()
     assert np.array_equal(
@@ -193,8 +195,8 @@ def test_other_block(cloud, old, change, code):
 
 
 @pytest.mark.parametrize("local", ["old", "new", "both", "neither"])
-@pytest.mark.parametrize("said", [False, True])
-def test_offset(tmp_path, old, local, said):
+@pytest.mark.parametrize("is_stated", [False, True])
+def test_offset(tmp_path, old, local, is_stated):
     offset = np.array([EAST_M, NORTH_M, 0.0])
     (tmp_path / "sensor.csv").write_text("focal,sensor_x,sensor_y\n24,24,9.6\n")
     for name, moved in (("old", 0.0), ("new", 0.5)):
@@ -202,7 +204,7 @@ def test_offset(tmp_path, old, local, said):
         table = cameras_csv(
             tmp_path / f"{name}.csv", replace(old, centres=old.centres - away + moved), angles=True
         )
-        if said and local not in (name, "both"):
+        if is_stated and local not in (name, "both"):
             table.write_text("# CoordinateSystem: EPSG:32633\n" + table.read_text())
     inputs = Inputs(
         cameras=tmp_path / "new.csv", water=WATER_M, adjusted_from=tmp_path / "old.csv",
@@ -221,17 +223,17 @@ def test_offset(tmp_path, old, local, said):
 @pytest.mark.parametrize("views", mostly_nightly([None, "dense.vis"], "dense.vis"))
 def test_rendered_block(tmp_path, views):
     """With true poses; without the transfer land is 19 GSD (of 5 cm) too low, the bed 27 off."""
-    told = pcfix.correct_file(
+    summary = pcfix.correct_file(
         FREE / "cloud.las", tmp_path / "out.las", cameras=TRUE / "colmap", water=0.37,
         adjusted_from=FREE / "sparse", cameras_offset=tuple(np.loadtxt(FREE / "offset.txt")),
         views=None if views is None else FREE / views,
     )  # fmt: skip
     las = laspy.read(tmp_path / "out.las")
     bed, land = errors_gsd(las)
-    assert told.transfer["points"] == told.points
+    assert summary.transfer["points"] == summary.points
     # the noise of the matcher: with the true cameras from the start it leaves as much
     assert np.sqrt((land**2).mean()) < 0.7
     assert np.sqrt((bed**2).mean()) < 0.95
-    assert told.transfer["shift_m"]["mean_z"] > 1.0
+    assert summary.transfer["shift_m"]["mean_z"] > 1.0
     pcfix.restore_file(tmp_path / "out.las", tmp_path / "back.las")
     assert (tmp_path / "back.las").read_bytes() == (FREE / "cloud.las").read_bytes()

@@ -111,7 +111,7 @@ def test_water_elsewhere(tmp_path, path, name):
         (tmp_path / name).write_text(FAR[name])
     with refused("water.no_overlap") as caught:
         pcfix.label_file(path, tmp_path / "b.las", water=tmp_path / name)
-    assert caught.value.values["apart_m"] == pytest.approx(np.max([EAST_M, NORTH_M]), rel=2e-3)
+    assert caught.value.values["away_m"] == pytest.approx(np.max([EAST_M, NORTH_M]), rel=2e-3)
 
 
 def test_rough_water(tmp_path):

@@ -127,8 +127,8 @@ def test_cameras_that_do_not_fit():
 @pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
 @pytest.mark.parametrize("name", ["odm/hectorsosa", "metashape/uclm_sorolla/markers.xml"])
 def test_camera_files(name):
-    kept = read_cameras(SAMPLES / name)
-    found = read_gnss(SAMPLES / name, replace(kept, gnss=None)).gnss
-    assert found.xyz.tolist() == kept.gnss.xyz.tolist()
-    assert found.sigma_m == pytest.approx(kept.gnss.sigma_m, nan_ok=True)
-    assert found.crs == kept.gnss.crs
+    stored = read_cameras(SAMPLES / name)
+    found = read_gnss(SAMPLES / name, replace(stored, gnss=None)).gnss
+    assert found.xyz.tolist() == stored.gnss.xyz.tolist()
+    assert found.sigma_m == pytest.approx(stored.gnss.sigma_m, nan_ok=True)
+    assert found.crs == stored.gnss.crs

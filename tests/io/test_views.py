@@ -88,7 +88,7 @@ def rows_of(views):
 
 def given(match, xyz, chunk=150):
     """Return the cameras of each point of a cloud in chunks, their weights, and the counts."""
-    match = match.settled(xyz[:chunk])
+    match = match.with_image_order(xyz[:chunk])
     found = [match.views_of(xyz[i : i + chunk], i) for i in range(0, len(xyz), chunk)]
     parts, report = [views for views, _ in found], reduce(operator.add, [one for _, one in found])
     weights = None if parts[0].weight is None else np.concatenate([one.weight for one in parts])
@@ -322,7 +322,7 @@ def vertex(x, image, *weights):
     return struct.pack(f"<3fBiB{len(weights)}f", 0, 0, x, 1, image, len(weights), *weights)
 
 
-WHOLE = HEAD + vertex(0, 0, 0.5)
+COMPLETE = HEAD + vertex(0, 0, 0.5)
 BAD = [
     (b"", "views.damaged"),
     (struct.pack("<Q", 2**60) + b"\0" * 8, "views.damaged"),  # too many points
@@ -337,11 +337,11 @@ BAD = [
     (START + LISTED.replace(b"uchar", b"float") + b"end_header\n", "ply.header"),
     (START + LISTED + b"end_header\n\1\0\0\0\0", "views.no_positions"),
     (START + b"property float x\nend_header\n\0\0\0\0", "views.no_lists"),
-    (WHOLE, "ply.cut_short"),
-    (WHOLE + vertex(1, 1, 0.5)[:-1], "ply.cut_short"),
-    (WHOLE + vertex(1, -1, 0.5), "views.image_number"),
-    (WHOLE + vertex(np.nan, 1, 0.5), "views.not_finite"),
-    (WHOLE + vertex(1, 1, 0.5, 0.5), "views.weights"),
+    (COMPLETE, "ply.cut_short"),
+    (COMPLETE + vertex(1, 1, 0.5)[:-1], "ply.cut_short"),
+    (COMPLETE + vertex(1, -1, 0.5), "views.image_number"),
+    (COMPLETE + vertex(np.nan, 1, 0.5), "views.not_finite"),
+    (COMPLETE + vertex(1, 1, 0.5, 0.5), "views.weights"),
 ]
 
 

@@ -237,9 +237,9 @@ def test_folds_and_walls(tmp_path):
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
-    made = pcfix.simulate_scene(2000, seed=3)
-    write_scene(made, folder, overwrite=False)
-    return folder, made
+    simulated = pcfix.simulate_scene(2000, seed=3)
+    write_scene(simulated, folder, overwrite=False)
+    return folder, simulated
 
 
 def corrected(scene, output, water, **more):
@@ -249,12 +249,14 @@ def corrected(scene, output, water, **more):
     )
 
 
-def level_raster(path, made, cover, level=None):
+def level_raster(path, simulated, cover, level=None):
     """Write the level of a scene over part of its length, west of the rest."""
-    west, south = made.true_xyz[:, :2].min(axis=0) - 20.0
-    east, north = made.true_xyz[:, :2].max(axis=0) + 20.0
-    heights = np.full((int(north - south), int((east - west) * cover)), level or made.water_level_m)
-    return write(path, heights, from_origin(west, north, 1.0, 1.0), f"EPSG:{made.epsg}")
+    west, south = simulated.true_xyz[:, :2].min(axis=0) - 20.0
+    east, north = simulated.true_xyz[:, :2].max(axis=0) + 20.0
+    heights = np.full(
+        (int(north - south), int((east - west) * cover)), level or simulated.water_level_m
+    )
+    return write(path, heights, from_origin(west, north, 1.0, 1.0), f"EPSG:{simulated.epsg}")
 
 
 def test_raster_of_a_level(scene, tmp_path):

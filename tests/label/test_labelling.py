@@ -72,8 +72,8 @@ def test_connected():
     assert (plain[pit] == 40).all()
     assert (found[x > 66.0] != 40).all()
     np.testing.assert_array_equal(found[x < 50.0], plain[x < 50.0])
-    apart = labelling.report()["separate"]
-    assert apart["points"] == (plain == 40).sum() - (found == 40).sum()
+    separate = labelling.report()["separate"]
+    assert separate["points"] == (plain == 40).sum() - (found == 40).sum()
 
     channel = (np.abs(xyz[:, 1] - NORTH - 20.0) < 1.0) & (x > 40) & (x < 82)
     xyz[channel, 2] = WATER_M - 0.3
@@ -98,9 +98,9 @@ def test_respect_classes():
     classes = np.random.default_rng(0).choice([0, 2, 5, 40, 41], 20_000).astype(np.uint8)
     wet = xyz[:, 2] < WATER_M
     found, labelling = labelled(part_of(xyz, classes), respect_classes=(5, 2, 2))
-    kept = np.isin(classes, (2, 5))
-    np.testing.assert_array_equal(found, np.where(wet & ~kept, 40, classes))
-    assert labelling.report()["respected"] == (wet & kept).sum()
+    respected = np.isin(classes, (2, 5))
+    np.testing.assert_array_equal(found, np.where(wet & ~respected, 40, classes))
+    assert labelling.report()["respected"] == (wet & respected).sum()
     with refused("option.respect_classes", points=int(wet.sum())):
         labelled(part_of(xyz, classes), respect_classes=(0, 2, 5, 40, 41))[1].check("cloud")
 

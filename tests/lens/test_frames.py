@@ -115,11 +115,11 @@ def test_different_lenses(points):
     mixed = pcfix.Cameras(mixed.labels, mixed.centres, mixed.rotations, lenses[:8])
     frames = frames_of(mixed)
     assert frames.row.tolist() == [0, 1, 2, 3, NOT_DISTORTED, 0, 1, 2]
-    alone = [
+    single = [
         pcfix.Cameras(("a",), mixed.centres[c : c + 1], mixed.rotations[c : c + 1], (lenses[c],))
         for c in range(8)
     ]
-    for c, camera in enumerate(alone):
+    for c, camera in enumerate(single):
         by_itself = frames_of(camera)
         for point in points[:100]:
             e = mixed.centres[c] - point
@@ -138,11 +138,11 @@ def test_without_lens():
 
 def test_views_beside_frames():
     cameras = block(LENSES["barrel"], k=2)
-    beside, away = np.array([[100.0, 87.5, -2.0]]), np.array([[400.0, 350.0, -2.0]])
-    for point in (beside, away):
+    near, away = np.array([[100.0, 87.5, -2.0]]), np.array([[400.0, 350.0, -2.0]])
+    for point in (near, away):
         assert snell(point, cameras, 0.0).outcome[0] == pcfix.Outcome.NO_CAMERA
     views = pcfix.Views(np.array([0, 2]), np.array([0, 1]))
-    assert snell(beside, cameras, 0.0, views=views).ray_count[0] == 2
+    assert snell(near, cameras, 0.0, views=views).ray_count[0] == 2
     with pytest.warns(pcfix.PcfixWarning):
         found = snell(away, cameras, 0.0, views=views)
     assert found.outcome[0] == pcfix.Outcome.NO_CAMERA

@@ -12,7 +12,7 @@ import pcfix
 from pcfix.flow.photos import map_photos
 from pcfix.io.water import read_water_raster
 from pcfix.model import Lens
-from pcfix.photos.calm import corners_in, laid, register
+from pcfix.photos.calm import corners_in, register, warped
 from pcfix.photos.mapping import Photo
 from pcfix.photos.waves import View, bed_places, slopes_of
 from pcfix.water.surface import surface_above
@@ -81,21 +81,23 @@ def test_registration():
     rng = np.random.default_rng(2)
     noise = cv2.GaussianBlur(rng.uniform(0.0, 255.0, (300, 400)).astype(np.float32), (0, 0), 2.0)
     image = cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
-    shots, ways = [], []
+    shots, homographies = [], []
     for number in range(8):
         turn = 0.01 * number
-        way = np.array([[1.0, -turn, 3.0 * number], [turn, 1.0, -2.0 * number], [1e-5, 0.0, 1.0]])
+        homography = np.array(
+            [[1.0, -turn, 3.0 * number], [turn, 1.0, -2.0 * number], [1e-5, 0.0, 1.0]]
+        )
         moved = cv2.GaussianBlur(rng.normal(0.0, 150.0, (300, 400, 2)), (0, 0), 20.0)
         moved[:, :200] = 0.0
         here = np.stack(np.meshgrid(np.arange(400), np.arange(300)), axis=2)
         wavy = cv2.remap(image, (here + moved).astype(np.float32), None, cv2.INTER_LINEAR)
-        shot = laid(wavy[..., None], np.linalg.inv(way) if number else np.eye(3))
+        shot = warped(wavy[..., None], np.linalg.inv(homography) if number else np.eye(3))
         shots.append(shot)
-        ways.append(way if number else np.eye(3))
+        homographies.append(homography if number else np.eye(3))
     found = register(np.stack(list(corners_in(shots))))[0]
     corners = np.array([[30.0, 30.0, 1.0], [170.0, 30.0, 1.0], [30.0, 270.0, 1.0], [170.0, 270, 1]])
-    for way, truth in zip(found, ways, strict=True):
-        one, other = corners @ way.T, corners @ truth.T
+    for homography, truth in zip(found, homographies, strict=True):
+        one, other = corners @ homography.T, corners @ truth.T
         away = one[:, :2] / one[:, 2:] - other[:, :2] / other[:, 2:]
         assert np.abs(away).max() < 0.1  # px
 

@@ -49,11 +49,11 @@ def test_bed_in_place(scene, pictures):
         lambda k: picture_of(pictures[k][..., None]),
     )  # fmt: skip
     without = np.clip(np.rint(straight), 0, 255).astype(np.uint8).reshape(side, side)
-    bent = np.hypot(*displacement_px(np.where(hidden > 0, truth, without), truth).T)
+    uncorrected = np.hypot(*displacement_px(np.where(hidden > 0, truth, without), truth).T)
     assert covered.mean() > 0.97
     # px: photographs sampled without a filter, and resampled
     assert np.quantile(off, [0.5, 0.95]) == pytest.approx([0.0, 0.0], abs=0.2)
-    assert np.quantile(bent, 0.95) > 1.0  # there is something to trace
+    assert np.quantile(uncorrected, 0.95) > 1.0  # there is something to trace
 
 
 def test_seam(scene):

@@ -78,11 +78,11 @@ def test_rounds_stop(block):
     found = rounds(block, until_gsd=0.04)
     assert found.gsd_m == pytest.approx(0.62, abs=0.01)
     assert [one.mean_m for one in found.rounds] == pytest.approx([-0.5, -0.16, -0.05, -0.02])
-    assert found.settled
+    assert found.converged
     assert found.rounds[0].sd_m == pytest.approx(0.0, abs=1e-3)
     assert all(one.within_gsd == 1.0 for one in found.rounds)
     assert len(rounds(block, until_gsd=0.5).rounds) == 2  # the same, and asked for less
-    assert not rounds(block, until_gsd=0.001).settled
+    assert not rounds(block, until_gsd=0.001).converged
     assert calls(block) == "xxxx"
 
 

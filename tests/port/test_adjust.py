@@ -32,49 +32,49 @@ SIGMA_M = 0.005
 
 def write_scene(folder, port):
     """Write a model whose poses are wrong by centimetres, with apparent points."""
-    made = simulate_port(port, points=300, noise_px=0.3, seed=4)
+    data = simulate_port(port, points=300, noise_px=0.3, seed=4)
     rng = np.random.default_rng(6)
-    off = rng.normal(0.0, 0.02, made.cameras.centres.shape)
-    cameras = replace(made.cameras, centres=made.cameras.centres + off, crs=EPSG)
-    ties = TiePoints(made.apparent, made.views, made.image_xy)
+    off = rng.normal(0.0, 0.02, data.cameras.centres.shape)
+    cameras = replace(data.cameras, centres=data.cameras.centres + off, crs=EPSG)
+    ties = TiePoints(data.apparent, data.views, data.image_xy)
     write_colmap(folder / "model", cameras, ties)
-    places = made.cameras.centres + rng.normal(0.0, SIGMA_M, off.shape)
+    places = data.cameras.centres + rng.normal(0.0, SIGMA_M, off.shape)
     write_gnss(folder / "gnss.csv", cameras.labels, places, np.full(off.shape, SIGMA_M))
-    return made
+    return data
 
 
 @pytest.mark.parametrize("port", [FLAT, DomePort(0.05, 0.0, 1.49, (0.003, 0.0, 0.004))])
 def test_poses_and_bed(tmp_path, port):
-    made = write_scene(tmp_path, port)
+    data = write_scene(tmp_path, port)
     with threads(1):
         found = adjust_cameras(
             tmp_path / "model", water=None, port=port, gnss=tmp_path / "gnss.csv",
-            index=made.refractive_index, lens_unknowns=(),
+            index=data.refractive_index, lens_unknowns=(),
         )  # fmt: skip
     assert found.sigma0 == pytest.approx(1.0, abs=0.1)
-    off = found.cameras.centres - made.cameras.centres
+    off = found.cameras.centres - data.cameras.centres
     # standard errors of the adjustment itself, which its own tests compare with repeats
     sigma_m = found.precision.centre_sigma_m
     assert np.sqrt((off**2).mean()) < 1.5 * np.sqrt((sigma_m**2).mean()) < 0.02
     # points that two images show from 0.1 m apart are known to decimetres: the median counts
-    assert len(found.xyz) == len(made.truth)
-    bed = np.median(np.abs(found.xyz - made.truth)[:, 2])
+    assert len(found.xyz) == len(data.truth)
+    bed = np.median(np.abs(found.xyz - data.truth)[:, 2])
     assert bed < 2.0 * np.median(found.precision.point_sigma_m[:, 2])
     if port is FLAT:  # a dome about the projection centre hardly bends anything
-        assert bed < 0.1 * np.median(np.abs(made.apparent - made.truth)[:, 2])
+        assert bed < 0.1 * np.median(np.abs(data.apparent - data.truth)[:, 2])
 
 
 @pytest.mark.parametrize("port", [FLAT, DomePort(0.05, 0.004, 1.49, (0.003, -0.002, 0.006))])
 def test_port_from_exact_images(port):
     """Light by Fermat's principle; the start is off by millimetres."""
-    made, is_flat = simulate_port(port, points=200, seed=4), isinstance(port, FlatPort)
+    data, is_flat = simulate_port(port, points=200, seed=4), isinstance(port, FlatPort)
     start = replace(port, distance_m=0.03) if is_flat else replace(port, centre_m=(0.0, 0.0, 0.0))
     unknowns = Unknowns(lens=(), surface={"distance" if is_flat else "centre": np.inf})
-    ties = TiePoints(made.truth, made.views, made.image_xy)
+    ties = TiePoints(data.truth, data.views, data.image_xy)
     block = replace(
-        plain_block(made.cameras, ties, None, made.refractive_index), port=start,
+        plain_block(data.cameras, ties, None, data.refractive_index), port=start,
         gnss=GnssPositions(
-            made.cameras.centres, np.full((len(made.cameras), 3), SIGMA_M), None
+            data.cameras.centres, np.full((len(data.cameras), 3), SIGMA_M), None
         ),
     )  # fmt: skip
     problem, begin = prepare(block, unknowns)
@@ -85,7 +85,7 @@ def test_port_from_exact_images(port):
         assert home.distance_m == pytest.approx(port.distance_m, abs=1e-8)  # m
     else:
         np.testing.assert_allclose(home.centre_m, port.centre_m, atol=1e-8)
-    np.testing.assert_allclose(found.state.xyz + problem.origin, made.truth, atol=1e-5)
+    np.testing.assert_allclose(found.state.xyz + problem.origin, data.truth, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -93,28 +93,28 @@ def test_port_from_exact_images(port):
     [(FLAT, "distance"), (DomePort(0.05, 0.0, 1.49, (0.003, 0.0, 0.004)), "centre")],
 )
 def test_port_from_noisy_images(tmp_path, port, free):
-    made = write_scene(tmp_path, port)
+    data = write_scene(tmp_path, port)
     is_flat = free == "distance"
     start = replace(port, distance_m=0.03) if is_flat else replace(port, centre_m=(0.0, 0.0, 0.0))
     with threads(1):
         found = adjust_cameras(
             tmp_path / "model", tmp_path / "out", water=None, port=start, free=(free,),
-            gnss=tmp_path / "gnss.csv", index=made.refractive_index, lens_unknowns=(),
+            gnss=tmp_path / "gnss.csv", index=data.refractive_index, lens_unknowns=(),
         )  # fmt: skip
     summary = json.loads((tmp_path / "out" / "adjustment.json").read_text())
-    told = summary["port"]
-    again = port_of_text(told["surface"])  # to 0.1 um
+    written = summary["port"]
+    again = port_of_text(written["surface"])  # to 0.1 um
     np.testing.assert_allclose(coefficients(again), coefficients(found.port), atol=1e-7)
     names = ("distance",) if is_flat else ("centre_x", "centre_y", "centre_z")
     true = dict(zip(names, (port.distance_m,) if is_flat else port.centre_m, strict=True))
     for name, value in true.items():
-        row = told[name]
+        row = written[name]
         assert abs(row["after"] - value) < 3.5 * row["sigma"]
         assert abs(row["before"] - value) > 0.0 or value == 0.0
-    assert f"--port {told['surface']}" in adjustment_text(summary)
+    assert f"--port {written['surface']}" in adjustment_text(summary)
     options = AdjustOptions(port=port, free=(free,))
     words = correct_words(found, "model", tmp_path / "out", options)
-    assert words.endswith(f"--port {told['surface']}")
+    assert words.endswith(f"--port {written['surface']}")
 
 
 @pytest.mark.parametrize(

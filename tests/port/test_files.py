@@ -31,7 +31,7 @@ def cloud(scene, tmp_path_factory):
 
 
 def test_file(scene, cloud, tmp_path):
-    told = pcfix.correct_file(
+    found_summary = pcfix.correct_file(
         cloud, tmp_path / "out.las", cameras=scene.cameras, port=SPEC, method="consistent",
         respect_classes=(7,), summary=tmp_path / "run.json",
     )  # fmt: skip
@@ -48,11 +48,11 @@ def test_file(scene, cloud, tmp_path):
     assert set(np.asarray(after.classification)[~noise]) == {40}
     # no surface, no depth: the least that marks a submerged point
     assert set(np.asarray(after.WaterDepth)[~noise]) == {0.001}
-    assert told.submerged == told.corrected == (~noise).sum()
+    assert found_summary.submerged == found_summary.corrected == (~noise).sum()
     report = json.loads((tmp_path / "run.json").read_text())
     assert report["settings"]["port"]["thickness_m"] == 0.008
     assert report["depth_m"] == {}
-    assert str(scene.port) in text_of("correct", told)
+    assert str(scene.port) in text_of("correct", found_summary)
 
 
 def test_restored(scene, cloud, tmp_path):

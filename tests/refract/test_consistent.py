@@ -324,9 +324,9 @@ def test_ray_miss(many):
             down = (points[i] - centre) / np.linalg.norm(points[i] - centre)
             pierced = centre + down * (centre[2] - water.a) / -down[2]
             side = np.hypot(*down[:2])
-            bent = np.append(down[:2] / N_WATER, -np.sqrt(1.0 - (side / N_WATER) ** 2))
+            refracted = np.append(down[:2] / N_WATER, -np.sqrt(1.0 - (side / N_WATER) ** 2))
             away = points[i] + result.shift_m[i] - pierced
-            squares.append(np.sum(np.cross(away, bent) ** 2))
+            squares.append(np.sum(np.cross(away, refracted) ** 2))
         # coordinates of UTM are known to 1e-9 m
         assert result.ray_miss_m[i] == pytest.approx(np.sqrt(np.mean(squares)), abs=MICROMETRE)
 

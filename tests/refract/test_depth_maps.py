@@ -203,9 +203,9 @@ def test_block_without_list(name, most, monkeypatch):
     assert abs(error.mean()) < 5.7
     assert rms(error) < 0.6 * rms(errors_gsd(name, method="snell", camera_set="all"))
     monkeypatch.setattr("pcfix.refract.learning._learn_bed", lambda *_: None)
-    alone = errors_gsd(name, method="consistent", camera_set="mvs")
+    without_ties = errors_gsd(name, method="consistent", camera_set="mvs")
     # 3.5 and 42 GSD: the images of a group see the bed at heights that are a metre apart
-    assert rms(error) < {"nadir": 0.9, "half oblique": 0.4}[name] * rms(alone)
+    assert rms(error) < {"nadir": 0.9, "half oblique": 0.4}[name] * rms(without_ties)
 
 
 # the bed of the surroundings

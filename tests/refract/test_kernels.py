@@ -58,7 +58,7 @@ WAVES = WaterRaster(
     0.15 * np.sin(np.arange(-20.0, 120.0) / 4.0) * np.ones((140, 1)), -20.0, 120.0, (1.0, 1.0)
 )
 PAIRS = {"camera_set": "mvs", "matcher": "pairs"}
-WAYS = {
+CASES = {
     "snell": {"method": "snell"},
     "snell, waves": {"method": "snell", "water": WAVES},
     "consistent": {"method": "consistent", "camera_set": "all"},
@@ -75,24 +75,24 @@ def corrected(points, cameras, *, water=0.0, **how):
     return pcfix.correct_points(points, cameras, water, **how)
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_any_threads_and_chunks(points, cameras, way):
-    how, shuffled = WAYS[way], np.random.default_rng(1).permutation(N)
+@pytest.mark.parametrize("case", CASES)
+def test_any_threads_and_chunks(points, cameras, case):
+    how, shuffled = CASES[case], np.random.default_rng(1).permutation(N)
     whole = corrected(points, cameras, **how)
     assert whole.corrected.any()
     for count in (1, 3):
         with threads(count):
             same(whole, corrected(points, cameras, **how))
-    if way not in OF_ALL:
+    if case not in OF_ALL:
         assert np.array_equal(whole.xyz[shuffled], corrected(points[shuffled], cameras, **how).xyz)
         for i in range(0, N, 61):
-            alone = corrected(points[i : i + 1], cameras, **how)
-            assert np.array_equal(alone.xyz[0], whole.xyz[i])
+            single = corrected(points[i : i + 1], cameras, **how)
+            assert np.array_equal(single.xyz[0], whole.xyz[i])
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_no_points(points, cameras, way):
-    how, none = dict(WAYS[way]), np.zeros((0, 3))
+@pytest.mark.parametrize("case", CASES)
+def test_no_points(points, cameras, case):
+    how, none = dict(CASES[case]), np.zeros((0, 3))
     water = how.pop("water", WaterPlane(0.0))
     learned = Learned(matcher=matcher_of(cameras, points) if "matcher" in how else None)
     above = surface_above(water, none)

@@ -73,8 +73,8 @@ def test_mixture(is_mixed):
     rng = np.random.default_rng(2)
     xy, bed = patches(200, rng)
     ratio = 1.34 + 0.05 * np.arange(5)
-    made = ratio[rng.integers(0, 5, bed.shape)] if is_mixed else np.mean(ratio)
-    apparent = bed / made + rng.normal(0.0, 0.5 * GSD_M, bed.shape)
+    used_ratio = ratio[rng.integers(0, 5, bed.shape)] if is_mixed else np.mean(ratio)
+    apparent = bed / used_ratio + rng.normal(0.0, 0.5 * GSD_M, bed.shape)
     terms, level = smooth_surfaces(np.dstack([xy, apparent])), np.full_like(apparent, LEVEL_M)
     several = Candidates(apparent[..., None] * ratio, np.ones((*bed.shape, 5)))
     mean = Candidates(apparent[..., None] * np.mean(ratio), np.ones((*bed.shape, 1)))
@@ -93,9 +93,9 @@ def test_missing_candidates():
     terms, level = smooth_surfaces(np.dstack([xy, apparent])), np.full_like(apparent, LEVEL_M)
     height = np.dstack([1.34 * apparent, np.full(bed.shape, np.nan)])
     padded = Candidates(height, np.ones(height.shape))
-    alone = Candidates(height[..., :1], np.ones((*bed.shape, 1)))
+    single = Candidates(height[..., :1], np.ones((*bed.shape, 1)))
     with_none, without = (
-        log_likelihood(terms, apparent, level, one, GSD_M) for one in (padded, alone)
+        log_likelihood(terms, apparent, level, one, GSD_M) for one in (padded, single)
     )
     # the starts of the search differ, by the spread of the candidates: 0 here
     assert with_none == pytest.approx(without, abs=1e-9)

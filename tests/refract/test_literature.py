@@ -16,7 +16,7 @@ from pcfix.refract.methods import correct
 from pcfix.refract.regression import DepthRegression
 from pcfix.water.surface import surface_above
 from tests.utils.batches import batch_of
-from tests.utils.twins import bend, light_path, stacked_intersection
+from tests.utils.twins import light_path, refract_ray, stacked_intersection
 
 UTM = np.array([512_345.678, 4_987_654.321, 0.0])
 NANOMETRE = 1e-9  # doubles at UTM coordinates have steps of 1e-9 m; results are relative to P
@@ -171,9 +171,9 @@ def test_shan_ray_miss():
         for centre in centres - UTM:
             ray = (point - centre) / np.linalg.norm(point - centre)
             entry = point + ray * point[2] / -ray[2]
-            bent = bend(ray, np.array([0.0, 0.0, 1.0]), 1.34)
+            refracted = refract_ray(ray, np.array([0.0, 0.0, 1.0]), 1.34)
             away = point + found.shift_m[i] - entry
-            square += away @ away - (away @ bent) ** 2
+            square += away @ away - (away @ refracted) ** 2
         assert found.ray_miss_m[i] == pytest.approx(math.sqrt(square / 4), abs=1e-9)
 
 
@@ -186,9 +186,9 @@ def test_few_rays():
         assert found.outcome.tolist() == expected
         assert (found.shift_m[:2] == 0.0).all()
     for method in MEANS:
-        alone = run(method, xyz, cameras.centres, views=views)
-        assert alone.outcome.tolist() == [Outcome.NO_CAMERA, Outcome.CORRECTED, Outcome.CORRECTED]
-        assert alone.ray_count.tolist() == [0, 1, 3]
+        single = run(method, xyz, cameras.centres, views=views)
+        assert single.outcome.tolist() == [Outcome.NO_CAMERA, Outcome.CORRECTED, Outcome.CORRECTED]
+        assert single.ray_count.tolist() == [0, 1, 3]
     for method in ("factor", "regression"):
         found = run(method, xyz, cameras.centres, views=views)
         assert (found.outcome == Outcome.CORRECTED).all()
@@ -213,9 +213,9 @@ def test_tilted_as_level(method):
     found = run(method, points, centres, water=tilted)
     for i, point in enumerate(points):
         height = surface_above(tilted, points[i : i + 1]).height_m[0]
-        alone = run(method, [point], centres, water=WaterPlane(height))
+        single = run(method, [point], centres, water=WaterPlane(height))
         # the plane's height at UTM is a difference of numbers near 4e4: 1e-11 m are lost there
-        assert found.shift_m[i] == pytest.approx(alone.shift_m[0], abs=NANOMETRE)
+        assert found.shift_m[i] == pytest.approx(single.shift_m[0], abs=NANOMETRE)
 
 
 @given(

@@ -20,7 +20,7 @@ RENDERED, rendered = needs("rendered_a")
 AUTO = ScienceOptions(method="auto", index=1.34)
 
 
-def told(xyz, cameras, water, settings=AUTO):
+def detected(xyz, cameras, water, settings=AUTO):
     batch = Batch(xyz, surface_above(water, xyz), Survey(water, cameras, settings))
     survey, verdicts = learn_of_sample(batch)
     return survey.settings, verdicts[0] if verdicts else None
@@ -40,7 +40,7 @@ COARSE = {"points": 40_000, "seed": 1, "lidar_per_m2": 0.0, "sensor_px": (1824, 
 @pytest.mark.parametrize("name", mostly_nightly(CLOUDS, "tracks", "depth-maps"))
 def test_simulated_cloud(name):
     scene = simulated(12_000, seed=1, lidar_per_m2=0.0, **CLOUDS[name])
-    settings, verdict = told(scene.apparent_xyz, scene.cameras, scene.water)
+    settings, verdict = detected(scene.apparent_xyz, scene.cameras, scene.water)
     kind = {"river of tracks": "tracks"}.get(name, name)
     place = ["tracks", "depth-maps", "pairs"].index(kind)
     assert verdict.chosen is IN_FRAME[place]
@@ -57,7 +57,7 @@ def test_simulated_cloud(name):
 def test_single_maps(kind):
     scene = simulated(cloud=kind, **COARSE)
     rows = np.diff(scene.views.start) > 0
-    settings, verdict = told(scene.xyz[rows], scene.cameras, scene.water)
+    settings, verdict = detected(scene.xyz[rows], scene.cameras, scene.water)
     assert verdict.chosen is IN_FRAME[["single-map", "nearest-map"].index(kind) + 3]
     assert (settings.camera_set, settings.matcher) == ("mvs", kind)
     assert verdict.confidence > 0.8
@@ -116,7 +116,7 @@ def test_camera_set():
         Survey(scene.water, scene.cameras, replace(AUTO, camera_set="mvs")),
     )
     assert reconstructions_of(batch) == IN_FRAME[1:]
-    settings, verdict = told(
+    settings, verdict = detected(
         scene.apparent_xyz, scene.cameras, scene.water, replace(AUTO, camera_set="mvs")
     )
     assert verdict is None and (settings.camera_set, settings.matcher) == ("mvs", "depth-maps")
@@ -129,7 +129,7 @@ def test_real_cloud():
     local = pcfix.read_cameras(RENDERED / "colmap")
     cameras = replace(local, centres=local.centres + np.loadtxt(RENDERED / "offset.txt"))
     xyz = np.ascontiguousarray(laspy.read(RENDERED / "cloud.las").xyz)
-    _, verdict = told(xyz[::2], cameras, WaterPlane(0.37))
+    _, verdict = detected(xyz[::2], cameras, WaterPlane(0.37))
     assert verdict.chosen is IN_FRAME[1] and verdict.is_sure
 
 

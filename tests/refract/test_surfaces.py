@@ -184,9 +184,9 @@ def test_dry_camera():
     centres = np.array([[-20.0, 0, 50], [20.0, 0, 50]])
     two, point = pcfix.Cameras(("wet", "dry"), centres), np.array([[0.0, 0, -0.1]])
     result = pcfix.correct_points(point, two, 0.0, level_offset_m=[0.2, -0.2])
-    bent = math.asin(math.sin(math.atan2(20.0, 50.1)) / 1.34)
+    angle_in_water = math.asin(math.sin(math.atan2(20.0, 50.1)) / 1.34)
     entry = -20.0 + 20.0 * (50.0 - 0.2) / 50.1  # where the wet ray meets its water
-    slope, dry = math.tan(bent), 20.0 / 50.1
+    slope, dry = math.tan(angle_in_water), 20.0 / 50.1
     # entry + slope (0.2 - z) = (z + 0.1) dry
     z = (entry + 0.2 * slope - 0.1 * dry) / (slope + dry)
     assert result.xyz[0] == pytest.approx([(z + 0.1) * dry, 0.0, z], abs=1e-9)

@@ -11,7 +11,7 @@ from pcfix.model import WaterDimension, WaterMesh, WaterPlane, WaterRaster
 from pcfix.refract.tracing import METHODS, trace
 from tests.utils.codes import refused
 from tests.utils.tracing_twin import direction, through_plane, through_surface
-from tests.utils.twins import bend
+from tests.utils.twins import refract_ray
 
 INDEX = 1.34
 UTM = np.array([512_345.0, 4_987_654.0, 0.0])
@@ -92,7 +92,7 @@ def test_planes(method, plane):
 def test_there_and_back(method, incidence_deg):
     i = math.radians(incidence_deg)
     leaves = np.array([40.0 * math.tan(i), 0.0, 0.0])
-    down = bend(np.array([math.sin(i), 0.0, -math.cos(i)]), np.array([0.0, 0.0, 1.0]), INDEX)
+    down = refract_ray(np.array([math.sin(i), 0.0, -math.cos(i)]), np.array([0.0, 0.0, 1.0]), INDEX)
     point = leaves + 6.0 * down
     found = trace([0.0, 0.0, 40.0], point, WaterPlane(0.0), refractive_index=INDEX, method=method)
     # at 89 degrees a miss of 1e-9 m is 1e-9 / cos^2 of the incidence at the surface
@@ -115,7 +115,7 @@ def test_waves(method, slope_deg):
         normal = normal_at(surface, a[0], a[1])
         if normal is None:
             continue
-        down = bend(direction(a, centres[i]), normal, INDEX)
+        down = refract_ray(direction(a, centres[i]), normal, INDEX)
         miss = (points[i] - a) - ((points[i] - a) @ down) * down
         # the normal by differences over 1e-5 m is good to 1e-9, times 8 m of water
         assert np.linalg.norm(miss) < 5e-8

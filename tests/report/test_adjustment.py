@@ -167,10 +167,10 @@ def bare(adjusted):
 def test_page(adjusted, kind):
     before, it = before_px(adjusted), adjusted if kind == "whole" else bare(adjusted)
     values = adjustment_dict(it, before)
-    said = " ".join(Elements(adjustment_page(values)).said)
-    assert not re.search(r"\bnan\b|\bNone\b|\binf\b", said + adjustment_text(values))
-    assert "Adjusted 3 images and 24 points" in said
-    assert ("Something <decided>" in said) == (kind == "whole")
+    texts = " ".join(Elements(adjustment_page(values)).texts)
+    assert not re.search(r"\bnan\b|\bNone\b|\binf\b", texts + adjustment_text(values))
+    assert "Adjusted 3 images and 24 points" in texts
+    assert ("Something <decided>" in texts) == (kind == "whole")
 
 
 def test_text(adjusted):
@@ -196,7 +196,7 @@ def test_check_points(adjusted):
     found = replace(adjusted, block=replace(adjusted.block, control=surveyed(2, 1)), used=used)
     values = adjustment_dict(found, before_px(found))
     assert values["points"] == {"all": 22, "land": 8, "water": 14}
-    assert values["observations"] == {"used": 64, "left_out": 5}
+    assert values["observations"] == {"used": 64, "excluded": 5}
     assert sum(values["residuals"][key]["points"] for key in ("land", "water")) == 22
 
 

@@ -39,7 +39,7 @@ class Elements(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.found, self.open, self.said = [], [], []
+        self.found, self.open, self.texts = [], [], []
         self.feed(text)
         assert self.open == []
 
@@ -53,7 +53,7 @@ class Elements(HTMLParser):
 
     def handle_data(self, data):
         if self.open and self.open[-1] not in ("script", "style"):
-            self.said.append(data)
+            self.texts.append(data)
 
     def all(self, tag):
         return [attributes for name, attributes in self.found if name == tag]
@@ -74,8 +74,8 @@ def test_self_contained(report):
     assert all(len(picture["alt"]) > 20 for picture in pictures)
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in files)
     assert str(folder) not in text and str(SCENE) not in text
-    said = " ".join(elements.said)
-    assert not re.search(r"\b(None|nan|inf|True|False)\b|[{}]", said)
+    texts = " ".join(elements.texts)
+    assert not re.search(r"\b(None|nan|inf|True|False)\b|[{}]", texts)
     assert len(text) < 4_000_000
 
 
@@ -135,12 +135,12 @@ def test_map_in_browser(report, tmp_path):
     page.write_text(text.replace("</body>", PROBE))
     done = open_page(page, tmp_path / "profile", "--window-size=500,900")
     assert [line for line in done.stderr.splitlines() if "CONSOLE" in line] == []
-    *said, width = re.search(r"<title>([^<]*)", done.stdout)[1].split("|")
+    *texts, width = re.search(r"<title>([^<]*)", done.stdout)[1].split("|")
     assert int(width) <= 500  # nothing is wider than the page
-    told = [
-        re.match(r"X ([\d.]+), Y ([\d.]+), Depth ([\d.]+) m ± ([\d.]+) m,", one) for one in said
+    tips = [
+        re.match(r"X ([\d.]+), Y ([\d.]+), Depth ([\d.]+) m ± ([\d.]+) m,", one) for one in texts
     ]
-    x, y, depth, error = np.array([one.groups() for one in told], float).T
+    x, y, depth, error = np.array([one.groups() for one in tips], float).T
     assert abs(x[2] - x[0]) < 2.0  # a cell: the place under the wheel stays
     assert (x[1] - x[0]) / (x[3] - x[2]) == pytest.approx(np.e, rel=0.2)
     data = map_data(text)

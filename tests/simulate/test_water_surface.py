@@ -6,7 +6,7 @@ import pytest
 from pcfix.model import WaterPlane
 from pcfix.simulate.tracing import Water
 from tests.utils.bed_rays import bed_points
-from tests.utils.twins import bend, light_path
+from tests.utils.twins import light_path, refract_ray
 
 N = 1.34
 TILTED = WaterPlane(0.3, 0.05, -0.03)
@@ -71,5 +71,5 @@ def test_there_and_back():
     assert seen == pytest.approx(points, abs=1e-9)
     for i in range(COUNT):  # the slow twin's refraction
         air, under = surface[i] - centres[i], points[i] - surface[i]
-        slow = bend(air / np.linalg.norm(air), planes[1][i], N)
+        slow = refract_ray(air / np.linalg.norm(air), planes[1][i], N)
         assert slow == pytest.approx(under / np.linalg.norm(under), abs=1e-9)

@@ -24,12 +24,12 @@ class Files:
     """
 
     folder: Path
-    made: Unaware
+    data: Unaware
     truth: FloatArray
 
     @property
     def scene(self) -> TieScene:
-        return self.made.scene
+        return self.data.scene
 
     @property
     def water(self) -> float:
@@ -43,11 +43,11 @@ def write_block(folder: Path, points: int = 1600, **settings: object) -> Files:
         "position_noise_m": 0.3, "attitude_noise_deg": 0.2,
     } | settings  # fmt: skip
     scene, others = parted(simulate_tie_points(points, **given), TIES)
-    made = unaware(scene)
-    cameras = replace(made.cameras, crs=EPSG)
-    write_colmap(folder / "model", cameras, made.ties)
+    data = unaware(scene)
+    cameras = replace(data.cameras, crs=EPSG)
+    write_colmap(folder / "model", cameras, data.ties)
     write_colmap(folder / "bare", cameras)
-    write_las(folder / "cloud.las", apparent_cloud(made, others))
+    write_las(folder / "cloud.las", apparent_cloud(data, others))
     positions = scene.cameras.gnss
     write_gnss(folder / "gnss.csv", scene.cameras.labels, positions.xyz, positions.sigma_m)
     write_gcps(folder / "gcps.csv", scene)
@@ -56,7 +56,7 @@ def write_block(folder: Path, points: int = 1600, **settings: object) -> Files:
         f"focal_px,width_px,height_px,cx,cy\n{lens.focal!r},{lens.width:g},{lens.height:g},"
         f"{lens.principal_x!r},{lens.principal_y!r}\n"
     )
-    return Files(folder, made, others.truth)
+    return Files(folder, data, others.truth)
 
 
 def write_gnss(path: Path, labels: tuple[str, ...], xyz: FloatArray, sigma: FloatArray) -> None:

@@ -27,8 +27,8 @@ def bed_points(
     # Snell: the part along the surface shrinks by n, the rest is what a unit vector has left
     sideways = (unit - down * normals[wet]) / refractive_index
     rest = np.sqrt(1.0 - np.einsum("mi,mi->m", sideways, sideways))[:, None]
-    bent = sideways - rest * normals[wet]
-    straight[wet] = _on_plane(surface, bent, places[wet], bed_normals[wet])
+    refracted = sideways - rest * normals[wet]
+    straight[wet] = _on_plane(surface, refracted, places[wet], bed_normals[wet])
     return straight
 
 

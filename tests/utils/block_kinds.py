@@ -205,15 +205,15 @@ def write_kind(
 
     model/ : COLMAP, with tie points; cloud.las; gnss.csv; true/ : the model as it is in truth.
     """
-    made = KindBlock(kind, seed, points, cloud)
-    old = made.unaware(weighs_gnss=seed % 2 == 0)
-    ties, cloud = made.part(slice(0, made.ties)), made.part(slice(made.ties, None))
+    data = KindBlock(kind, seed, points, cloud)
+    old = data.unaware(weighs_gnss=seed % 2 == 0)
+    ties, cloud = data.part(slice(0, data.ties)), data.part(slice(data.ties, None))
     tracks = TiePoints(ties.apparent(old) + ORIGIN_M, Views(ties.start, ties.camera), ties.image_xy)
     placed = replace(old, centres=old.centres + ORIGIN_M, crs=EPSG)
     write_colmap(folder / "model", placed, tracks)
-    true = replace(made.cameras, centres=made.cameras.centres + ORIGIN_M, gnss=None, crs=EPSG)
+    true = replace(data.cameras, centres=data.cameras.centres + ORIGIN_M, gnss=None, crs=EPSG)
     write_colmap(folder / "true", true)
     write_las(folder / "cloud.las", cloud.apparent(old) + ORIGIN_M)
-    gnss = made.cameras.gnss
-    write_gnss(folder / "gnss.csv", made.cameras.labels, gnss.xyz + ORIGIN_M, gnss.sigma_m)
+    gnss = data.cameras.gnss
+    write_gnss(folder / "gnss.csv", data.cameras.labels, gnss.xyz + ORIGIN_M, gnss.sigma_m)
     return cloud.xyz + ORIGIN_M

@@ -11,15 +11,15 @@ def middle_of(folder, target, half_m=25.0):
     """
     las = laspy.read(folder / "cloud.las")
     away_m = np.abs(las.xyz[:, :2] - (las.header.mins + las.header.maxs)[:2] / 2.0).max(axis=1)
-    kept = np.flatnonzero(away_m < half_m)
-    las.points = las.points[kept]
+    inside = np.flatnonzero(away_m < half_m)
+    las.points = las.points[inside]
     las.write(target / "cloud.las")
     words = np.fromfile(folder / "dense.vis", "<u4")[2:]
     starts, at = np.empty(len(away_m), int), 0
     for row in range(len(away_m)):
         starts[row] = at
         at += 1 + words[at]
-    rows = [words[at : at + 1 + words[at]] for at in starts[kept]]
-    head = np.array([len(kept)], "<u8").tobytes()
+    rows = [words[at : at + 1 + words[at]] for at in starts[inside]]
+    head = np.array([len(inside)], "<u8").tobytes()
     (target / "dense.vis").write_bytes(head + np.concatenate(rows).tobytes())
     return target

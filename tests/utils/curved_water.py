@@ -40,8 +40,8 @@ def piercing_points(q: FloatArray, centre: FloatArray, numbers: FloatArray, n: f
     xy = q_wet[:, :2].copy()
     for _ in range(NEWTON_STEPS):
         columns = [
-            (slope(xy + STEP_M * way) - slope(xy - STEP_M * way)) / (2.0 * STEP_M)
-            for way in np.eye(2)
+            (slope(xy + STEP_M * direction) - slope(xy - STEP_M * direction)) / (2.0 * STEP_M)
+            for direction in np.eye(2)
         ]
         step = np.linalg.solve(np.stack(columns, axis=2), slope(xy)[:, :, None])[:, :, 0]
         xy -= step
@@ -52,25 +52,25 @@ def piercing_points(q: FloatArray, centre: FloatArray, numbers: FloatArray, n: f
     return surface
 
 
-def under_bent_water(made: TieScene, shape: FloatArray, seed: int = 9) -> TieScene:
+def under_curved_water(data: TieScene, shape: FloatArray, seed: int = 9) -> TieScene:
     """Return a scene whose water is bent by d, e, f about the middle of its cameras."""
-    origin = np.round(made.true_cameras.centres.mean(axis=0))
-    plane, lens = made.water, made.true_cameras.lenses[0]
+    origin = np.round(data.true_cameras.centres.mean(axis=0))
+    plane, lens = data.water, data.true_cameras.lenses[0]
     level = plane.a + plane.b * origin[0] + plane.c * origin[1] - origin[2]
     numbers = np.array([level, plane.b, plane.c, *shape])
-    cameras = replace(made.true_cameras, centres=made.true_cameras.centres - origin)
+    cameras = replace(data.true_cameras, centres=data.true_cameras.centres - origin)
 
     def images(xyz: FloatArray, camera) -> FloatArray:
         centre = cameras.centres[camera]
-        through = piercing_points(xyz - origin, centre, numbers, made.refractive_index)
+        through = piercing_points(xyz - origin, centre, numbers, data.refractive_index)
         return project(through, cameras, camera, lens)[0]
 
-    owner = np.repeat(np.arange(len(made.truth)), np.diff(made.views.start))
-    control = made.control
-    bent = replace(
-        made,
-        exact_xy=images(made.truth[owner], made.views.camera),
-        control_exact_xy=images(made.control_truth[control.point], control.camera),
-        is_wet=made.truth[:, 2] < origin[2] + height(numbers, *(made.truth - origin)[:, :2].T),
+    owner = np.repeat(np.arange(len(data.truth)), np.diff(data.views.start))
+    control = data.control
+    curved = replace(
+        data,
+        exact_xy=images(data.truth[owner], data.views.camera),
+        control_exact_xy=images(data.control_truth[control.point], control.camera),
+        is_wet=data.truth[:, 2] < origin[2] + height(numbers, *(data.truth - origin)[:, :2].T),
     )
-    return bent.measured(np.random.default_rng(seed))
+    return curved.measured(np.random.default_rng(seed))

@@ -1,7 +1,7 @@
 """Slow twins of dense matching: partners by loops, depths by scipy, maps fused by bisection.
 
 Light is traced by `pcfix.simulate.tracing`; nothing of `pcfix.refract` is used. The matcher may
-have had other cameras, `made`, than those that took the images; both have the places in the images.
+have had other cameras, `before`, than those that took the images; both have the same image points.
 """
 
 from itertools import combinations
@@ -60,19 +60,19 @@ def on_bed(centre, towards, plane, bed, n):
     return bed_points(centre[None], way, plane_of(plane), plane_of(bed), n)[0]
 
 
-def costs_of(p, u, q, cameras, partners, planes, n, metric, made=None):
+def costs_of(p, u, q, cameras, partners, planes, n, metric, before=None):
     """Return for each partner its squared residual, px^2, as a function of the way t beyond p.
 
     In pixels, or as angles times the focal length as seen from where it is least.
     """
-    made = made or cameras
+    before = before or cameras
 
     def one(j):
-        centre, focal = made.centres[j], made.lenses[j].focal
+        centre, focal = before.centres[j], before.lenses[j].focal
         there = pixel(cameras, j, leaves_water(q, cameras.centres[j], planes[j], n))
         if metric == "pixels":
-            return lambda t: float(((pixel(made, j, p + t * u) - there) ** 2).sum())
-        ray = way_of(made, j, there)
+            return lambda t: float(((pixel(before, j, p + t * u) - there) ** 2).sum())
+        ray = way_of(before, j, there)
 
         def miss2(t):
             return float((np.cross(p + t * u - centre, ray) ** 2).sum())
@@ -99,24 +99,24 @@ def slow_depth(costs, tolerance):
 
 
 def fused_slowly(
-    start, maps, weights, cameras, matched, planes, bed, n, tolerance, metric, made=None
+    start, maps, weights, cameras, matched, planes, bed, n, tolerance, metric, before=None
 ):
     """Return the fused point of a bed on the plumb line of a start, and what it shows.
 
     At the height at which the weighted ways along the rays add up to nothing up or down; the
     plane of the bed is (a, b, c) of z = a + b x + c y.
     """
-    made = made or cameras
+    before = before or cameras
 
     def ways(z):
         p = np.array([*start[:2], z])
         total, shown = 0.0, []
         for c, w in zip(maps, weights, strict=True):
-            u = (p - made.centres[c]) / np.linalg.norm(p - made.centres[c])
+            u = (p - before.centres[c]) / np.linalg.norm(p - before.centres[c])
             centre = cameras.centres[c]
-            way = way_of(cameras, c, pixel(made, c, p))
+            way = way_of(cameras, c, pixel(before, c, p))
             q = on_bed(centre, centre + way, planes[c], bed, n)
-            costs = costs_of(p, u, q, cameras, matched[c], planes, n, metric, made)
+            costs = costs_of(p, u, q, cameras, matched[c], planes, n, metric, before)
             total += w * u[2] * slow_depth(costs, tolerance)
             shown.append(q)
         return total, np.average(shown, 0, weights)

@@ -59,15 +59,15 @@ def run(kind: str, seed: int, **settings: object) -> Run:
         scene = with_mismatches(scene, rng)
     off_m = rng.normal(0.0, SIGMA_LEVEL_M) if kind == "level" else 0.0
     water = WaterPlane(scene.water.a + off_m, scene.water.b, scene.water.c)
-    made = unaware(scene, loss=CAUCHY if kind == "mismatches" else SQUARES)
+    data = unaware(scene, loss=CAUCHY if kind == "mismatches" else SQUARES)
     gnss = scene.cameras.gnss
-    ties, lens = usable_ties(made.ties, made.cameras), default_lens(made.cameras.lenses)
-    block = block_to_adjust(made.cameras, ties, water, scene.refractive_index)
+    ties, lens = usable_ties(data.ties, data.cameras), default_lens(data.cameras.lenses)
+    block = block_to_adjust(data.cameras, ties, water, scene.refractive_index)
     surface = {"level": SIGMA_LEVEL_M} if kind == "level" else {}
     found = adjust_block(replace(block, gnss=gnss), Unknowns(lens=lens, surface=surface))
     bed = tuple(
         bed_rms_m(scene, cameras, surface) / (80.0 / cameras.lenses[0].focal)
-        for cameras, surface in ((made.cameras, water), (found.cameras, found.water))
+        for cameras, surface in ((data.cameras, water), (found.cameras, found.water))
     )
     return Run(found, normalised(found, scene.true_cameras), bed)
 
@@ -78,10 +78,10 @@ def normalised(found: Adjusted, true: Cameras) -> dict[str, FloatArray]:
     centres = (found.cameras.centres - true.centres[row]) / found.precision.centre_sigma_m
     turn = found.cameras.rotations @ true.rotations[row].transpose(0, 2, 1)
     angles = np.degrees(Rotation.from_matrix(turn).as_rotvec()) / found.precision.angle_sigma_deg
-    lens, made = found.cameras.lenses[0], true.lenses[0]
+    lens, data = found.cameras.lenses[0], true.lenses[0]
     off = {
-        "f": lens.focal - made.focal, "cx": lens.principal_x - made.principal_x,
-        "cy": lens.principal_y - made.principal_y,
+        "f": lens.focal - data.focal, "cx": lens.principal_x - data.principal_x,
+        "cy": lens.principal_y - data.principal_y,
     }  # fmt: skip
     sigma = {name: found.precision.sigma_of(name) or np.nan for name in off}  # NaN where held
     errors = {name: np.array([by / sigma[name]]) for name, by in off.items()}
@@ -128,8 +128,8 @@ def with_mismatches(scene: TieScene, rng: np.random.Generator) -> TieScene:
     views, o = scene.views, len(scene.views.camera)
     owner = np.repeat(np.arange(len(scene.truth)), np.diff(views.start))
     wanted, by = float(rng.uniform(0.05, 0.10)) * o, np.zeros((o, 2))
-    alone = rng.random(o) < 0.5 * wanted / o
-    by[alone] = drawn_px(rng, int(alone.sum()))
+    single = rng.random(o) < 0.5 * wanted / o
+    by[single] = drawn_px(rng, int(single.sum()))
     while (by != 0.0).any(axis=1).sum() < wanted:
         middle = scene.truth[rng.integers(len(scene.truth)), :2]
         near = np.hypot(*(scene.truth[:, :2] - middle).T) < 3.0

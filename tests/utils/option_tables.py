@@ -34,8 +34,8 @@ def table(options: Iterable[Option]) -> list[str]:
     for one in options:
         plain = "" if bool in one.kinds else "TEXT" if one.kinds == (str,) else "N"
         value = "|".join(one.choices) or one.metavar or ("PATH" if one.is_path else plain)
-        negative = "no-" if one.default is True else ""
-        flag = f"--{negative}{one.flag[2:]} {value}".strip().replace("|", "\\|")
+        both = f"`, `--no-{one.flag[2:]}" if one.default is True else ""
+        flag = f"{one.flag}{both} {value}".strip().replace("|", "\\|")
         rows.setdefault(one.name, f"| `{flag}` | {one.help} | {one.needed or one.default_text} |")
     return ["| option | meaning | default |", "|---|---|---|", *rows.values()]
 

@@ -67,8 +67,8 @@ def rendered(photo, relief, texture, water_m=None, n=1.34):
         pierced = photo.centre + far[:, None] * direction[wet]
         sine = np.hypot(direction[wet, 0], direction[wet, 1]) / n
         aside = direction[wet, :2] / np.maximum(n * sine, 1e-12)[:, None]
-        bent = np.column_stack([aside * sine[:, None], -np.sqrt(1.0 - sine**2)])
-        place[wet] = _marched(pierced, bent, relief)
+        refracted = np.column_stack([aside * sine[:, None], -np.sqrt(1.0 - sine**2)])
+        place[wet] = _marched(pierced, refracted, relief)
     grey = np.rint(255.0 * texture(place[:, :2])).astype(np.uint8)
     return grey.reshape(u.shape), place.reshape(*u.shape, 3)
 

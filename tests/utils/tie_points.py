@@ -22,13 +22,13 @@ from pcfix.model import (
 )
 from pcfix.simulate.scene import (
     ORIGIN_M,
-    Sight,
     Site,
+    Visible,
     cameras_in_world,
+    find_visible,
     lay_out,
     plane_in_world,
     points_on,
-    see,
 )
 from pcfix.simulate.settings import SceneSettings
 
@@ -141,13 +141,13 @@ def _above(xyz: FloatArray, plane: WaterPlane) -> FloatArray:
     return np.asarray(xyz[:, 2] - (plane.a + xyz[:, :2] @ [plane.b, plane.c]))
 
 
-def _seen(xyz: FloatArray, site: Site) -> tuple[FloatArray, Sight]:
+def _seen(xyz: FloatArray, site: Site) -> tuple[FloatArray, Visible]:
     """Return the points in enough images, and their images."""
-    sight = see(xyz, site, site.luck)
-    made = sight.paired
-    start = np.concatenate([sight.start[:-1][made], sight.start[-1:]])
+    imaged = find_visible(xyz, site, site.luck)
+    made = imaged.paired
+    start = np.concatenate([imaged.start[:-1][made], imaged.start[-1:]])
     point = np.repeat(np.arange(int(made.sum())), np.diff(start))
-    return xyz[made], replace(sight, truth=xyz[made], start=start, point=point)
+    return xyz[made], replace(imaged, truth=xyz[made], start=start, point=point)
 
 
 def _spread(xyz: FloatArray, above: FloatArray, control: int, checks: int) -> FloatArray:
@@ -172,7 +172,7 @@ def _far_apart(xyz: FloatArray, count: int) -> FloatArray:
 
 
 def _control(
-    xyz: FloatArray, marks: Sight, wet: BoolArray, control: int, chosen: SceneSettings
+    xyz: FloatArray, marks: Visible, wet: BoolArray, control: int, chosen: SceneSettings
 ) -> GroundControl:
     """Return surveyed points without noise; the first ones on land are control points."""
     rank = np.arange(len(xyz))

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import brentq, root
 
 
-def bend(direction, normal, n):
+def refract_ray(direction, normal, n):
     """Refract a downward unit direction by rotating it in the plane of incidence."""
     incidence = math.acos(min(1.0, -float(normal @ direction)))
     refraction = math.asin(math.sin(incidence) / n)
@@ -48,7 +48,7 @@ def correct_slowly(point, centres, plane, n):
         gap = centre[2] - (a + b * centre[0] + c * centre[1])
         reach = gap / (b * down[0] + c * down[1] - down[2])
         anchors.append(centre + reach * down - point)
-        directions.append(bend(down, normal, n))
+        directions.append(refract_ray(down, normal, n))
         angles.append(math.degrees(math.acos(min(1.0, -float(normal @ down)))))
     shift = stacked_intersection(anchors, directions)
     distances = [
@@ -110,7 +110,7 @@ def correct_under(surface, point, centres, n):
     for above, centre in zip(surfaces, centres, strict=True):
         at, normal = first_crossing(above, point, centre)
         anchors.append(at - point)
-        directions.append(bend((point - centre) / np.linalg.norm(point - centre), normal, n))
+        directions.append(refract_ray((point - centre) / np.linalg.norm(point - centre), normal, n))
     return point + stacked_intersection(anchors, directions)
 
 

@@ -59,9 +59,9 @@ def parted(scene: TieScene, ties: int) -> tuple[TieScene, TieScene]:
     return some_ties(scene, np.arange(ties)), some_ties(scene, np.arange(ties, len(scene.truth)))
 
 
-def apparent_cloud(made: Unaware, others: TieScene) -> FloatArray:
+def apparent_cloud(data: Unaware, others: TieScene) -> FloatArray:
     """Return where the unaware cameras see points, by straight rays."""
-    old, views = made.cameras, others.views
+    old, views = data.cameras, others.views
     return triangulate(
         others.ties.image_xy, old, views.camera, views.start, old.lenses[0], others.truth
     )

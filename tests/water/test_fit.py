@@ -279,8 +279,8 @@ def test_drawn_line(tmp_path):
         level.append(fit.level_m)
         sigma.append(fit.as_dict()["sigma_level_m"])
         naive.append(fit_water(xyz, model="level").as_dict()["sigma_level_m"])
-    error, said = np.sqrt(np.mean(np.square([level, sigma]), axis=1))
-    assert 0.75 < error / said < 1.3  # of 60: a standard deviation of 0.09
+    error, stated = np.sqrt(np.mean(np.square([level, sigma]), axis=1))
+    assert 0.75 < error / stated < 1.3  # of 60: a standard deviation of 0.09
     assert error / np.mean(naive) > 4.0
     with_tilt = sum(fit_water(xyz, counts=counts).model != "level" for xyz, counts in drawn[:15])
     assert with_tilt <= 3  # of 15 at 5 %: more in 1 of 100 cases

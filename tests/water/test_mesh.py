@@ -8,7 +8,7 @@ from scipy.spatial import Delaunay
 import pcfix
 from pcfix.water.surface import surface_above
 from tests.utils.nightly import mostly_nightly
-from tests.utils.twins import bend, stacked_intersection
+from tests.utils.twins import refract_ray, stacked_intersection
 
 UTM = np.array([512_000.0, 4_987_000.0, 100.0])
 
@@ -44,8 +44,10 @@ def test_all_facets():
         hits = [first_hit(vertices[triangles], centre, point) for centre in centres]
         anchors = [at - point for at, _ in hits]
         down = [(point - c) / np.linalg.norm(point - c) for c in centres]
-        bent = [bend(d, normal, 1.34) for d, (_, normal) in zip(down, hits, strict=True)]
-        expected = point + stacked_intersection(anchors, bent)
+        refracted = [
+            refract_ray(d, normal, 1.34) for d, (_, normal) in zip(down, hits, strict=True)
+        ]
+        expected = point + stacked_intersection(anchors, refracted)
         assert found == pytest.approx(expected, abs=1e-8)
 
 

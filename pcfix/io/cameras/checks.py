@@ -342,11 +342,11 @@ def lens_by_name(given: Mapping[str, float], width: float, height: float, **more
 
 
 def model_of(
-    path: Path, lens: Lens, models: Mapping[str, LensModel], *, whole: bool = False
+    path: Path, lens: Lens, models: Mapping[str, LensModel], *, integer: bool = False
 ) -> tuple[str, dict[str, float]]:
     """Return the simplest model that is exactly this lens, and its parameters in their order.
 
-    With `whole` the frame must be whole pixels. An `InputError` if there is no model for `path`.
+    With `integer` the frame must be whole pixels. An `InputError` if there is no model for `path`.
     """
     from pcfix.lens.imaging import project
 
@@ -361,7 +361,7 @@ def model_of(
     x, y = np.meshgrid(*(np.linspace(-0.5, 0.5, 8) * side for side in (lens.width, lens.height)))
     rays = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, lens.focal)])
     exact = project(lens, rays)
-    fits = not whole or (lens.unit == "px" and lens.width % 1.0 == lens.height % 1.0 == 0.0)
+    fits = not integer or (lens.unit == "px" and lens.width % 1.0 == lens.height % 1.0 == 0.0)
     alike = [one for one in models if models[one].projection == lens.projection] if fits else []
     for name in sorted(alike, key=lambda one: models[one].names.count(" ")):
         given = {one: values.get(one, 0.0) for one in models[name].names.split()}

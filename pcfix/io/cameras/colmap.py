@@ -319,7 +319,7 @@ def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = 
     number_of = {lens: i for i, lens in enumerate(dict.fromkeys(lenses), start=1)}
     listed = list[bytes]()
     for lens, i in number_of.items():
-        model, values = model_of(target, lens, WRITTEN, whole=True)
+        model, values = model_of(target, lens, WRITTEN, integer=True)
         size = int(lens.width), int(lens.height)
         listed.append(struct.pack("<IiQQ", i, MODELS.index(model), *size))
         listed.append(np.array([*values.values()], "<f8").tobytes())

@@ -56,7 +56,7 @@ TOPOCENTRIC = "reconstruction.topocentric.json"
 TOPOCENTRIC_LIMIT_M = 1e5
 SCALE_TOLERANCE = 0.1
 """Of the squared scale of a map projection, which excludes feet."""
-WHOLE_M = 2e-3
+ROUNDING_M = 2e-3
 """Newer ODM puts the origin at whole metres; reference_lla is rounded a little."""
 SAME_FOCAL = 1e-6
 GNSS_KEYS = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev")
@@ -136,8 +136,8 @@ def named_crs(path: Path) -> str:
 def _frame(files: Files, found: Reconstruction) -> AffineFrame | None:
     """Decide the frame, see the top of this module for the rules; None for OpenSfM's own."""
     crs, reference = _crs_of(files), found.reference
-    whole = None if reference is None else _located(*reference[:2], crs)
-    if not (whole or files.keys() & {*_OF_CRS, SHOTS, TOPOCENTRIC}):
+    located = None if reference is None else _located(*reference[:2], crs)
+    if not (located or files.keys() & {*_OF_CRS, SHOTS, TOPOCENTRIC}):
         return None
     unmoved = AffineFrame(np.eye(3), np.zeros(3), found.cameras.crs or "", crs)
     if reference is None or files["poses"].name == TOPOCENTRIC:
@@ -151,9 +151,9 @@ def _frame(files: Files, found: Reconstruction) -> AffineFrame | None:
             raise damaged(path, "it does not turn and shift the reconstruction")
         if named := _located(*reference[:2], crs, shift[:2]):  # else the file is of another origin
             return AffineFrame(turn, shift, named[0])
-    if whole is None:
+    if located is None:
         return unmoved
-    crs, place = whole
+    crs, place = located
     moved = AffineFrame(np.eye(3), np.array([*place, 0.0]), crs)
     # centres of shots.geojson, else the GNSS, which stays topocentric, show whether it was moved:
     # the two readings differ by the meridian convergence and the scale
@@ -186,7 +186,7 @@ def _located(
     zones = [f"EPSG:{first + (zone + step) % 60}" for step in (0, -1, 1)]
     for candidate in [crs] if crs else zones:
         there = _projected(candidate, lon, lat)
-        expected, within_m = (np.round(there), WHOLE_M) if place is None else (place, 1.0)
+        expected, within_m = (np.round(there), ROUNDING_M) if place is None else (place, 1.0)
         if np.linalg.norm(there - expected) < within_m:
             return candidate, expected
     return None

@@ -119,9 +119,9 @@ def _frame_of(project: Project) -> AffineFrame:
     path, scene = project.part("scene_reference_frame", "scene-reference-frame", needed=False)
     if not scene:  # the frame of the processing is arbitrary
         return AffineFrame(np.eye(3), np.zeros(3), "local")
-    way = scene["base_to_canonical"]
-    shift, scale = triple(way["shift"]), triple(way["scale"])
-    if way.get("swap_xy"):
+    canonical = scene["base_to_canonical"]
+    shift, scale = triple(canonical["shift"]), triple(canonical["scale"])
+    if canonical.get("swap_xy"):
         scale = scale[[1, 0, 2]]  # positions are east, north already, scales in the CRS's order
     stated = checks.crs(path, scene["crs"]["definition"])
     crs, unit = (stated, 1.0) if stated == "local" else _with_heights(stated, str(path))

@@ -98,7 +98,7 @@ class Record(VLR):  # type: ignore[misc]  # laspy is untyped
 
 
 class RecordList(VLRList):  # type: ignore[misc]
-    """VLRs for a laspy header; a `Record` is written as it was read."""
+    """VLRs for a laspy header; a `Record` is written unchanged."""
 
     def write_to(
         self, stream: BinaryIO, as_extended: bool = False, encoding_errors: str = "strict"
@@ -126,7 +126,7 @@ def read_records(stream: BinaryIO) -> tuple[list[Record], list[Record]]:
         raise ValueError(f"its version is {head[24]}.{head[25]}, and there are 1.0 to 1.4")
     start, points_start, count = struct.unpack_from("<HII", head, 94)
     if points_start > stream.seek(0, os.SEEK_END):  # laspy would read up to there
-        raise ValueError("its points begin behind its end")
+        raise ValueError("its points would begin after the end of the file")
     vlrs = _read(stream, start, count, _VLR, points_start)
     encoding, minor = head[6], head[25]
     if minor >= 4:

@@ -165,7 +165,7 @@ def _header(
 
 
 def corrected_identity(source: LasSource) -> bytes:
-    """Return the identity of a corrected or cleaned file: made by pcfix, else as it was."""
+    """Return the identity of a corrected or cleaned file: pcfix if changed, else the input's."""
     name = f"pcfix {__version__}".encode().ljust(32, b"\0")
     return source.identity[:32] + name + source.identity[64:]  # the generating software
 

@@ -35,7 +35,7 @@ class Sample:
 
     `path` is below the sample's folder. `frame` is the CRS of X, Y, Z where the file itself is
     geocentric. `seen` makes observations those of an image from its upper left corner. `apart_px`
-    and `apart_m` are how far we may be from what is expected, which is written with few digits.
+    and `distance_m` are how far we may be from what is expected, which is written with few digits.
     `rms_px` is the same for the RMS of all tie points, where the file has them. `images` of
     check.json are those that can be read, where not all can.
     """
@@ -48,7 +48,7 @@ class Sample:
     name_of: Callable = lambda image: image
     distorted: bool = True
     apart_px: float = 0.02
-    apart_m: float = 2e-4
+    distance_m: float = 2e-4
     rms_px: float | None = None
     images: tuple = ()
 
@@ -68,7 +68,7 @@ SAMPLES = {
     # the map scales in plan alone (0.9996), which no rotation can: in the corners
     "odm/testerarm_sub0": Sample(apart_px=0.06, rms_px=3e-3),
     "odm/hectorsosa": Sample(),
-    "odm/orthority_odm": Sample(apart_m=1e-3),
+    "odm/orthority_odm": Sample(distance_m=1e-3),
     "opensfm/berlin": Sample(rms_px=1e-3),
     "colmap/ar_boxes": Sample("bin", rms_px=1e-3),
     "colmap/wesley_dense": Sample(rms_px=1e-3),
@@ -161,8 +161,8 @@ def test_sample(name):
         for given in check["projection_centres"]
         if not told.images or given["image"] in told.images
     ]
-    apart_m, turned_deg = np.max(offs, axis=0)
-    assert apart_m < told.apart_m
+    distance_m, turned_deg = np.max(offs, axis=0)
+    assert distance_m < told.distance_m
     rough = "view_dir_approx" in check["projection_centres"][0]
     assert turned_deg < (APPROXIMATE_DEG if rough else VIEW_DEG)
 

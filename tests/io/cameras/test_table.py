@@ -110,15 +110,15 @@ def test_degrees(tmp_path, header, crs):
 
 
 @pytest.mark.parametrize(
-    ("said", "crs"),
+    ("stated", "crs"),
     [
         ("# CoordinateSystem: EPSG:32632", "EPSG:32632"),
         ("# crs: EPSG:25832+7837", "EPSG:25832+7837"),
         ('# CoordinateSystem: LOCAL_CS["Local Coordinates (m)",UNIT["metre",1]]', "local"),
     ],
 )
-def test_the_crs_of_a_comment(tmp_path, said, crs):
-    assert plain(tmp_path, said + "\n#Label,X,Y,Z\na,1,2,3\n").crs == crs
+def test_the_crs_of_a_comment(tmp_path, stated, crs):
+    assert plain(tmp_path, stated + "\n#Label,X,Y,Z\na,1,2,3\n").crs == crs
 
 
 # Angles

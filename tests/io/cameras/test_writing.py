@@ -19,7 +19,7 @@ from tests.utils.reprojection import bring_to
 
 FRAME = (1600.0, 1200.0, 810.0, 590.0)
 RAYS = np.random.default_rng(1).uniform([-0.4, -0.4, 1], [0.4, 0.4, 1], (50, 3))
-BENT = {"radial": (-0.1, 0.02, -0.003), "tangential": (1e-3, -2e-3)}
+DISTORTED = {"radial": (-0.1, 0.02, -0.003), "tangential": (1e-3, -2e-3)}
 FISH = {"projection": "equidistant"}
 COLMAP_LENSES = {
     "SIMPLE_PINHOLE": PLAIN,
@@ -27,7 +27,7 @@ COLMAP_LENSES = {
     "SIMPLE_RADIAL": Lens(1500.0, *FRAME, radial=(-0.1, 0.0)),
     "RADIAL": Lens(1500.0, *FRAME, radial=(-0.1, 0.02, 0.0)),
     "OPENCV": Lens(1500.0, *FRAME, b1=-2.0, radial=(-0.1, 0.02), tangential=(1e-3, -2e-3)),
-    "FULL_OPENCV": Lens(1500.0, *FRAME, **BENT, denominator=(0.01, 0.002)),
+    "FULL_OPENCV": Lens(1500.0, *FRAME, **DISTORTED, denominator=(0.01, 0.002)),
     "SIMPLE_RADIAL_FISHEYE": Lens(800.0, *FRAME, **FISH),
     "RADIAL_FISHEYE": Lens(800.0, *FRAME, **FISH, radial=(0.01, 0.002)),
     "OPENCV_FISHEYE": Lens(800.0, *FRAME, **FISH, radial=(0.01, 2e-3, 3e-4, 1e-5)),
@@ -50,7 +50,7 @@ COLMAP_LENSES = {
     "SIMPLE_DIVISION": Lens(1500.0, *FRAME, projection="division", shape=(-0.05,)),
     "EUCM": Lens(1500.0, *FRAME, projection="eucm", shape=(0.6, 1.1)),
 }
-OPENCV = Lens(1500.0, *FRAME, **BENT, denominator=(0.01, 0.0, 0.002))
+OPENCV = Lens(1500.0, *FRAME, **DISTORTED, denominator=(0.01, 0.0, 0.002))
 FOUR = Lens(1400.0, *FRAME, radial=(-0.1, 0.02, -0.003, 1e-4), tangential=(1e-3, -2e-3))
 FILM = Lens(3.6, 3.8, 2.8, 1.9, 1.4, unit="mm")
 

@@ -8,7 +8,15 @@ from functools import lru_cache
 import numpy as np
 
 from pcfix.model import Views
-from pcfix.simulate.scene import Scene, lay_out, points_on, scene_of, see, simulate_scene, starts
+from pcfix.simulate.scene import (
+    Scene,
+    find_visible,
+    lay_out,
+    points_on,
+    scene_of,
+    simulate_scene,
+    starts,
+)
 from pcfix.simulate.settings import SceneSettings
 from pcfix.simulate.terrain import Terrain
 from tests.utils.matchers.depth_maps import fuse_depth_maps, keep_single_maps, stereo_models
@@ -37,27 +45,27 @@ def matched_scene(points: int, *, cloud: str = "tracks", **keywords) -> Scene:
     sure, parts = replace(site, detection=1.0), []
     if cloud == "pairs":
         sample = truth[:: max(1, len(truth) // SAMPLE)][:SAMPLE]
-        table = neighbour_table(see(sample, sure, rng), count)
+        table = neighbour_table(find_visible(sample, sure, rng), count)
     elif cloud in ("single-map", "nearest-map"):
         partners = stereo_models(site.given, float(np.median(truth[:, 2])), count)
         table = partners.matched
     else:
         sample = points_on(site.terrain, max(TIES, 10 * len(site.true)), rng)
-        every = see(sample, sure, rng)
+        every = find_visible(sample, sure, rng)
         partners = openmvs_partners(every.intersected(every.ideal), every, count, rng)
         table = partners.matched
 
     at_once = max(1, PAIRS_AT_ONCE // len(site.true))
     for some in np.split(truth, range(at_once, len(truth), at_once)):
-        sight = see(some, site, site.luck)
+        imaged = find_visible(some, site, site.luck)
         if cloud == "depth-maps":
             normals = normals_of(site.terrain, *some[:, :2].T)
-            parts.append(fuse_depth_maps(sight, normals, partners, matching))
+            parts.append(fuse_depth_maps(imaged, normals, partners, matching))
         elif cloud in ("single-map", "nearest-map"):
             normals, nearest = normals_of(site.terrain, *some[:, :2].T), cloud == "nearest-map"
-            parts.append(keep_single_maps(sight, normals, partners, matching, nearest=nearest))
+            parts.append(keep_single_maps(imaged, normals, partners, matching, nearest=nearest))
         else:
-            parts.append(match_pairs(sight, table, matching))
+            parts.append(match_pairs(imaged, table, matching))
     xyz, true, camera, counts, *weight = map(np.concatenate, zip(*parts, strict=True))
     scene = vars(scene_of(chosen, site, xyz, true, Views(starts(counts), camera, *weight)))
     return MatchedScene(**scene, neighbours=table)

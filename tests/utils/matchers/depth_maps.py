@@ -32,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.model import Cameras, FloatArray, IntArray, Lens
-from pcfix.simulate.scene import Sight
+from pcfix.simulate.scene import Visible
 from pcfix.simulate.tracing import piercing_points_of_planes, project, rotations_of
 from tests.utils.bed_rays import bed_points
 from tests.utils.matchers.pairs import Partners, rows_of
@@ -83,32 +83,32 @@ class Maps(NamedTuple):
 
 
 def fuse_depth_maps(
-    sight: Sight, normals: FloatArray, partners: Partners, rng: np.random.Generator
+    imaged: Visible, normals: FloatArray, partners: Partners, rng: np.random.Generator
 ) -> tuple[np.ndarray, ...]:
     """Return a fused point for each place of the bed, its truth, images, their number and weight.
 
     A place with fewer than three matching depth maps is not moved and has no cameras. `normals`,
     shape (n, 3), are unit normals of the true surface; `rng` makes noise and selects points.
     """
-    site, matching = sight.site, _Matching(sight, normals, partners, rng)
-    luck = rng.uniform(0.0, 1.0, len(sight.point))
-    place = sight.intersected(sight.ideal)
+    site, matching = imaged.site, _Matching(imaged, normals, partners, rng)
+    luck = rng.uniform(0.0, 1.0, len(imaged.point))
+    place = imaged.intersected(imaged.ideal)
     maps = matching.maps(place)
     seed, group = matching.groups(maps, luck)
     seeded = np.flatnonzero(seed >= 0)
     place[seeded] = maps.points(seed[seeded], maps.averaged[seed[seeded]])
     maps = matching.maps(place)
-    rows = np.flatnonzero((group >= 0) & (group == seed[sight.point]))
+    rows = np.flatnonzero((group >= 0) & (group == seed[imaged.point]))
     # without those whose depth is not that of their point's place
-    _, z = project(place[sight.point[rows]], site.given, sight.camera[rows], site.optics.lens)
+    _, z = project(place[imaged.point[rows]], site.given, imaged.camera[rows], site.optics.lens)
     rows = rows[np.abs(maps.averaged[rows] - z) < AGREE * z]
-    count = np.bincount(sight.point[rows], minlength=len(seed))
-    rows = rows[count[sight.point[rows]] >= LEAST_FUSED]
-    point, weight = sight.point[rows], 1.0 / maps.averaged[rows] ** 2
+    count = np.bincount(imaged.point[rows], minlength=len(seed))
+    rows = rows[count[imaged.point[rows]] >= LEAST_FUSED]
+    point, weight = imaged.point[rows], 1.0 / maps.averaged[rows] ** 2
     xyz = maps.points(rows, maps.averaged[rows])
-    fused, true = (_means(v, weight, point, sight.truth) for v in (xyz, maps.shown[rows]))
+    fused, true = (_means(v, weight, point, imaged.truth) for v in (xyz, maps.shown[rows]))
     count = np.bincount(point, minlength=len(fused))
-    return fused, true, sight.camera[rows], count, weight.astype(np.float32)
+    return fused, true, imaged.camera[rows], count, weight.astype(np.float32)
 
 
 BASE_TO_HEIGHT, BEST_BASE, AXES_WITHIN_DEG, LEAST_MODELS = (0.1, 0.5), 0.25, 30.0, 3
@@ -131,7 +131,7 @@ def stereo_models(cameras: Cameras, ground_m: float, count: int) -> Partners:
 
 
 def keep_single_maps(
-    sight: Sight, normals: FloatArray, partners: Partners, rng: np.random.Generator, *,
+    imaged: Visible, normals: FloatArray, partners: Partners, rng: np.random.Generator, *,
     nearest: bool,
 ) -> tuple[np.ndarray, ...]:  # fmt: skip
     """Return a point of each place along the ray of one base image; see `fuse_depth_maps`.
@@ -140,44 +140,44 @@ def keep_single_maps(
     base image was compared with, three or more. The base image is the nearest in plan or drawn by
     lot. A place without one is not moved and has no cameras.
     """
-    matching = _Matching(sight, normals, partners, rng)
-    place = sight.intersected(sight.ideal)
+    matching = _Matching(imaged, normals, partners, rng)
+    place = imaged.intersected(imaged.ideal)
     maps = matching.maps(place, best_pair=False)
     possible = (matching.partner >= 0).sum(axis=1) >= LEAST_MODELS
     rows = np.flatnonzero(possible & np.isfinite(maps.depth))
-    centres = sight.site.given.centres[sight.camera[rows], :2]
-    distance = np.linalg.norm(centres - place[sight.point[rows], :2], axis=1)
-    order = np.lexsort((distance if nearest else rng.uniform(size=len(rows)), sight.point[rows]))
-    point, first = np.unique(sight.point[rows[order]], return_index=True)
+    centres = imaged.site.given.centres[imaged.camera[rows], :2]
+    distance = np.linalg.norm(centres - place[imaged.point[rows], :2], axis=1)
+    order = np.lexsort((distance if nearest else rng.uniform(size=len(rows)), imaged.point[rows]))
+    point, first = np.unique(imaged.point[rows[order]], return_index=True)
     base = rows[order[first]]
-    true = sight.truth.copy()
+    true = imaged.truth.copy()
     place[point], true[point] = maps.points(base, maps.depth[base]), maps.seen[base]
     place[~np.isin(np.arange(len(place)), point)] = true[~np.isin(np.arange(len(place)), point)]
     count = np.zeros(len(place), int)
     count[point] = 1
-    return place, true, sight.camera[base], count
+    return place, true, imaged.camera[base], count
 
 
 class _Matching:
-    """What the depths of all m references, the rows of `sight`, are found with.
+    """What the depths of all m references, the rows of `imaged`, are found with.
 
-    `water` has an anchor and a normal for each row of `sight`, `normals` the bed's for each point.
-    Partners and neighbours are rows of `sight`, -1 for none, shape (m, c), (m, 8) and (m, 12).
+    `water` has an anchor and a normal for each row of `imaged`, `normals` the bed's for each point.
+    Partners and neighbours are rows of `imaged`, -1 for none, shape (m, c), (m, 8) and (m, 12).
     Partner j of row i has the image noise ``noise_px[i, j]`` and the extra cost ``cost_px2[i, j]``.
     """
 
     def __init__(
-        self, sight: Sight, normals: FloatArray, partners: Partners, rng: np.random.Generator
+        self, imaged: Visible, normals: FloatArray, partners: Partners, rng: np.random.Generator
     ) -> None:
-        site, row_of = sight.site, rows_of(sight)
+        site, row_of = imaged.site, rows_of(imaged)
 
         def there(table: IntArray) -> IntArray:
             """Return the rows of the images that a table names for the image of each row."""
-            others = table[sight.camera]
-            return np.where(others >= 0, row_of[sight.point[:, None], others], -1)
+            others = table[imaged.camera]
+            return np.where(others >= 0, row_of[imaged.point[:, None], others], -1)
 
-        self.sight, self.normals, self.known = sight, normals, partners.known
-        self.water = site.water.planes(len(sight.point))
+        self.imaged, self.normals, self.known = imaged, normals, partners.known
+        self.water = site.water.planes(len(imaged.point))
         self.partner = there(partners.matched)
         self.partner[(self.partner >= 0).sum(axis=1) < LEAST_PARTNERS] = -1
         self.averaged, self.fused = there(partners.averaged), there(partners.fused)
@@ -187,14 +187,14 @@ class _Matching:
 
     def maps(self, place: FloatArray, *, best_pair: bool = True) -> Maps:
         """Return the depths of all references along their rays through a place of each point."""
-        sight, site = self.sight, self.sight.site
-        point, camera, lens = sight.point, sight.camera, site.optics.lens
+        imaged, site = self.imaged, self.imaged.site
+        point, camera, lens = imaged.point, imaged.camera, site.optics.lens
         pixels, depth = project(place[point], site.given, camera, lens)
         seen = bed_points(
             site.true.centres[camera],
             _rays(pixels, site.true, camera, lens),
             self.water,
-            (sight.truth[point], self.normals[point]),
+            (imaged.truth[point], self.normals[point]),
             site.water.refractive_index,
         )
         origin, ray = site.given.centres[camera], _rays(pixels, site.given, camera, lens)
@@ -210,11 +210,11 @@ class _Matching:
 
         From a first depth.
         """
-        site, (reference, slot) = self.sight.site, np.nonzero(self.partner >= 0)
+        site, (reference, slot) = self.imaged.site, np.nonzero(self.partner >= 0)
         row = self.partner[reference, slot]
         measured = self._measured(row, seen[reference], self.noise_px[reference, slot])
         origin, ray, first = rays
-        camera, given, lens = self.sight.camera[row], site.given, site.optics.lens
+        camera, given, lens = self.imaged.camera[row], site.given, site.optics.lens
         turn = rotations_of(given)[camera]
         sightings = Sightings(
             reference,
@@ -244,8 +244,8 @@ class _Matching:
         return np.where(np.abs(depth - first) < MOST_OFF * first, depth, np.nan)
 
     def _measured(self, row: IntArray, seen: FloatArray, noise_px: FloatArray) -> FloatArray:
-        """Return where the images of some rows of `sight` show places of the bed, ideal pixels."""
-        site, camera = self.sight.site, self.sight.camera[row]
+        """Return where the images of some rows of `imaged` show places of the bed, ideal pixels."""
+        site, camera = self.imaged.site, self.imaged.camera[row]
         anchors, normals = (part[row] for part in self.water)
         centres, n = site.true.centres[camera], site.water.refractive_index
         surface = piercing_points_of_planes(seen, centres, anchors, normals, n)
@@ -261,7 +261,7 @@ class _Matching:
         rows = np.arange(len(maps.depth))
         total, shown, agreeing = maps.depth.copy(), maps.seen.copy(), np.ones(len(rows))
         disagreeing = np.zeros(len(rows))
-        normal = self.normals[self.sight.point]
+        normal = self.normals[self.imaged.point]
         for neighbour in self.averaged.T:
             # where the ray meets the neighbour's map, a plane through its point parallel to the bed
             own = np.flatnonzero(neighbour >= 0)
@@ -274,36 +274,38 @@ class _Matching:
             shown[agrees] += maps.seen[neighbour[agrees]]
             agreeing += agrees
             disagreeing += np.isfinite(depth) & ~agrees
-        kept = (agreeing > 1.0) & (agreeing > disagreeing) & (agreeing + disagreeing > LEAST_COVER)
-        depth = np.where(kept, total / agreeing, np.nan)
+        accepted = (
+            (agreeing > 1.0) & (agreeing > disagreeing) & (agreeing + disagreeing > LEAST_COVER)
+        )
+        depth = np.where(accepted, total / agreeing, np.nan)
         return depth, shown / agreeing[:, None]
 
     def groups(self, maps: Maps, luck: FloatArray) -> tuple[IntArray, IntArray]:
         """Return the seed of the luckiest point of each place, and the seed that used up each row.
 
-        Both are rows of `sight`, -1 where there is none.
+        Both are rows of `imaged`, -1 where there is none.
         """
-        sight = self.sight
-        chosen, group = np.full(len(sight.start) - 1, -1), np.full(len(sight.point), -1)
+        imaged = self.imaged
+        chosen, group = np.full(len(imaged.start) - 1, -1), np.full(len(imaged.point), -1)
         free = np.isfinite(maps.averaged)
         for camera in np.argsort(-self.known, kind="stable"):
-            seeds = np.flatnonzero((sight.camera == camera) & free)
+            seeds = np.flatnonzero((imaged.camera == camera) & free)
             there = self.fused[seeds]
             # how far beyond the points of the seeds these maps are, relative
             at = maps.points(seeds, maps.averaged[seeds])[:, None]
-            normal = self.normals[sight.point[seeds]][:, None]
+            normal = self.normals[imaged.point[seeds]][:, None]
             reach = (maps.averaged[there][..., None] * maps.ray[there] * normal).sum(axis=2)
             distance = reach / ((at - maps.origin[there]) * normal).sum(axis=2) - 1.0
             usable = (there >= 0) & free[there]
             members = usable & (np.abs(distance) < AGREE)
-            kept = 1 + members.sum(axis=1) >= LEAST_FUSED
+            accepted = 1 + members.sum(axis=1) >= LEAST_FUSED
             behind = usable & (distance >= AGREE)
-            free[there[(members | behind) & kept[:, None]]] = False
-            seeds, there, members = seeds[kept], there[kept], members[kept]
+            free[there[(members | behind) & accepted[:, None]]] = False
+            seeds, there, members = seeds[accepted], there[accepted], members[accepted]
             free[seeds] = False
             group[seeds] = seeds
             group[there[members]] = np.repeat(seeds, members.sum(axis=1))
-            point = sight.point[seeds]
+            point = imaged.point[seeds]
             luckier = (chosen[point] < 0) | (luck[seeds] > luck[chosen[point]])
             chosen[point[luckier]] = seeds[luckier]
         return chosen, group

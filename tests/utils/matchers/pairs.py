@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.model import FloatArray, IntArray
-from pcfix.simulate.scene import Sight, starts
+from pcfix.simulate.scene import Visible, starts
 from pcfix.simulate.tracing import rotations_of, triangulate
 
 SAMPLE = 1000
@@ -46,17 +46,17 @@ class Partners(NamedTuple):
     known: IntArray
 
 
-def neighbour_table(sight: Sight, count: int) -> IntArray:
+def neighbour_table(imaged: Visible, count: int) -> IntArray:
     """Return the best neighbours of each image, shape (k, count), best first, -1 for none.
 
     An image scores for every common point, by a bell about an angle of 10 degrees between the rays,
     wider above: in the manner of OpenMVS.
     """
-    centres = sight.site.true.centres
+    centres = imaged.site.true.centres
     k = len(centres)
     score = np.zeros((k, k))
-    for i, place in enumerate(sight.truth):
-        seen = sight.camera[sight.start[i] : sight.start[i + 1]]
+    for i, place in enumerate(imaged.truth):
+        seen = imaged.camera[imaged.start[i] : imaged.start[i + 1]]
         ray = centres[seen] - place
         ray /= np.linalg.norm(ray, axis=1)[:, None]
         angle = np.degrees(np.arccos(np.clip(ray @ ray.T, -1.0, 1.0)))
@@ -70,7 +70,7 @@ def neighbour_table(sight: Sight, count: int) -> IntArray:
 
 
 def openmvs_partners(
-    ties: FloatArray, sight: Sight, count: int, rng: np.random.Generator
+    ties: FloatArray, imaged: Visible, count: int, rng: np.random.Generator
 ) -> Partners:
     """Return the partners that OpenMVS 2.3 would choose (`Scene::SelectNeighborViews`).
 
@@ -79,14 +79,14 @@ def openmvs_partners(
     the least score are not modelled. `ties`, shape (p, 3), are the reconstructed tie points,
     `count` the partners of a depth map; `rng` selects which features are found.
     """
-    cameras, optics = sight.site.given, sight.site.optics
+    cameras, optics = imaged.site.given, imaged.site.optics
     k = len(cameras)
     # the cell of each image in which each tie point is found, shape (k, p), -1 for none
     cell = np.full((k, len(ties)), -1)
-    share = optics.to_image(sight.ideal) / [optics.lens.width, optics.lens.height]
+    share = optics.to_image(imaged.ideal) / [optics.lens.width, optics.lens.height]
     column, row = np.clip((CELLS * share).astype(int), 0, CELLS - 1).T
-    cell[sight.camera, sight.point] = row * CELLS + column
-    cell[_lost(ties, sight, cameras.centres, rng)] = -1
+    cell[imaged.camera, imaged.point] = row * CELLS + column
+    cell[_lost(ties, imaged, cameras.centres, rng)] = -1
     axes = rotations_of(cameras)[:, 2]
     depth = np.einsum("ki,kpi->kp", axes, ties - cameras.centres[:, None])
     table, known = np.full((k, max(MOST, count)), -1), np.zeros(k, int)
@@ -116,59 +116,61 @@ def openmvs_partners(
             good &= (mean >= low) & (mean <= high)
         order = np.argsort(-score, kind="stable")
         order = order[counts[order] >= LEAST_COMMON]
-        kept = list(order)
+        retained = list(order)
         for candidate in order[::-1]:  # bad ones go, from the worst up, while more than nine remain
-            if len(kept) > LEAST_LEFT and not good[candidate]:
-                kept.remove(candidate)
-        kept = kept[: table.shape[1]]
-        table[i, : len(kept)], known[i] = kept, len(order)
-        strong = [one for one in kept[:count] if score[one] >= LEAST_SCORE * score[kept[0]]]
+            if len(retained) > LEAST_LEFT and not good[candidate]:
+                retained.remove(candidate)
+        retained = retained[: table.shape[1]]
+        table[i, : len(retained)], known[i] = retained, len(order)
+        strong = [one for one in retained[:count] if score[one] >= LEAST_SCORE * score[retained[0]]]
         matched[i, : len(strong)] = strong
     return Partners(matched, table[:, :AVERAGED], table[:, :MOST], known)
 
 
 def _lost(
-    ties: FloatArray, sight: Sight, centres: FloatArray, rng: np.random.Generator
+    ties: FloatArray, imaged: Visible, centres: FloatArray, rng: np.random.Generator
 ) -> tuple[IntArray, IntArray]:
     """Return cameras and points where a feature is not found again."""
     luck = rng.uniform(0.0, 1.0, len(ties))
-    home = sight.start[:-1] + (luck * np.diff(sight.start)).astype(int)
-    first = np.minimum(home, max(0, len(sight.camera) - 1))[sight.point]
-    ray = centres[sight.camera] - ties[sight.point]
+    home = imaged.start[:-1] + (luck * np.diff(imaged.start)).astype(int)
+    first = np.minimum(home, max(0, len(imaged.camera) - 1))[imaged.point]
+    ray = centres[imaged.camera] - ties[imaged.point]
     ray /= np.linalg.norm(ray, axis=1)[:, None]
     cosine = np.einsum("mi,mi->m", ray, ray[first])
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     gone = rng.uniform(0.0, 1.0, len(ray)) > np.exp(-((angle / FOUND_AGAIN_DEG) ** 2))
-    return sight.camera[gone], sight.point[gone]
+    return imaged.camera[gone], imaged.point[gone]
 
 
-def rows_of(sight: Sight) -> IntArray:
+def rows_of(imaged: Visible) -> IntArray:
     """Return the row of each point and camera, shape (n, k), -1 where there is none."""
-    rows = np.full((len(sight.truth), len(sight.site.true)), -1)
-    rows[sight.point, sight.camera] = np.arange(len(sight.point))
+    rows = np.full((len(imaged.truth), len(imaged.site.true)), -1)
+    rows[imaged.point, imaged.camera] = np.arange(len(imaged.point))
     return rows
 
 
-def match_pairs(sight: Sight, table: IntArray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+def match_pairs(
+    imaged: Visible, table: IntArray, rng: np.random.Generator
+) -> tuple[np.ndarray, ...]:
     """Return the medians of the pairs of each point, the true points, and the images in pairs.
 
     A point without a pair stays where it is and has no cameras. `table`, shape (k, c), has the
     neighbours of each camera, -1 for none; `rng` makes the noise, of two image points a pair.
     """
     # the rows that are pairs, each once, sorted by point, then camera
-    k, rows = len(table), rows_of(sight)
+    k, rows = len(table), rows_of(imaged)
     match = np.zeros((k, k + 1), bool)
     match[np.arange(k)[:, None], table] = True  # the column k, or -1, is for "none"
     match = match[:, :k]
     first, second = np.nonzero(np.triu(match | match.T, 1))
     owner, pair = np.nonzero((rows[:, first] >= 0) & (rows[:, second] >= 0))
     one, other = rows[owner, first[pair]], rows[owner, second[pair]]
-    site, truth, point = sight.site, sight.truth, sight.point[one]
+    site, truth, point = imaged.site, imaged.truth, imaged.point[one]
     both = np.column_stack([one, other]).ravel()
     places = triangulate(
-        site.observed(sight.ideal[both], rng),
+        site.observed(imaged.ideal[both], rng),
         site.given,
-        sight.camera[both],
+        imaged.camera[both],
         np.arange(0, len(both) + 1, 2),
         site.optics.lens,
         truth[point],
@@ -179,7 +181,7 @@ def match_pairs(sight: Sight, table: IntArray, rng: np.random.Generator) -> tupl
     for axis in range(3):
         ordered = places[np.lexsort((places[:, axis], point)), axis]
         xyz[paired, axis] = (ordered[low[paired]] + ordered[high[paired]]) / 2.0
-    used = np.zeros(len(sight.point), bool)
+    used = np.zeros(len(imaged.point), bool)
     used[both] = True
-    count = np.bincount(sight.point[used], minlength=len(truth))
-    return xyz, truth, sight.camera[used], count
+    count = np.bincount(imaged.point[used], minlength=len(truth))
+    return xyz, truth, imaged.camera[used], count

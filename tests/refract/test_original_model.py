@@ -73,27 +73,27 @@ def some_points():
 )
 def test_maps_of_original_model(maps, metric):
     """Fused by a slow twin that traces light in one geometry and matches in the other."""
-    made = absorbed()
-    weights = 1.0 / ((made.centres[list(maps)] - [3.0, 4.0, -4.0]) ** 2).sum(axis=1)
+    original = absorbed()
+    weights = 1.0 / ((original.centres[list(maps)] - [3.0, 4.0, -4.0]) ** 2).sum(axis=1)
     matched = [[j for j in row if j >= 0] for row in MATCHED]
     planes = [(WATER.a, WATER.b, WATER.c)] * 8
-    came, true = fused_slowly(
+    apparent, true = fused_slowly(
         np.array([3.0, 4.0, -4.3]), maps, weights, CAMERAS, matched, planes, (-6.0, 0.0, 0.0),
-        N_WATER, TOLERANCE, metric, made,
+        N_WATER, TOLERANCE, metric, original,
     )  # fmt: skip
     views = replace(listed([maps]), weight=(weights / weights.sum()).astype(np.float32))
-    learned = Learned(matcher=matcher(made))
+    learned = Learned(matcher=matcher(original))
     for start in (
-        came,
-        came + np.array([0.3, -0.2, 0.4]),
+        apparent,
+        apparent + np.array([0.3, -0.2, 0.4]),
     ):  # the place it is counted from does not matter
-        result = run(start[None], views, learned, OriginalModel(came[None], made))
+        result = run(start[None], views, learned, OriginalModel(apparent[None], original))
         assert result.outcome.tolist() == [Outcome.CORRECTED]
         # ways are balanced as shares of the distances, and angles stand for pixels, so that other
         # pairs are the best ones: as of one set of cameras, with residuals of some pixels
         assert start + result.shift_m[0] == pytest.approx(true, abs=0.01)
-    wrong = run(came[None], views, learned, None)
-    assert np.abs(came + wrong.shift_m[0] - true).max() > 0.1
+    wrong = run(apparent[None], views, learned, None)
+    assert np.abs(apparent + wrong.shift_m[0] - true).max() > 0.1
 
 
 SCALE, SHIFT = 1.03, np.array([5.0, -3.0, 2.0])
@@ -111,7 +111,7 @@ def test_transformed_block(kind):
     def elsewhere(xyz):
         return SCALE * xyz @ turned.T + SHIFT
 
-    made = replace(
+    original = replace(
         CAMERAS, centres=elsewhere(CAMERAS.centres), rotations=CAMERAS.rotations @ turned.T
     )
     xyz = some_points()
@@ -120,8 +120,8 @@ def test_transformed_block(kind):
     bed = Bed(np.full((1, 1), -5.0), -20.0, -20.0, 50.0)
     one = run(xyz, views, Learned(matcher=matcher(CAMERAS, True), bed=bed), None, matching)
     other = run(
-        xyz, views, Learned(matcher=matcher(made, True), bed=bed),
-        OriginalModel(elsewhere(xyz), made), matching,
+        xyz, views, Learned(matcher=matcher(original, True), bed=bed),
+        OriginalModel(elsewhere(xyz), original), matching,
     )  # fmt: skip
     assert (one.outcome == Outcome.CORRECTED).all()
     assert np.array_equal(one.outcome, other.outcome)
@@ -133,23 +133,23 @@ def test_transformed_block(kind):
 @pytest.mark.parametrize("with_list", [True, False], ids=["list", "no list"])
 def test_land(with_list):
     """A twin fuses land, that is, a bed in water that does not refract."""
-    made, maps = absorbed(), MIXED if with_list else (0,)
-    weights = 1.0 / ((made.centres[list(maps)] - [3.0, 4.0, 2.0]) ** 2).sum(axis=1)
+    original, maps = absorbed(), MIXED if with_list else (0,)
+    weights = 1.0 / ((original.centres[list(maps)] - [3.0, 4.0, 2.0]) ** 2).sum(axis=1)
     matched = [[j for j in row if j >= 0] for row in MATCHED]
-    came, true = fused_slowly(
+    apparent, true = fused_slowly(
         np.array([3.0, 4.0, 2.2]), maps, weights, CAMERAS, matched, [(50.0, 0.0, 0.0)] * 8,
-        (2.0, 0.0, 0.0), 1.0, TOLERANCE, "angles", made,
+        (2.0, 0.0, 0.0), 1.0, TOLERANCE, "angles", original,
     )  # fmt: skip
     settings = ScienceOptions(method="consistent", index=N_WATER)
-    alone = matcher(made)._replace(fused=np.full((8, 12), -1))
+    alone = matcher(original)._replace(fused=np.full((8, 12), -1))
     views = listed([maps]) if with_list else None
     batch = batch_of(
-        came[None], surface_above(WATER, came[None]), WATER, CAMERAS, settings, views,
-        learned=Learned(matcher=alone), original_model=OriginalModel(came[None], made),
+        apparent[None], surface_above(WATER, apparent[None]), WATER, CAMERAS, settings, views,
+        learned=Learned(matcher=alone), original_model=OriginalModel(apparent[None], original),
     )  # fmt: skip
     shift = shift_of_land(batch)
     if with_list:
-        assert came + shift[0] == pytest.approx(true, abs=0.01)
+        assert apparent + shift[0] == pytest.approx(true, abs=0.01)
     else:  # each image alone may have made it
         assert np.isfinite(shift).all() and np.abs(shift).max() > 0.1
     tracks = replace(listed([MIXED]), kind="tracks")
