@@ -99,7 +99,7 @@ def rays_in_frame(xyz: np.ndarray, cameras: Cameras) -> np.ndarray:
 def level_as_given() -> Iterator[None]:
     """Points at random show no level; to look for one there takes longer than to correct them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(CloudSample, "level_doubts", lambda sample: ())
+        patch.setattr(CloudSample, "level_notes", lambda sample: ())
         yield
 
 

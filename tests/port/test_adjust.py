@@ -111,7 +111,7 @@ def test_port_from_noisy_images(tmp_path, port, free):
         row = written[name]
         assert abs(row["after"] - value) < 3.5 * row["sigma"]
         assert abs(row["before"] - value) > 0.0 or value == 0.0
-    assert f"--port {written['surface']}" in adjustment_text(summary)
+    assert f"--port {written['surface']}" in " ".join(adjustment_text(summary).split())
     options = AdjustOptions(port=port, free=(free,))
     words = correct_words(found, "model", tmp_path / "out", options)
     assert words.endswith(f"--port {written['surface']}")

@@ -270,6 +270,7 @@ def drawn_by_hand(seed, folder, every_m=30.0, off_m=0.3):
     return xyz, shore.counts
 
 
+@pytest.mark.filterwarnings("ignore::pcfix.PcfixWarning")  # the file names no CRS
 def test_drawn_line(tmp_path):
     """Of 300 points along it 11 were drawn: its standard error is theirs."""
     level, sigma, naive = [], [], []
