@@ -49,7 +49,7 @@ def main(tokens: Sequence[str] | None = None) -> None:
         _end_by_signals(ended)
         # Modules and kernels are hundreds of thousands of permanent objects. Collecting garbage
         # among them, often and at the end, took a fifth of the start.
-        gc.set_threshold(50_000, 20, 50)
+        gc.set_threshold(500_000, 20, 50)
         atexit.register(gc.freeze)
         _run(arguments)
     except (CycloptsError, UsageError) as error:
