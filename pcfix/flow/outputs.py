@@ -283,7 +283,8 @@ def report_run(
         project=options.project or "", date=options.date or "", **more,
     )  # fmt: skip
     shown = (
-        f"{tile.title} {tile.tag}: " + ", ".join(f"{name} {value}" for name, value in tile.figures)
+        f"{', '.join(filter(None, [tile.title, tile.tag]))}: "
+        + ", ".join(f"{name} {value}" for name, value in tile.figures)
         for tile in page.tiles
         if tile.figures
     )
