@@ -320,13 +320,13 @@ def _likely_field(problem: Problem, tile: IntArray, sigma0: float, rest: FloatAr
     count = np.bincount(tile)
     middle = [np.bincount(tile, given.image_xy[:, i] / half_px) / count for i in range(2)]
     sensor = np.bincount(tile, given.group[given.camera]) / count
-    apart = np.sum([(axis - axis[:, None]) ** 2 for axis in middle], axis=0)
+    distance2 = np.sum([(axis - axis[:, None]) ** 2 for axis in middle], axis=0)
     is_same_sensor = sensor == sensor[:, None]
     # in the eigenvectors of K R K' the pulls are independent, so that the likelihood is a product
     likely, halves = np.zeros((len(RANGES), len(STEPS))), []
     square = (LARGEST_PX * STEPS**3) ** 2  # dense where s is small
     for i, length in enumerate(RANGES):
-        common = np.where(is_same_sensor, np.exp(-0.5 * apart / length**2), 0.0)
+        common = np.where(is_same_sensor, np.exp(-0.5 * distance2 / length**2), 0.0)
         half = np.linalg.cholesky(np.kron(common, np.eye(2)) + 1e-9 * one)
         halves.append(half)
         value, vector = np.linalg.eigh(half.T @ rest[:, :-1] @ half)

@@ -150,7 +150,7 @@ def make_tiles(xyz: FloatArray, points: int | None = None) -> Tiles:
 
 
 def spacing_m(xyz: FloatArray, side_m: float) -> float:
-    """Return the spacing of points (n, 3) within the squares of the plan with any; 0 on a line."""
+    """Return the spacing of points (n, 3) in plan, over squares with points; 0 on a line."""
     squares, more = np.empty(0, np.int64), list[IntArray]()
     for rows in blocks(len(xyz)):
         column, row = np.floor(xyz[rows, :2] / side_m).astype(np.int64).T

@@ -103,8 +103,8 @@ class RunFolder:
         """Return a hash for each step, of its options, its input files and the step before it."""
         settings, files, results = self.settings(), self.files(), self.folder.resolve()
         # files that are read with a named one, such as sensor.csv, may appear later
-        beside = {one for path in self._named for one in belonging(path)}
-        files["adjust"] += sorted(one for one in beside if results not in one.resolve().parents)
+        read_too = {one for path in self._named for one in belonging(path)}
+        files["adjust"] += sorted(one for one in read_too if results not in one.resolve().parents)
         keys, key = dict[str, str](), ""
         for step in STEPS:
             options = sorted(one for one in settings.items() if LATER.get(one[0], "adjust") == step)

@@ -168,12 +168,12 @@ def _parameter(one: dict[str, Any]) -> Any:
         behaviour = file.Folder if kind == "folder" else file.File
         clouds = {"fileFilter": CLOUDS} if kind == "cloud" else {}
         return file(name, label, behaviour, optional=optional, **clouds)
-    made = None, optional, not optional
+    default = None, optional, not optional
     if kind == "folder written":
-        return core.QgsProcessingParameterFolderDestination(name, label, *made)
+        return core.QgsProcessingParameterFolderDestination(name, label, *default)
     if kind == "written":
         filters = OUTPUTS if one["needed"] else "All files (*.*)"
-        return core.QgsProcessingParameterFileDestination(name, label, filters, *made)
+        return core.QgsProcessingParameterFileDestination(name, label, filters, *default)
     return core.QgsProcessingParameterString(name, label, default, False, optional)
 
 
