@@ -73,7 +73,7 @@ def _restoring(plan: None, source: LasSource) -> FileWork:
         ours = np.asarray(~moved & (points.array["WaterDepth"] > 0))
         withheld = np.asarray(points["withheld"]).astype(bool)
         points["withheld"][:] = (withheld & ~ours).astype(np.uint8)
-        shift = np.column_stack([points.array[name] for name in SHIFTS]).astype(np.int64)
+        shift = np.array([points.array[name] for name in SHIFTS], np.int64)
         old = convert(points, header.point_format)
         move(old, -shift, source.path)
         return old

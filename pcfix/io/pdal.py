@@ -160,7 +160,7 @@ class Results:
         )
         for i, axis in enumerate("XYZ"):
             # land keeps its bits, negative zero included
-            out[axis][rows][moved] += changes.steps[moved, i] * scales[i]
+            out[axis][rows][moved] += changes.steps[i][moved] * scales[i]
         for column, some, values in changes.values:
             out[column.name][rows][some] = values * column_scale(column, scales)
         out["Classification"][rows][correction.corrected] = BATHYMETRIC_POINT

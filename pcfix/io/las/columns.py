@@ -85,7 +85,7 @@ def column_scale(column: Column, scales: FloatArray) -> float:
 class Changes(NamedTuple):
     """What a correction changes in n points of a file."""
 
-    steps: npt.NDArray[np.int64]  # (n, 3), the shift in steps of the file's own scale
+    steps: npt.NDArray[np.int64]  # (3, n), the shift along each axis in steps of the file's scale
     flagged: BoolArray  # (n,), to be withheld
     values: list[tuple[Column, BoolArray, npt.NDArray[Any]]]  # whole numbers of some rows
 
@@ -103,13 +103,15 @@ def changes_of(
     uncorrected here, so that `restore` can distinguish them from those that pcfix withheld. Points
     that are withheld because they could not be transferred have the same mark, a depth.
     """
-    steps = np.rint(correction.shift_m / scales).astype(np.int64)
+    # by axis, because numpy is slow along the short one
+    steps = np.array([np.rint(a / b) for a, b in zip(correction.shift_m.T, scales, strict=True)])
+    steps = steps.astype(np.int64)
     changed = correction.corrected | (correction.uncorrected & ~withheld)
     values: list[tuple[Column, BoolArray, npt.NDArray[Any]]] = []
     for column in columns:
         if column.scale == 0.0:
             rows = changed | correction.moved
-            values.append((column, rows, steps[rows, SHIFTS.index(column.name)]))
+            values.append((column, rows, steps[SHIFTS.index(column.name)][rows]))
             continue
         value = (getattr(correction, column.of) if column.of else classes)[changed]
         if column.scale != 1.0:
@@ -146,14 +148,22 @@ def convert(
     array: Records = np.zeros(len(points), point_format.dtype())
     new = laspy.ScaleAwarePointRecord(array, point_format, points.scales, points.offsets)
     same = points.point_format.id == point_format.id
-    for name in points.array.dtype.names:
-        if name in array.dtype.names and (same or name != "bit_fields"):
-            array[name] = points.array[name]
+    old, after = points.array, array.dtype.fields or {}
+    names = [name for name in old.dtype.names if name in after and (same or name != "bit_fields")]
+    # the first fields, mostly all, have the same places: one copy of their bytes is ten times as
+    # fast as one for each field
+    size = 0
+    while names and after[names[0]] == old.dtype.fields[names[0]] and after[names[0]][1] == size:
+        size += after[names.pop(0)][0].itemsize
+    array.view(np.uint8).reshape(len(array), -1)[:, :size] = old.view(np.uint8).reshape(
+        len(old), -1
+    )[:, :size]
+    for name in names:
+        array[name] = old[name]
     if same:
         return new
     for name in _PACKED:
         new[name][:] = np.asarray(points[name])
-    old = points.array
     if "scan_angle" in array.dtype.names and "scan_angle_rank" in old.dtype.names:
         array["scan_angle"] = np.rint(old["scan_angle_rank"] / SCAN_ANGLE_STEP_DEG)
     elif "scan_angle_rank" in array.dtype.names and "scan_angle" in old.dtype.names:
@@ -162,12 +172,12 @@ def convert(
 
 
 def move(points: laspy.ScaleAwarePointRecord, steps: npt.NDArray[np.int64], path: Path) -> None:
-    """Move points of a file by whole steps of their scale, shape (n, 3).
+    """Move points of a file by whole steps of their scale, shape (3, n).
 
     An `InputError` if a coordinate does not fit 32 bits.
     """
-    for axis, name in enumerate("XYZ"):
-        moved = points.array[name] + steps[:, axis]
+    for name, along in zip("XYZ", steps, strict=True):
+        moved = points.array[name] + along
         if moved.size and (moved.min() < _INT32.min or moved.max() > _INT32.max):
             sentence = (
                 f"the scale of {name} is too fine for the result in 32 bits. Write the cloud with a"
