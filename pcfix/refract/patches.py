@@ -23,6 +23,7 @@ import numpy as np
 
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Batch, stacked
+from pcfix.running import current
 
 PATCHES, FEWEST_POINTS = 750, 400
 PATCH_POINTS = (32, 16)
@@ -78,10 +79,11 @@ def _patches_of(batch: Batch, points: int, at_borders: bool) -> Patches | None:
         return None
     width_m = PATCH_WIDTH * flying_height_m(batch)
     # so dense that a patch is as wide as the images' borders are far apart
-    xy = batch.xyz[usable, :2]
-    extent = np.maximum(np.ptp(xy, axis=0), width_m)
-    x, y = np.floor((xy - xy.min(axis=0)).T / width_m).astype(np.int64)
-    squares = len(np.unique(x * (int(y.max()) + 1) + y))
+    # by axis, because numpy is slow along the short one
+    x, y = (batch.xyz[usable, axis] for axis in (0, 1))
+    extent = np.maximum([np.ptp(x), np.ptp(y)], width_m)
+    column, row = (np.floor((one - one.min()) / width_m).astype(np.int64) for one in (x, y))
+    squares = len(np.unique(column * (int(row.max()) + 1) + row))
     covered = min(float(extent.prod()) / width_m**2, squares)
     step = max(1, int(len(usable) / max(FEWEST_POINTS, points * covered)))
     usable = usable[::step]
@@ -107,7 +109,8 @@ def _border_distance_m(xy: FloatArray, centres: FloatArray) -> FloatArray:
 
     if len(centres) < 2:
         return np.zeros(len(xy))
-    distance, near = map(np.asarray, cKDTree(centres).query(xy, k=2))
+    tree, workers = cKDTree(centres), current().threads
+    distance, near = map(np.asarray, tree.query(xy, k=2, workers=workers))
     base = np.linalg.norm(centres[near[:, 0]] - centres[near[:, 1]], axis=1)
     # of the bisector of the two centres: (d2^2 - d1^2) / 2 b
     return np.asarray(np.diff(distance**2)[:, 0] / (2.0 * np.maximum(base, 1e-9)))
