@@ -17,7 +17,17 @@ from itertools import pairwise
 import numpy as np
 
 from pcfix.model import FloatArray, IntArray
-from pcfix.running import blocks, bounds, current, empty, grouped, mapped, release, row_numbers
+from pcfix.running import (
+    blocks,
+    bounds,
+    current,
+    distinct,
+    empty,
+    grouped,
+    mapped,
+    release,
+    row_numbers,
+)
 
 PIECE_ROWS = 65_536
 LEAF_POINTS = 32
@@ -71,7 +81,7 @@ def nearest_distance(places: FloatArray, points: FloatArray) -> FloatArray:
     """
     near = Neighbours(make_tiles(points), 3)
     asked, distance = make_tiles(places), empty((len(places),))
-    for piece in asked.pieces(PIECE_ROWS):
+    for piece in asked.pieces(POINTS_PER_TILE):
         distance[asked.row[piece]] = near.nearest(asked.xyz[piece], 1)[0][:, 0]
     return distance
 
@@ -80,7 +90,7 @@ POINTS_PER_TILE = 250_000
 MOST_SQUARES = 5_000_000
 """Squares of blocks of points that wait to be merged."""
 _MOST_TILES_A_SIDE = 200
-_SAMPLE = 100_000
+_SAMPLE = 10_000
 _CELLS_ACROSS = 256
 """Cells of a tile; numpy sorts numbers of 16 bits in linear time."""
 
@@ -131,8 +141,11 @@ def make_tiles(xyz: FloatArray, points: int | None = None) -> Tiles:
     columns, rows = np.ceil(extent / side).astype(int).tolist()
 
     def tile_of(some: FloatArray) -> IntArray:
-        cell = np.clip(np.floor((some[:, :2] - origin) / side), 0, (columns - 1, rows - 1))
-        column, row = cell.astype(np.uint16).T
+        # by axis, here and below, because numpy is slow along the short one
+        column, row = (
+            np.clip((some[:, axis] - origin[axis]) / side, 0, most).astype(np.uint16)
+            for axis, most in enumerate((columns - 1, rows - 1))
+        )
         return np.asarray(column * np.uint16(rows) + row)
 
     numbers = mapped(tile_of, xyz)
@@ -140,8 +153,9 @@ def make_tiles(xyz: FloatArray, points: int | None = None) -> Tiles:
     start = np.unique(start)
     boxes = []
     for a, b in pairwise(start):
-        cell = np.floor(places[a:b, :2] * (_CELLS_ACROSS / side)).astype(np.int64) % _CELLS_ACROSS
-        order = np.argsort((cell @ (1, _CELLS_ACROSS)).astype(np.uint16), kind="stable")
+        x, y = (np.floor(places[a:b, axis] * (_CELLS_ACROSS / side)) for axis in (0, 1))
+        x, y = (one.astype(np.int64) % _CELLS_ACROSS for one in (x, y))
+        order = np.argsort((x + _CELLS_ACROSS * y).astype(np.uint16), kind="stable")
         places[a:b], row[a:b] = places[a:b][order], row[a:b][order]
         boxes.append(bounds(places[a:b]))
         release()
@@ -153,19 +167,13 @@ def spacing_m(xyz: FloatArray, side_m: float) -> float:
     """Return the spacing of points (n, 3) in plan, over squares with points; 0 on a line."""
     squares, more = np.empty(0, np.int64), list[IntArray]()
     for rows in blocks(len(xyz)):
-        column, row = np.floor(xyz[rows, :2] / side_m).astype(np.int64).T
-        more.append(_distinct((row << 32) + column))
+        column, row = (np.floor(xyz[rows, axis] / side_m).astype(np.int64) for axis in (0, 1))
+        more.append(distinct((row << 32) + column))
         if sum(map(len, more)) > MOST_SQUARES:  # seldom: each time all squares are sorted
-            squares, more = _distinct(np.concatenate([squares, *more])), []
-    squares = _distinct(np.concatenate([squares, *more]))
+            squares, more = distinct(np.concatenate([squares, *more])), []
+    squares = distinct(np.concatenate([squares, *more]))
     low, high = bounds(xyz[:, :2])
     row = squares >> 32
     corner = np.column_stack([squares - (row << 32), row]) * side_m
     sides = np.minimum(corner + side_m, high) - np.maximum(corner, low)
     return float(np.sqrt(np.maximum(sides, 0.0).prod(axis=1).sum() / len(xyz)))
-
-
-def _distinct(values: IntArray) -> IntArray:
-    """Return each value once, ascending; `numpy.unique` takes fifty times as long for millions."""
-    values = np.sort(values)
-    return values[np.append(True, values[1:] != values[:-1])[: len(values)]]

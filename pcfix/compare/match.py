@@ -12,7 +12,7 @@ from pcfix.clean.neighbours import nearest_of
 from pcfix.errors import GeometryError, SettingError, bad_file
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import CompareRules
-from pcfix.running import blocks, bounds, empty, mapped, subset
+from pcfix.running import blocks, bounds, distinct, empty, mapped, subset
 
 GAP_SPACINGS, MIN_GAP_M = 5.0, 1.0
 """A point counts up to this distance outside the other cloud, unless the user sets it."""
@@ -211,13 +211,15 @@ def near_in_plan(xy: FloatArray, other_xy: FloatArray, limit_m: float) -> BoolAr
 
     def squares(some: FloatArray) -> IntArray:
         # points beyond fall into the outermost squares, which are near to none
-        square = np.clip(np.floor((some[:, :2] - low) / limit_m) + 1.0, 0, size - 1)
-        column, row = square.astype(np.int64).T
+        column, row = (
+            np.clip((some[:, axis] - low[axis]) / limit_m + 1.0, 0, size[axis] - 1).astype(np.int64)
+            for axis in (0, 1)
+        )
         return np.asarray(row * size[0] + column)
 
-    held = np.unique(np.hstack([np.unique(squares(other_xy[b])) for b in blocks(len(other_xy))]))
+    held = distinct(np.hstack([distinct(squares(other_xy[b])) for b in blocks(len(other_xy))]))
     steps = np.array([-1, 0, 1])
-    near = np.unique(held[:, None, None] + steps[:, None] * size[0] + steps)
+    near = distinct(held[:, None, None] + steps[:, None] * size[0] + steps)
     return mapped(lambda some: np.isin(squares(some), near), xy)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from pcfix.errors import SettingError
 from pcfix.model import FloatArray
 from pcfix.refract.tally import share_of_orders, within_orders
-from pcfix.running import blocks, grouped, mapped
+from pcfix.running import blocks, distinct, grouped, mapped
 from pcfix.sums import Figures
 
 PERCENTILES = (5, 25, 50, 75, 95)
@@ -104,7 +104,7 @@ def binned(
     ``option.range`` if there are more than `MAX_BINS`.
     """
     place = mapped(lambda some: np.floor(some / width_m), depth_m)
-    numbers = np.unique(np.hstack([np.unique(place[rows]) for rows in blocks(len(place))]))
+    numbers = distinct(np.hstack([distinct(place[rows]) for rows in blocks(len(place))]))
     if len(numbers) > MAX_BINS:
         sentence = f"A bin width of {width_m:g} m makes {len(numbers):,} bins. Use a larger one."
         raise SettingError("option.range", sentence, value=width_m, bins=len(numbers))
