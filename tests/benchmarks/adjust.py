@@ -44,7 +44,7 @@ GOOD_GSD, COVERED = 1.5, 0.8
 
 
 def speed(given):
-    print("points   observations   wall s    cpu s  steps  us/obs    MB  centres m")
+    print("points   images  observations   wall s    cpu s  us/obs    MB  centres m")
     for points in (1000, *given.points):
         scene = simulate_tie_points(
             points=points, area_m=(240.0, 160.0), position_noise_m=0.05, attitude_noise_deg=0.06
@@ -57,8 +57,8 @@ def speed(given):
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
         if points > 1000:  # the first block compiles the kernels
             print(
-                f"{points:<8} {len(block.camera):>12} {wall:>8.1f} {cpu:>8.1f} {found.steps:>6}"
-                f" {1e6 * cpu / len(block.camera):>7.1f} {peak:>5.0f}"
+                f"{points:<8} {len(block.cameras):>6} {len(block.camera):>13} {wall:>8.1f}"
+                f" {cpu:>8.1f} {1e6 * cpu / len(block.camera):>7.1f} {peak:>5.0f}"
                 f" {np.sqrt((off**2).sum(axis=1).mean()):>10.4f}",
                 flush=True,
             )
