@@ -30,8 +30,10 @@ CLOSE = 1e-10
 EXACT = 1e-10
 """Squared residual, in variances, of an observation that is met exactly."""
 
-ROUNDING = 1e-12
-"""Share of the cost by which it may rise at the minimum."""
+ROUNDING = 1e-9
+"""Share of the cost by which it may rise at the minimum. In large blocks some points near the water
+surface change sides at each step, so that the cost does not fall further; shorter steps do not help
+either, and would double the time. Of a million observations it is 0.03 standard errors at most."""
 
 
 # Steps
