@@ -48,8 +48,9 @@ CLOSE_M = 1e-7  # estimated distance from the solution, from the last two steps
 # P, and the plane of the water (N, h), which moves under waves.
 _BY_U, _BY_V, _IMAGE, _PLANE, RAY_RUNS = slots(3, 3, 2, 4)
 
-# Runs for the points: Q, g, d g / d Q, the last step squared, the state, and a run for temporaries.
-Q, _G, _BY_Q, _STEP2, STATE, _TEMPORARY, POINT_RUNS = slots(3, 3, 9, 1, 1, 1)
+# Runs for the points: Q, g, d g / d Q, the last step squared, the state, and the light to one
+# camera: k, S, the depth D and s, as of `light_near`.
+Q, _G, _BY_Q, _STEP2, STATE, _LIGHT, POINT_RUNS = slots(3, 3, 9, 1, 1, 6)
 SEARCHED, FOUND, LOST = 0.0, 1.0, 2.0
 
 
@@ -80,6 +81,7 @@ def search_tile(
             c, lens = near[k], optics.lenses[optics.row[near[k]]]
             if tin is not None or fields is not None:
                 _settle(rays[k], room, tile, marks[k], rig, c, n, tin, fields)
+            _find_light(room, rays[k], tile, marks[k], rig, c, n)
             # numba compiles a version of `_add` for each kind of argument
             if lens[PLAIN] != 0.0:
                 _add(room, rays[k], tile, marks[k], rig, c, optics, plain_lens(lens), n)
@@ -136,7 +138,7 @@ def _settle(
     n: float, tin: Tin | None, fields: Field | None,
 ) -> None:  # fmt: skip
     """Move the planes of the rays of one camera to where the light leaves a mesh or raster."""
-    temporary = room[_TEMPORARY * TILE :]
+    temporary = room[_LIGHT * TILE :]
     plane, origin = temporary[:4], temporary[4:7]
     for j in range(marks.size):
         if not marks[j] > 0.0 or room[STATE * TILE + j] != SEARCHED:
@@ -152,6 +154,25 @@ def _settle(
 
 
 @device
+def _find_light(
+    room: FloatArray, ray: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int,
+    n: float,
+) -> None:  # fmt: skip
+    """Set the light from each Q to one camera.
+
+    In a short loop the processor works on the roots and divisions of several points at once; in the
+    long one of `_add` each would wait for the one before. That saves a quarter of the kernel.
+    """
+    centre = row_of(rig.centres, c)
+    for j in range(marks.size):
+        normal, h = three(ray, _PLANE * TILE + j), ray[(_PLANE + 3) * TILE + j]
+        e, q = minus(centre, three(tile, j)), three(room, Q * TILE + j)
+        k, root, depth, _, s = light_near(q, e, normal, h, n)
+        put(room, _LIGHT * TILE + j, (k, root, depth))
+        put(room, (_LIGHT + 3) * TILE + j, s)
+
+
+@device
 def _add(
     room: FloatArray, ray: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int,
     optics: Optics, plain: Plain | None, n: float,
@@ -160,9 +181,9 @@ def _add(
     centre, lens, r = row_of(rig.centres, c), optics.lenses[optics.row[c]], optics.rotations[c]
     right, down, ahead = row_of(r, 0), row_of(r, 1), row_of(r, 2)
     for j in range(marks.size):
-        e, q = minus(centre, three(tile, j)), three(room, Q * TILE + j)
-        normal, h = three(ray, _PLANE * TILE + j), ray[(_PLANE + 3) * TILE + j]
-        k, root, depth, m2, s = light_near(q, e, normal, h, n)
+        e, normal = minus(centre, three(tile, j)), three(ray, _PLANE * TILE + j)
+        h, (k, root, depth) = ray[(_PLANE + 3) * TILE + j], three(room, _LIGHT * TILE + j)
+        s, m2 = three(room, (_LIGHT + 3) * TILE + j), n * n if depth > 0.0 else 1.0
         w = minus(scaled(k, s), normal)
         w = dot(right, w), dot(down, w), dot(ahead, w)
         if plain is None:
