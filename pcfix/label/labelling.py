@@ -108,10 +108,10 @@ class Labelling:
         Points are collected in cells, which are coarsened until they have enough points. Water is
         connected over sides, corners, and gaps of at most two cells.
         """
-        from scipy.ndimage import binary_dilation, label
-
         if not self.settings.connected:
             return self
+        from scipy.ndimage import binary_dilation, label  # slow to import
+
         cells = Cells(low, high, Layer(np.zeros((), np.uint8), np.bitwise_or))
         water_points = 0
         for part in parts:
