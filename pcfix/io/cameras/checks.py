@@ -287,7 +287,7 @@ class AffineFrame(NamedTuple):
 
     matrix: FloatArray
     shift: FloatArray
-    crs: str
+    crs: str | None
     project_crs: str | None = None
 
     def points(self, xyz: FloatArray) -> FloatArray:
