@@ -321,6 +321,11 @@ class LensModel(NamedTuple):
     projection: Projection = "perspective"
     in_turn: bool = False
 
+    def lens(self, given: Mapping[str, float], width: float, height: float, **more: Any) -> Lens:
+        """Return the lens with the given parameters; `more` are other fields of a `Lens`."""
+        more |= {"projection": self.projection, "in_turn": self.in_turn}
+        return lens_by_name(given, width, height, **more)
+
 
 def lens_by_name(given: Mapping[str, float], width: float, height: float, **more: Any) -> Lens:
     """Return the lens with the given parameters; `more` are other fields of a `Lens`.
@@ -365,8 +370,7 @@ def model_of(
     alike = [one for one in models if models[one].projection == lens.projection] if fits else []
     for name in sorted(alike, key=lambda one: models[one].names.count(" ")):
         given = {one: values.get(one, 0.0) for one in models[name].names.split()}
-        more = {"projection": lens.projection, "in_turn": models[name].in_turn}
-        held = project(lens_by_name(given, lens.width, lens.height, **more), rays)
+        held = project(models[name].lens(given, lens.width, lens.height), rays)
         if np.allclose(held, exact, rtol=0.0, atol=EXACT * lens.focal, equal_nan=True):
             return name, given
     kind = f"{lens.sensor or 'of the images'} ({lens.projection} in {lens.unit})"

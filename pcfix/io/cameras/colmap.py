@@ -31,9 +31,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError, bad_file
+from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import LensModel, Source, damaged, lens_by_name, model_of
+from pcfix.io.cameras.checks import LensModel, Source, damaged, model_of
 from pcfix.io.crs import is_topocentric
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 from pcfix.options.declare import File
@@ -51,23 +51,14 @@ def read(source: Source) -> Cameras:
     """Read the poses of registered images and their lenses."""
     listed, *others = _models_at(source.path)
     path, folder = listed.with_stem("images"), listed.parent
-    cameras, images = read_list(listed), read_images(path, points=False)
-    if not images:
-        raise checks.no_pose(path)
-    poses = np.array([image.pose for image in images])
+    lens_of, images = read_lenses(listed), read_images(path, points=False)
+    poses = np.array([image.pose for image in images]).reshape(-1, 7)
     labels = tuple(image.name for image in images)
     rotations = checks.quaternions(path, labels, poses[:, :4])
-    used = dict.fromkeys(image.camera for image in images)
-    lenses = {number: lens_of(number, cameras[number]) for number in used}
+    lenses = tuple(lens_of[image.camera] for image in images)
     offset, crs = read_place(folder)
     checks.warn_several(folder, len(others) + 1, len(images))
-    return Cameras(
-        labels=labels,
-        centres=checks.centres(rotations, poses[:, 4:]) + offset,
-        rotations=rotations,
-        lenses=tuple(lenses[image.camera] for image in images),
-        crs=crs,
-    )
+    return Cameras(labels, checks.centres(rotations, poses[:, 4:]) + offset, rotations, lenses, crs)
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
@@ -141,22 +132,14 @@ BY_NAME = {
 MODELS = tuple(BY_NAME)
 
 
-Camera = tuple[str, float, float, tuple[float, ...]]
-"""A row of the camera list: model, width, height, parameters."""
-
-
-def lens_of(identifier: int, camera: Camera) -> Lens:
-    """Return the lens of a camera."""
-    name, width, height, values = camera
-    model = BY_NAME[name]
-    more = {"in_turn": model.in_turn, "sensor": f"{identifier} {name}"}
-    given = dict(zip(model.names.split(), values, strict=True))
-    return lens_by_name(given, width, height, projection=model.projection, **more)
-
-
-def _no_model(path: Path, camera: object, model: object) -> InputError:
-    what, remedy = f"the model {model} of camera {camera}", "Give the undistorted model"
-    return checks.unsupported(path, what, remedy, model=model)
+def make_lens(path: Path, camera: int, name: str, frame: Any, parameters: Any) -> Lens:
+    """Return the lens of a camera; the `frame` is its width and height in pixels."""
+    if name not in BY_NAME:
+        what, remedy = f"the model {name} of camera {camera}", "Give the undistorted model"
+        raise checks.unsupported(path, what, remedy, model=name)
+    width, height = map(float, frame)
+    given = dict(zip(BY_NAME[name].names.split(), map(float, parameters), strict=True))
+    return BY_NAME[name].lens(given, width, height, sensor=f"{camera} {name}")
 
 
 class Image(NamedTuple):
@@ -198,28 +181,22 @@ def _lines(path: Path) -> Iterator[str]:
                 yield line.strip()
 
 
-def read_list(path: Path) -> dict[int, Camera]:
+def read_lenses(path: Path) -> dict[int, Lens]:
     """Read ``cameras``, binary or text: identifier, model, width, height, parameters."""
-    cameras: dict[int, Camera] = {}
+    lenses: dict[int, Lens] = {}
     with checks.reading(path):
         if path.suffix == ".bin":
             file = _open(path)
             for _ in range(*_take(file, _COUNT)):
-                identifier, number, width, height = _take(file, _CAMERA)
-                if not 0 <= number < len(MODELS):
-                    raise _no_model(path, identifier, number)
-                count = len(BY_NAME[MODELS[number]].names.split())
+                number, model, *frame = _take(file, _CAMERA)
+                name = MODELS[model] if 0 <= model < len(MODELS) else str(model)
+                count = len(BY_NAME[name].names.split()) if name in BY_NAME else 0
                 values = _take(file, struct.Struct(f"<{count}d"))
-                cameras[identifier] = MODELS[number], float(width), float(height), values
-            return cameras
-        for name, model, *words in filter(None, map(str.split, _lines(path))):
-            if model not in BY_NAME:
-                raise _no_model(path, name, model)
-            width, height, *numbers = map(float, words)
-            if len(numbers) != len(BY_NAME[model].names.split()):
-                raise damaged(path, f"camera {name}: {len(numbers)} parameters of {model}")
-            cameras[int(name)] = model, width, height, tuple(numbers)
-    return cameras
+                lenses[number] = make_lens(path, number, name, frame, values)
+            return lenses
+        for number, name, width, height, *words in filter(None, map(str.split, _lines(path))):
+            lenses[int(number)] = make_lens(path, int(number), name, (width, height), words)
+    return lenses
 
 
 def read_images(path: Path, *, points: bool) -> list[Image]:
@@ -229,10 +206,8 @@ def read_images(path: Path, *, points: bool) -> list[Image]:
             file, images = _open(path), []
             for _ in range(*_take(file, _COUNT)):
                 identifier, *pose, camera = _take(file, _IMAGE)
-                end = file.find(b"\0", file.tell())
-                if end < 0:
-                    raise ValueError("a name does not end")
-                name = file.read(end + 1 - file.tell())[:-1].decode("utf-8", "replace")
+                end = file.find(b"\0", file.tell()) + 1
+                name = file.read(end - file.tell())[:-1].decode("utf-8", "replace")
                 (count,) = _take(file, _COUNT)
                 seen = np.empty(0, OBSERVATION)
                 if points and count:

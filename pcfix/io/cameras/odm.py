@@ -381,4 +381,4 @@ def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
     given |= {"fx": float(across) * scale, "fy": float(camera.get("focal_y", across)) * scale}
     given |= {"cx": width / 2.0 + float(camera.get("c_x", 0.0)) * scale}
     given |= {"cy": height / 2.0 + float(camera.get("c_y", 0.0)) * scale}
-    return lens_by_name(given, width, height, projection=model.projection, sensor=name)
+    return model.lens(given, width, height, sensor=name)

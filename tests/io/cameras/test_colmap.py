@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pcfix.io.cameras.colmap import BY_NAME, MODELS, lens_of
+from pcfix.io.cameras.colmap import BY_NAME, MODELS, make_lens
 from pcfix.lens.imaging import project
 from tests.utils.camera_files import read, read_ties
 from tests.utils.codes import refused
@@ -113,7 +113,7 @@ def test_binary_knows_the_models_by_their_numbers(tmp_path, number):
     values = [*twin.params[: len(twin.params) - len(extra)], *extra] if len(extra) else twin.params
     twin.params = values
     rays = np.random.default_rng(1).uniform((-0.4, -0.4, 1), (0.4, 0.4, 1), (100, 3))
-    made = lens_of(1, (model, 800.0, 600.0, tuple(values)))
+    made = make_lens(tmp_path, 1, model, (800, 600), values)
     assert project(made, rays) == pytest.approx(np.array(twin.img_from_cam(rays)), abs=1e-8)
 
 
