@@ -24,7 +24,14 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError, NoTiePointsError, PcfixError, PcfixWarning, bad_file
+from pcfix.errors import (
+    InputError,
+    NoTiePointsError,
+    PcfixError,
+    PcfixWarning,
+    SettingError,
+    bad_file,
+)
 from pcfix.io import tables
 from pcfix.io.files import check_input, check_output, parse_json, write_bytes
 from pcfix.model import (
@@ -127,6 +134,8 @@ def reading(path: object) -> Iterator[None]:
     try:
         with np.errstate(all="ignore"):
             yield
+    except SettingError as error:  # numbers that are finite in the file and not in the world
+        raise damaged(path, str(error).rstrip(".")) from error
     except PcfixError:
         raise
     except FileNotFoundError as error:
@@ -446,11 +455,14 @@ def image_size(folder: Path, name: str) -> tuple[int, int] | None:
 
 
 def block_to_write(path: Path, cameras: Cameras) -> tuple[FloatArray, tuple[Lens, ...]]:
-    """Return rotations and lenses of cameras."""
+    """Return the rotations as unit quaternions, shape (k, 4), scalar first, and the lenses."""
+    from scipy.spatial.transform import Rotation
+
     if cameras.rotations is None or cameras.lenses is None:
         sentence = "the cameras have no rotations or no lenses, so they cannot be written."
         raise bad_file(path, "output.no_lenses", sentence)
-    return cameras.rotations, cameras.lenses
+    wxyz = np.roll(Rotation.from_matrix(cameras.rotations).as_quat(canonical=True), 1, axis=1)
+    return wxyz, cameras.lenses
 
 
 def write_new(folder: Path, contents: Mapping[str, bytes]) -> None:

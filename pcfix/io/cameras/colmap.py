@@ -266,10 +266,8 @@ def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = 
     tie_points : TiePoints, optional
         In the frame of the cameras; those without a position or without a view are skipped.
     """
-    from scipy.spatial.transform import Rotation
-
     target = Path(folder)
-    rotations, lenses = checks.block_to_write(target, cameras)
+    turns, lenses = checks.block_to_write(target, cameras)
     for label in cameras.labels:  # the format would cut other names
         if not label == label.strip() != "" or {"\0", "\n"} & {*label}:
             sentence = f"the format cannot hold the image name {label!r}. Rename the image."
@@ -298,8 +296,7 @@ def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = 
         size = int(lens.width), int(lens.height)
         listed.append(struct.pack("<IiQQ", i, MODELS.index(model), *size))
         listed.append(np.array([*values.values()], "<f8").tobytes())
-    turns = np.roll(Rotation.from_matrix(rotations).as_quat(canonical=True), 1, axis=1)
-    shifts = -np.einsum("kij,kj->ki", rotations, cameras.centres - offset)
+    shifts = -np.einsum("kij,kj->ki", np.asarray(cameras.rotations), cameras.centres - offset)
     posed = list[bytes]()
     for i, (label, lens) in enumerate(zip(cameras.labels, lenses, strict=True)):
         posed.append(struct.pack("<I7dI", i + 1, *turns[i], *shifts[i], number_of[lens]))

@@ -370,8 +370,6 @@ def write_table(folder: File, cameras: Cameras) -> None:
     cameras : Cameras
         With rotations and lenses.
     """
-    from scipy.spatial.transform import Rotation
-
     target = Path(folder)
     turns, lenses = checks.block_to_write(target, cameras)
     if cameras.crs is not None and is_topocentric(cameras.crs):
@@ -386,8 +384,7 @@ def write_table(folder: File, cameras: Cameras) -> None:
     frame = (values.pop("f"), given.width, given.height)
     sensor = dict(zip(PIXELS if is_px else MILLIMETRES, map(float, frame), strict=True))
     sensor |= {OPENCV_NAMES.get(name, name): float(value) for name, value in values.items()}
-    quaternions = Rotation.from_matrix(turns).as_quat(canonical=True)
-    poses = np.column_stack([cameras.centres, np.roll(quaternions, 1, axis=1)]).tolist()
+    poses = np.column_stack([cameras.centres, turns]).tolist()
     has_crs = cameras.crs is not None and cameras.crs.strip().lower() != "local"
     comment = f"# CoordinateSystem: {' '.join((cameras.crs or '').split())}\n" if has_crs else ""
     rows = [[label, *row] for label, row in zip(cameras.labels, poses, strict=True)]
