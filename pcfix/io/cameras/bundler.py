@@ -65,7 +65,7 @@ class Model(NamedTuple):
     """
 
     cameras: Cameras
-    lenses: list[dict[str, float]]  # parameters; f is of the longer side in files of MVE
+    lenses: list[dict[str, float]]  # parameters; f is relative in files of MVE
     least_px: FloatArray
     points: Observations
     software: str
@@ -75,12 +75,10 @@ def read(source: Source) -> Cameras:
     """Read the poses of the largest model, and its lenses if sizes are known."""
     cameras, parameters, least_px, _, software = _model(source)
     frames = _frame_sizes(source.path, cameras.labels, least_px)
-    lenses = []
-    for given, (w, h) in zip(parameters, frames.tolist(), strict=False):
-        if software == MVE:
-            given["f"] *= max(w, h)
-        lenses.append(lens_by_name(given, w, h, inverse=software == VISUALSFM))
-    return replace(cameras, lenses=tuple(lenses) or None)
+    more = {"relative": software == MVE, "inverse": software == VISUALSFM}
+    pairs = zip(parameters, frames.tolist(), strict=False)  # no frames if the sizes are unknown
+    lenses = tuple(lens_by_name(given, *frame, **more) for given, frame in pairs)
+    return replace(cameras, lenses=lenses or None)
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:

@@ -2,7 +2,8 @@
 
 Lenses are made of parameters by name, as all packages have the same few. Here they are called
 ``f``, or ``fx`` across and ``fy`` down the image; ``cx``, ``cy``, the principal point from the
-upper left corner of the image; ``skew`` and ``b3``, the affine terms off the diagonal; ``k1``, ...
+upper left corner of the image, or ``dx``, ``dy`` from its centre; ``skew`` and ``b3``, the affine
+terms off the diagonal; ``k1``, ...
 radial and ``d1``, ... in the denominator; ``p1``, ``p2``, ... in Brown's order, so OpenCV's p1 is
 ``p2``; ``s1``, ... of thin prisms; and the parameters of a projection, see `SHAPES`.
 `pcfix.model.Lens` has the formulas.
@@ -24,14 +25,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import (
-    InputError,
-    NoTiePointsError,
-    PcfixError,
-    PcfixWarning,
-    SettingError,
-    bad_file,
-)
+from pcfix.errors import InputError, NoTiePointsError, PcfixWarning, bad_file
 from pcfix.io import tables
 from pcfix.io.files import check_input, check_output, parse_json, write_bytes
 from pcfix.model import (
@@ -134,9 +128,7 @@ def reading(path: object) -> Iterator[None]:
     try:
         with np.errstate(all="ignore"):
             yield
-    except SettingError as error:  # numbers that are finite in the file and not in the world
-        raise damaged(path, str(error).rstrip(".")) from error
-    except PcfixError:
+    except InputError:
         raise
     except FileNotFoundError as error:
         sentence = "is missing. Keep all files of the project together."
@@ -144,7 +136,7 @@ def reading(path: object) -> Iterator[None]:
     except KeyError as error:
         raise damaged(path, f"{error} is missing") from error
     except Exception as error:  # whatever a reader runs into where a file is cut off
-        raise damaged(path, error or type(error).__name__) from error
+        raise damaged(path, str(error).rstrip(".") or type(error).__name__) from error
 
 
 def read_document(path: Path) -> bytes:
@@ -331,16 +323,20 @@ class LensModel(NamedTuple):
     in_turn: bool = False
 
     def lens(self, given: Mapping[str, float], width: float, height: float, **more: Any) -> Lens:
-        """Return the lens with the given parameters; `more` are other fields of a `Lens`."""
+        """Return the lens with the given parameters, see `lens_by_name`."""
         more |= {"projection": self.projection, "in_turn": self.in_turn}
         return lens_by_name(given, width, height, **more)
 
 
-def lens_by_name(given: Mapping[str, float], width: float, height: float, **more: Any) -> Lens:
+def lens_by_name(
+    given: Mapping[str, float], width: float, height: float, *, relative: bool = False, **more: Any
+) -> Lens:
     """Return the lens with the given parameters; `more` are other fields of a `Lens`.
 
-    Without ``cx`` and ``cy`` the principal point is in the middle of the frame.
+    With `relative`, the focal lengths, ``dx``, ``dy`` and ``skew`` are in units of the larger side
+    of the frame. Without a principal point it is in the middle of the frame.
     """
+    size = max(width, height) if relative else 1.0
     value = defaultdict(float, given)
     focal = given.get("fy", value["f"])
     most = max((int(name[1:]) for name in given if name[1:].isdecimal()), default=0)
@@ -350,9 +346,10 @@ def lens_by_name(given: Mapping[str, float], width: float, height: float, **more
         for field, letter in LETTERS.items()
     }
     shape = tuple(value[name] for name in SHAPES.get(more.get("projection", ""), "").split())
-    middle = given.get("cx", width / 2.0), given.get("cy", height / 2.0)
-    affine = given.get("fx", focal) - focal, value["skew"], value["b3"]
-    return Lens(focal, width, height, *middle, *affine, **{"shape": shape} | terms | more)
+    x = given.get("cx", width / 2.0 + value["dx"] * size)
+    y = given.get("cy", height / 2.0 + value["dy"] * size)
+    affine = (given.get("fx", focal) - focal) * size, value["skew"] * size, value["b3"] * size
+    return Lens(focal * size, width, height, x, y, *affine, **{"shape": shape} | terms | more)
 
 
 def model_of(

@@ -41,7 +41,7 @@ import numpy as np
 from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, damaged, number, numbers, read_xml, text_of, warn
-from pcfix.io.crs import LOCAL, crs_text, is_local, parse_crs, shortened, unbound
+from pcfix.io.crs import LOCAL, crs_text, is_local, parse_crs, unbound
 from pcfix.io.ply import parse_header
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
 
@@ -70,19 +70,17 @@ def read(source: Source) -> Cameras:
     """Read the aligned images of a chunk: geocentric, or in a ``local`` frame."""
     chunk = open_chunk(source.path)
     images, unposed = aligned_images(chunk)
-    crs, project_crs = _world(chunk)
+    labels = tuple(image.label for image in images)
     in_world = np.array([image.place @ image.pose for image in images])
-    scales = np.cbrt(np.linalg.det(in_world[:, :3, :3]))[:, None, None]
-    lenses = {one: _lens(chunk.path, one) for one in dict.fromkeys(i.sensor for i in images)}
+    turns, centres = in_world[:, :3, :3], in_world[:, :3, 3]
+    scales = np.cbrt(np.linalg.det(turns))[:, None, None]
+    rotations = np.ascontiguousarray((turns / scales).transpose(0, 2, 1))  # world to camera
+    lens_of = {one: _lens(chunk.path, one) for one in dict.fromkeys(i.sensor for i in images)}
+    lenses = tuple(lens_of[image.sensor] for image in images)
+    crs, project_crs = _world(chunk)
+    gnss = _gnss_positions(chunk, images)
     return Cameras(
-        labels=tuple(image.label for image in images),
-        centres=in_world[:, :3, 3],
-        rotations=np.ascontiguousarray((in_world[:, :3, :3] / scales).transpose(0, 2, 1)),
-        lenses=tuple(lenses[image.sensor] for image in images),
-        crs=crs,
-        project_crs=project_crs,
-        gnss=_gnss_positions(chunk, images),
-        unposed=unposed,
+        labels, centres, rotations, lenses, crs, project_crs=project_crs, gnss=gnss, unposed=unposed
     )
 
 
@@ -215,10 +213,8 @@ def _places(path: Path, chunk: Element) -> tuple[dict[str | None, FloatArray | N
     transform; the active one can have that of the chunk. If none has a transform, the world is the
     frame of the chunk.
     """
-    places: dict[str | None, FloatArray | None]
-    places = {None: _similarity(path, chunk.find("transform"))}
-    for one in chunk.iterfind("components/component"):
-        places[one.get("id")] = _similarity(path, one.find("transform"))
+    framed = {None: chunk} | {one.get("id"): one for one in chunk.iterfind("components/component")}
+    places = {name: _similarity(path, one.find("transform")) for name, one in framed.items()}
     has_place = any(place is not None for place in places.values())
     if not has_place:
         places[None] = np.eye(4)
@@ -259,11 +255,11 @@ def _world(chunk: Document) -> tuple[str, str | None]:
     crs = parse_crs(text, name)
     if is_local(crs):
         return LOCAL, None
-    if crs.geodetic_crs is None:
-        raise damaged(chunk.path, f"the CRS {shortened(text)} has no datum")
     # the geocentric CRS on the same datum; of WGS 84 it has the code 4978
     axes = {"coordinate_system": type(crs)("EPSG:4978").to_json_dict()["coordinate_system"]}
-    given = unbound(crs.geodetic_crs).to_json_dict() | axes | {"type": "GeodeticCRS", "id": None}
+    given = (
+        unbound(crs.geodetic_crs or crs).to_json_dict() | axes | {"type": "GeodeticCRS", "id": None}
+    )
     frame = crs_text(type(crs).from_json_dict({k: v for k, v in given.items() if v}))
     return frame, frame if crs.is_geocentric else text
 
@@ -324,13 +320,13 @@ def _calibrated(
         for entry in calibration
         if entry.tag in PARAMETERS
     }
-    (width, height), value = size, defaultdict(float, given)
+    value = defaultdict(float, given)
     if "f" in given:
-        given |= {"fx": value["f"] + value["b1"], "fy": value["f"], "skew": value["b2"]}
-        given |= {"cx": width / 2.0 + value["cx"], "cy": height / 2.0 + value["cy"]}
+        given = given | {"fx": value["f"] + value["b1"], "skew": value["b2"]}
+        given |= {"dx": given.pop("cx", 0.0), "dy": given.pop("cy", 0.0)}
     else:  # PhotoScan's
         given |= {"fy": given.get("fy", value["fx"]), "p1": value["p2"], "p2": value["p1"]}
-    return checks.lens_by_name(given, width, height, projection=PROJECTIONS[kind], sensor=sensor)
+    return checks.lens_by_name(given, *size, projection=PROJECTIONS[kind], sensor=sensor)
 
 
 # ---- what was measured ----

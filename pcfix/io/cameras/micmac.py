@@ -26,6 +26,7 @@ write the formula of each coefficient next to it.
 from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
+from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -50,14 +51,10 @@ def read(source: Source) -> Cameras:
     if source.path.is_dir():
         found = [sorted(source.path.glob(f"{one}*{SUFFIX}")) for one in (PREFIX, PREFIX_2)]
         paths = [path for path in found[0] or found[1] if path.is_file()]
-    poses = [_orientation(path) for path in paths]
-    labels = [path.name.removesuffix(SUFFIX).removeprefix(PREFIX) for path in paths]
-    return Cameras(
-        labels=tuple(label.removeprefix(PREFIX_2) for label in labels),
-        centres=np.array([centre for centre, _, _ in poses]),
-        rotations=np.array([rotation for _, rotation, _ in poses]),
-        lenses=tuple(lens for _, _, lens in poses),
-    )
+    names = [path.name.removesuffix(SUFFIX).removeprefix(PREFIX) for path in paths]
+    labels = tuple(name.removeprefix(PREFIX_2) for name in names)
+    centres, rotations, lenses = zip(*map(_orientation, paths), strict=True)
+    return Cameras(labels, np.array(centres), np.array(rotations), lenses)
 
 
 def _orientation(path: Path) -> tuple[FloatArray, FloatArray, Lens]:
@@ -142,8 +139,8 @@ def _lens(
     values = given | {"fx": focal + b1 * focal, "fy": focal, "skew": b2 * focal}
     values |= {"cx": x + b1 * (x - cx) + b2 * (y - cy), "cy": y}
     middle = ((cx - x) / focal, (cy - y) / focal)
-    more = {"distortion_centre": middle, "inverse": is_inverse, "sensor": path.stem}
-    return checks.lens_by_name(values, width, height, **more)
+    more: dict[str, Any] = {"distortion_centre": middle, "inverse": is_inverse}
+    return checks.lens_by_name(values, width, height, sensor=path.stem, **more)
 
 
 def _calibration_2(path: Path, root: Element) -> Lens:

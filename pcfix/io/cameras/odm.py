@@ -48,7 +48,7 @@ from pcfix.io.cameras.checks import AffineFrame, LensModel, Source, damaged, len
 from pcfix.io.crs import Topocentric, is_topocentric
 from pcfix.io.tables import read_lines, unnamed
 from pcfix.lens.rotations import from_rotation_vectors
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
 
 SHOTS = "shots.geojson"
 RECONSTRUCTION = "reconstruction.json"
@@ -63,7 +63,6 @@ SAME_FOCAL = 1e-6
 GNSS_KEYS = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev")
 NO_GNSS = 999999.0
 """The gps_dop that OpenSfM writes for an image without a position."""
-CHUNK_BYTES = 1 << 24
 
 _FOLDERS = ("opensfm", "odm_georeferencing", "odm_georeferencing_25d", "odm_report")
 _OF_CRS = ("proj.txt", "coords.txt", "odm_georeferencing_model_geo.txt")
@@ -116,18 +115,16 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
         {name.encode(errors="replace"): i for i, name in enumerate(names)}
         for names in (cameras.labels, points)
     )
-    parts: list[tuple[IntArray, IntArray, FloatArray]] = []
-    with checks.reading(tracks), tracks.open("rb") as stream:
-        while block := stream.readlines(CHUNK_BYTES):  # there can be many millions of lines
-            lines = [line.split(b"\t", 5) for line in block if line.count(b"\t")]
-            point = np.array([point_of.get(fields[1], -1) for fields in lines], dtype=np.int64)
-            camera = np.array([camera_of.get(fields[0], -1) for fields in lines], dtype=np.int64)
-            values = np.array([fields[3:5] for fields in lines], dtype=float).reshape(-1, 2)
-            parts.append((point, camera, values))
-    point, camera, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
+    with checks.reading(tracks), tracks.open("rb") as stream:  # can have many millions of lines
+        listed = (line.split(b"\t", 5) for line in stream if b"\t" in line)
+        rows = (
+            (camera_of.get(f[0], -1), point_of.get(f[1], -1), *map(float, f[3:5])) for f in listed
+        )
+        values = np.fromiter(rows, np.dtype((np.float64, 4)))
+    camera, point = values[:, :2].T.astype(np.int64)
     order = np.lexsort((camera, point))
     size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]
-    uv = xy * size.max(axis=1, initial=0.0)[:, None] + size / 2.0
+    uv = values[:, 2:] * size.max(axis=1, initial=0.0)[:, None] + size / 2.0
     xyz = _frame(files, own).points(xyz)
     return checks.tie_points(checks.Observations(xyz, point[order], camera[order], uv[order]))
 
@@ -253,18 +250,18 @@ def _read_shots(files: Files) -> Cameras:
         with checks.reading(lenses_file):
             listed = checks.load_json(lenses_file).items()
             known = {name: lens(lenses_file, name, entry) for name, entry in listed}
-    lenses, plain = [], 0
+    lenses, bare = [], 0
     for shot in each:
-        width, height = float(shot["width"]), float(shot["height"])
-        focal = float(shot["focal"]) * max(width, height)
-        near = SAME_FOCAL * focal
-        alike = [one for one in known.values() if abs(one.focal + one.b1 - focal) < near]
-        found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else None)
-        plain += found is None
-        lenses.append(found or lens_by_name({"f": focal}, width, height))
-    if plain:
-        sentence = f"cameras.json has no camera of {plain} images; no distortion is assumed."
-        checks.warn(files["poses"], "cameras.no_distortion", sentence, images=plain)
+        plain = {"f": float(shot["focal"])}
+        own = lens_by_name(plain, float(shot["width"]), float(shot["height"]), relative=True)
+        near = SAME_FOCAL * own.focal
+        alike = [one for one in known.values() if abs(one.focal + one.b1 - own.focal) < near]
+        found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else own)
+        bare += found is own
+        lenses.append(found)
+    if bare:
+        sentence = f"cameras.json has no camera of {bare} images; no distortion is assumed."
+        checks.warn(files["poses"], "cameras.no_distortion", sentence, images=bare)
     turns = from_rotation_vectors(np.array([triple(shot["rotation"]) for shot in each]))
     gnss, images = _read_images(files, labels)
     unposed = unnamed(images, labels)
@@ -362,7 +359,8 @@ _MODELS = {
     "dual": LensModel("k1 k2 transition", "dual"),
 }
 """By names of `checks`, besides the focal lengths and the principal point of every model."""
-_CALLED = {"p1": "p2", "p2": "p1", "s1": "s0", "s2": "s1", "s3": "s2", "s4": "s3"}
+_CALLED = {"dx": "c_x", "dy": "c_y", "p1": "p2", "p2": "p1"}
+_CALLED |= {"s1": "s0", "s2": "s1", "s3": "s2", "s4": "s3"}
 """What OpenSfM calls what has another name in `checks`."""
 
 
@@ -374,11 +372,9 @@ def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
         what = f"the projection_type '{kind}' of camera {name}"
         raise checks.unsupported(path, what, remedy, model=kind, camera=name)
     model, camera = _MODELS[kind], {"transition": 0.5} | camera  # 0.5 where OpenSfM omits it
-    width, height = (float(camera.get(side, 0.0)) for side in ("width", "height"))
-    scale, names = max(width, height), model.names.split()
+    frame = (float(camera.get(side, 0.0)) for side in ("width", "height"))
+    names = ("dx", "dy", *model.names.split())
     given = {one: float(camera.get(_CALLED.get(one, one), 0.0)) for one in names}
     across: Any = camera.get("focal_x", camera.get("focal"))
-    given |= {"fx": float(across) * scale, "fy": float(camera.get("focal_y", across)) * scale}
-    given |= {"cx": width / 2.0 + float(camera.get("c_x", 0.0)) * scale}
-    given |= {"cy": height / 2.0 + float(camera.get("c_y", 0.0)) * scale}
-    return model.lens(given, width, height, sensor=name)
+    given |= {"fx": float(across), "fy": float(camera.get("focal_y", across))}
+    return model.lens(given, *frame, relative=True, sensor=name)

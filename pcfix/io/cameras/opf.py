@@ -21,7 +21,6 @@ Reference: Pix4D, "Open Photogrammetry Format Specification" 1.0, https://pix4d.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import unquote
@@ -39,6 +38,14 @@ FORMAT = "application/opf-{}+json"
 PROJECT = FORMAT.format("project")
 CONTENT = '"application/opf-|"orientation_deg"'
 INSIDE = r".*\.opf"
+INTERNALS = {
+    "perspective": {
+        **{"principal_point_px": "cx cy", "focal_length_px": "f"},
+        **{"radial_distortion": "k1 k2 k3", "tangential_distortion": "p2 p1"},
+    },
+    "fisheye": {"principal_point_px": "cx cy", "affine": "fx skew b3 fy"},
+}
+"""The parameters of each type of sensor, by names of `checks`."""
 Part = dict[str, Any]
 """An object of a JSON file."""
 
@@ -141,21 +148,15 @@ def _lens(path: Path, sensor: Part, given: Part) -> Lens:
     """Return the calibrated lens of a sensor, with the frame of the input cameras."""
     frame, inner = map(float, given["image_size_px"]), sensor["internals"]
     name = str(given.get("name") or f"sensor {sensor['id']}")
-    values = dict(zip(("cx", "cy"), map(float, inner["principal_point_px"]), strict=True))
-    if inner.get("type") == "perspective":
-        values["f"] = float(inner["focal_length_px"])
-        values |= dict(zip(("k1", "k2", "k3"), triple(inner["radial_distortion"]), strict=True))
-        values |= zip(("p2", "p1"), map(float, inner["tangential_distortion"]), strict=True)
-        lens = lens_by_name(values, *frame)
-    elif inner.get("type") == "fisheye":
-        values |= zip(("fx", "skew", "b3", "fy"), map(float, inner["affine"]), strict=True)
-        shape = tuple(map(float, inner["polynomial"]))
-        lens = lens_by_name(values, *frame, projection="polynomial", shape=shape)
-    else:
-        what = f"the type {inner.get('type')!r:.40} of sensor {name}"
+    if (kind := str(inner.get("type"))) not in INTERNALS:
         remedy = "Remove its images and calibrate again"
-        raise checks.unsupported(path, what, remedy, sensor=name)
-    return replace(lens, sensor=name)
+        raise checks.unsupported(path, f"the type {kind:.40} of sensor {name}", remedy, sensor=name)
+    values, more = dict[str, float](), dict[str, Any](sensor=name)
+    for field, names in INTERNALS[kind].items():
+        values |= zip(names.split(), np.ravel(inner[field]).astype(float).tolist(), strict=True)
+    if kind == "fisheye":
+        more |= {"projection": "polynomial", "shape": tuple(map(float, inner["polynomial"]))}
+    return lens_by_name(values, *frame, **more)
 
 
 def _gnss(path: Path, captures: list[Part], ids: list[int]) -> GnssPositions | None:

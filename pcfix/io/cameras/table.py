@@ -74,10 +74,11 @@ SPELLINGS: dict[str, tuple[str, ...]] = {
 }
 """Roles of columns, and their names; if a table has several, the first counts."""
 POSE = ("x", "y", "z", "longitude", "latitude", "yaw", "pitch", "roll", "omega", "phi", "kappa")
+REALITY_CAPTURE = ("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 _OWN_NAMES = (
     *("omega", "phi", "kappa", "qw", "qx", "qy", "qz", "enable"),
     *(f"r{i}{j}" for i in "123" for j in "123"),
-    *("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"),
+    *REALITY_CAPTURE,
 )
 SPELLINGS |= {name: (name,) for name in _OWN_NAMES}
 SPELLINGS |= {f"{role}_est": (f"{role}_est",) for role in POSE}
@@ -291,14 +292,13 @@ def _degrees(columns: Table, roles: tuple[str, ...]) -> FloatArray:
 
 def _own_lenses(columns: Table, frame: Lens) -> tuple[Lens, ...]:
     """Return the lens of each row from RealityCapture's columns, with the size of a sensor."""
-    width, height = frame.width, frame.height
-    side, lenses = max(width, height), []
-    distortion = np.nan_to_num(columns.where_there(DISTORTION))
-    for focal, x, y, *brown in np.hstack([columns.of(("f", "px", "py")), distortion]).tolist():
-        given = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), brown, strict=True))
-        given |= {"cx": width / 2.0 + x * side, "cy": height / 2.0 + y * side}
-        lenses.append(lens_by_name(given | {"f": focal * side / FILM_MM}, width, height))
-    return tuple(lenses)
+    values = np.hstack([columns.of(REALITY_CAPTURE[:3]), columns.where_there(REALITY_CAPTURE[3:])])
+    names = ("f", "dx", "dy", "k1", "k2", "k3", "k4", "p1", "p2")
+    each = [dict(zip(names, row, strict=True)) for row in np.nan_to_num(values).tolist()]
+    return tuple(
+        lens_by_name(given | {"f": given["f"] / FILM_MM}, frame.width, frame.height, relative=True)
+        for given in each
+    )
 
 
 # ---- sensors ----
@@ -310,7 +310,6 @@ OPENCV_NAMES = {"d1": "k4", "d2": "k5", "d3": "k6", "p2": "p1", "p1": "p2"}
 """What OpenCV calls the parameters that have another name in `checks`."""
 OPENCV = {"OpenCV": LensModel("f cx cy k1 k2 k3 d1 d2 d3 p2 p1")}
 TERMS = OPENCV["OpenCV"].names.split()[1:]
-DISTORTION = ("k1", "k2", "k3", "k4", "t1", "t2")
 FILM_MM = 36.0
 """Larger side of the film that 35 mm focal lengths mean."""
 
