@@ -132,13 +132,13 @@ BY_NAME = {
 MODELS = tuple(BY_NAME)
 
 
-def make_lens(path: Path, camera: int, name: str, frame: Any, parameters: Any) -> Lens:
-    """Return the lens of a camera; the `frame` is its width and height in pixels."""
+def make_lens(path: Path, camera: object, name: str, numbers: Any) -> Lens:
+    """Return the lens of a camera; the numbers are width, height (pixels) and parameters."""
     if name not in BY_NAME:
         what, remedy = f"the model {name} of camera {camera}", "Give the undistorted model"
         raise checks.unsupported(path, what, remedy, model=name)
-    width, height = map(float, frame)
-    given = dict(zip(BY_NAME[name].names.split(), map(float, parameters), strict=True))
+    width, height, *parameters = map(float, numbers)
+    given = dict(zip(BY_NAME[name].names.split(), parameters, strict=True))
     return BY_NAME[name].lens(given, width, height, sensor=f"{camera} {name}")
 
 
@@ -192,10 +192,10 @@ def read_lenses(path: Path) -> dict[int, Lens]:
                 name = MODELS[model] if 0 <= model < len(MODELS) else str(model)
                 count = len(BY_NAME[name].names.split()) if name in BY_NAME else 0
                 values = _take(file, struct.Struct(f"<{count}d"))
-                lenses[number] = make_lens(path, number, name, frame, values)
+                lenses[number] = make_lens(path, number, name, (*frame, *values))
             return lenses
-        for number, name, width, height, *words in filter(None, map(str.split, _lines(path))):
-            lenses[int(number)] = make_lens(path, int(number), name, (width, height), words)
+        for number, name, *words in filter(None, map(str.split, _lines(path))):
+            lenses[int(number)] = make_lens(path, number, name, words)
     return lenses
 
 

@@ -23,7 +23,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from pathlib import Path, PurePath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -78,7 +78,7 @@ def read(source: Source) -> Cameras:
     files = _find(source)
     images = read_parameters(files["parameters"]) if "parameters" in files else []
     names, posed = [image.label for image in images], [*range(len(images))]
-    turns = np.array([image.fields["rotation"] for image in images])
+    turns = np.array([image.rotation for image in images])
     turns = checks.rotations(files.get("parameters", source.path), names, turns)
     if "external" in files:
         path = files["external"]
@@ -101,20 +101,16 @@ def read(source: Source) -> Cameras:
             centres, rotations = (each[rows][posed] for each in (centres, rotations))
     else:
         labels, rotations = names, turns
-        centres = np.array([image.fields["centre"] for image in images]).reshape(-1, 3)
+        centres = np.array([image.centre for image in images]).reshape(-1, 3)
         centres += _offset(files)
-    given = [*names, *labels]
+    every = dict.fromkeys([*names, *labels])
     labels = [names[i] for i in posed] or labels
-    lenses = tuple(lens for i in posed if (lens := _lens(images[i])) is not None)
+    unposed = tuple(name for name in every if name not in set(labels))
+    lenses = tuple(images[i].lens for i in posed if images[i].lens is not None)
+    known = lenses if len(lenses) == len(labels) else None
     wkt = " ".join(read_lines(files["wkt"])).strip() if "wkt" in files else ""
-    return Cameras(
-        labels=tuple(labels),
-        centres=centres,
-        rotations=rotations,
-        lenses=lenses if len(lenses) == len(labels) else None,
-        crs=checks.crs(files["wkt"], wkt) if wkt else None,
-        unposed=tuple(name for name in dict.fromkeys(given) if name not in set(labels)),
-    )
+    crs = checks.crs(files["wkt"], wkt) if wkt else None
+    return Cameras(tuple(labels), centres, rotations, known, crs, unposed=unposed)
 
 
 # ---- files ----
@@ -173,11 +169,12 @@ def _offset(files: dict[str, Path]) -> FloatArray:
 
 
 class Image(NamedTuple):
-    """One image of the camera parameters; `fields` has its numbers by the names in `FIELDS`."""
+    """An image of the camera parameters; the rotation is world to camera, shape (9,)."""
 
     label: str
-    size: tuple[float, float]
-    fields: dict[str, FloatArray]
+    centre: FloatArray
+    rotation: FloatArray
+    lens: Lens | None
 
 
 def read_parameters(path: Path) -> list[Image]:
@@ -205,21 +202,14 @@ def read_parameters(path: Path) -> list[Image]:
         width, height = numbers(path, where, " ".join(size), 2).tolist()
         parts = np.split(numbers(path, where, " ".join(words_of), ends[-1]), ends[:-1])
         fields = {name: part for (name, _), part in zip(layout, parts, strict=True) if name}
-        images.append(Image(label.strip(), (width, height), fields))
+        given, more = dict[str, float](), dict[str, Any]()
+        for names, values in fields.items():
+            given |= zip(names.split(), values.tolist(), strict=False)
+        if "polynomial" in fields:
+            more = {"projection": "polynomial", "shape": tuple(fields["polynomial"].tolist())}
+        lens = lens_by_name(given, width, height, **more) if "fx" in given else None
+        images.append(Image(label.strip(), fields["centre"], fields["rotation"], lens))
     return images
-
-
-def _lens(image: Image) -> Lens | None:
-    """Return the lens of an image; None if the table does not have it."""
-    given: dict[str, float] = {}
-    for names, values in image.fields.items():
-        given |= zip(names.split(), values.tolist(), strict=False)
-    if "fx" not in given:
-        return None
-    if "polynomial" not in given:
-        return lens_by_name(given, *image.size)
-    shape = tuple(image.fields["polynomial"].tolist())
-    return lens_by_name(given, *image.size, projection="polynomial", shape=shape)
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:

@@ -127,17 +127,18 @@ def read(source: Source) -> Cameras:
     if by_gnss:
         sentence = "its positions are those of the GNSS, not adjusted ones."
         checks.warn(source.path, "cameras.not_adjusted", sentence)
-    sensor = sensor_file(source)
-    has_lens = turns is not None and columns.has("f", "px", "py")
-    return Cameras(
-        labels=tuple(columns.labels),
-        centres=centres(columns, needed=True),
-        rotations=turns,
-        lenses=_own_lenses(columns, read_sensor(sensor)) if has_lens and sensor else None,
-        crs=system,
-        gnss=gnss_positions(measured) if has_both else None,
-        unposed=tuple(unposed),
-    )
+    labels, xyz, lenses = tuple(columns.labels), centres(columns, needed=True), list[Lens]()
+    sensor, scale = sensor_file(source), np.array([1.0 / FILM_MM] + 8 * [1.0])
+    if turns is not None and sensor and columns.has(*REALITY_CAPTURE[:3]):
+        frame = read_sensor(sensor)
+        given = [columns.of(REALITY_CAPTURE[:3]), columns.where_there(REALITY_CAPTURE[3:])]
+        names = ("f", "dx", "dy", "k1", "k2", "k3", "k4", "p1", "p2")
+        for row in (scale * np.nan_to_num(np.hstack(given))).tolist():
+            values = dict(zip(names, row, strict=True))
+            lenses.append(lens_by_name(values, frame.width, frame.height, relative=True))
+    gnss = gnss_positions(measured) if has_both else None
+    known = tuple(lenses) or None
+    return Cameras(labels, xyz, turns, known, system, gnss=gnss, unposed=tuple(unposed))
 
 
 WGS84, WGS84_ELLIPSOIDAL = "EPSG:4326", "EPSG:4979"
@@ -288,17 +289,6 @@ def _degrees(columns: Table, roles: tuple[str, ...]) -> FloatArray:
         sentence += f" {name}[rad], or check the columns."
         raise columns.error(i, "cameras.angle_range", sentence, column=name, value=value)
     return values.T
-
-
-def _own_lenses(columns: Table, frame: Lens) -> tuple[Lens, ...]:
-    """Return the lens of each row from RealityCapture's columns, with the size of a sensor."""
-    values = np.hstack([columns.of(REALITY_CAPTURE[:3]), columns.where_there(REALITY_CAPTURE[3:])])
-    names = ("f", "dx", "dy", "k1", "k2", "k3", "k4", "p1", "p2")
-    each = [dict(zip(names, row, strict=True)) for row in np.nan_to_num(values).tolist()]
-    return tuple(
-        lens_by_name(given | {"f": given["f"] / FILM_MM}, frame.width, frame.height, relative=True)
-        for given in each
-    )
 
 
 # ---- sensors ----
