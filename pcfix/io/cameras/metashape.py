@@ -249,11 +249,9 @@ def _similarity(path: Path, element: Element | None) -> FloatArray | None:
 
 def _world(chunk: Document) -> tuple[str, str | None]:
     """Return the frame that a chunk's transforms lead to, and its CRS if that is another."""
-    text, name = text_of(chunk.root, "reference"), str(chunk.path)
-    if not text or text.upper() == "LOCAL" or not _places(chunk.path, chunk.root)[1]:
-        return LOCAL, None
-    crs = parse_crs(text, name)
-    if is_local(crs):
+    text = text_of(chunk.root, "reference")
+    has_place = bool(text) and _places(chunk.path, chunk.root)[1]
+    if not has_place or is_local(crs := parse_crs(text, str(chunk.path))):
         return LOCAL, None
     # the geocentric CRS on the same datum; of WGS 84 it has the code 4978
     axes = {"coordinate_system": type(crs)("EPSG:4978").to_json_dict()["coordinate_system"]}
@@ -357,7 +355,7 @@ def _gnss_positions(chunk: Document, images: list[Image]) -> GnssPositions | Non
     found = checks.measured(range(len(images)), places, crs)
     if found is None:
         return None
-    if crs.upper() == "LOCAL" or is_local(parsed := parse_crs(crs, str(path))):
+    if is_local(parsed := parse_crs(crs, str(path))):
         return replace(found, crs=LOCAL)
     largest = np.nanmax(np.abs(found.xyz[:, :2]), axis=0)
     if own or parsed.is_geographic or (largest > [180.0, 90.0]).any():

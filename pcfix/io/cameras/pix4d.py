@@ -45,10 +45,10 @@ NAMES = {
 }
 """Names of the files of a project, after its own name."""
 TABLE = re.compile(r"(.*_|)calibrated_(?:external_)?camera_parameters(_wgs84)?\.txt")
-HEADERS = (
-    ["filename", "imagewidth", "imageheight"],
-    ["imagename", "x", "y", "z", "omega", "phi", "kappa"],
-    ["imagename", "longitude", "latitude", "altitude", "omega", "phi", "kappa"],
+HEADER = re.compile(
+    r"(?i)\s*(filename imagewidth imageheight|imagename (x y z|longitude latitude altitude)"
+    r" omega phi kappa)\s*?$",
+    re.MULTILINE,
 )
 FOLDERS = ("", "params/", "1_initial/params/", "*/params/", "*/1_initial/params/")
 """Folders of the files, seen from the folder of a project."""
@@ -70,7 +70,7 @@ def recognises(source: Source) -> bool:
     """Whether a file begins like one of the tables, or a folder has a table."""
     if source.path.is_dir():
         return bool(_tables_in(source.path))
-    return _columns(source) in HEADERS
+    return HEADER.match(source.text) is not None
 
 
 def read(source: Source) -> Cameras:
@@ -116,17 +116,12 @@ def read(source: Source) -> Cameras:
 # ---- files ----
 
 
-def _columns(source: Source) -> list[str]:
-    """Return the words of the first line of a file, lower case."""
-    return source.text.lstrip().partition("\n")[0].lower().split()
-
-
 def _find(source: Source) -> dict[str, Path]:
     """Return the files of the project that exist, by the names in `NAMES`.
 
     The project's name precedes that of the files.
     """
-    path, columns = source.path, _columns(source)
+    path, begin = source.path, source.text.lstrip().lower()
     found = TABLE.fullmatch(path.name)
     tables = _tables_in(path) if path.is_dir() else [(path.parent, found[1] if found else "")]
     folder, prefix = tables[0]
@@ -135,9 +130,9 @@ def _find(source: Source) -> dict[str, Path]:
         sentence = f"has several projects ({', '.join(sorted(prefixes))}). Give one file."
         raise bad_file(folder, "cameras.several_projects", sentence, projects=len(prefixes))
     files = {kind: folder / (prefix + name) for kind, name in NAMES.items()}
-    if columns[:1] == ["filename"]:
+    if begin.startswith("filename"):
         files["parameters"] = path
-    elif columns[1:2] == ["x"]:
+    elif begin.startswith("imagename x"):
         files["external"] = path
     return {kind: file for kind, file in files.items() if file.is_file()}
 

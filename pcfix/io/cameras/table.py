@@ -127,8 +127,8 @@ def read(source: Source) -> Cameras:
     if by_gnss:
         sentence = "its positions are those of the GNSS, not adjusted ones."
         checks.warn(source.path, "cameras.not_adjusted", sentence)
-    labels, xyz, lenses = tuple(columns.labels), centres(columns, needed=True), list[Lens]()
-    sensor, scale = sensor_file(source), np.array([1.0 / FILM_MM] + 8 * [1.0])
+    labels, xyz = tuple(columns.labels), columns.of(axes(columns.place) or ())
+    lenses, sensor, scale = list[Lens](), sensor_file(source), np.array([1.0 / FILM_MM] + 8 * [1.0])
     if turns is not None and sensor and columns.has(*REALITY_CAPTURE[:3]):
         frame = read_sensor(sensor)
         given = [columns.of(REALITY_CAPTURE[:3]), columns.where_there(REALITY_CAPTURE[3:])]
@@ -187,12 +187,9 @@ def axes(place: Iterable[str]) -> tuple[str, str, str] | None:
     return next((three for three in AXES if {*three} <= {*place}), None)
 
 
-def centres(columns: Table, *, needed: bool = False) -> FloatArray:
-    """Return positions, shape (k, 3), NaN for rows without when they are not `needed`."""
-    three = axes(columns.place)
-    if three is None:
-        return np.full((len(columns.rows), 3), np.nan)
-    xyz = columns.of(three) if needed else columns.where_there(three)
+def centres(columns: Table) -> FloatArray:
+    """Return positions, shape (k, 3), NaN for rows without."""
+    xyz = columns.where_there(axes(columns.place) or AXES[0])
     xyz[np.isnan(xyz).any(axis=1)] = np.nan
     return xyz
 
