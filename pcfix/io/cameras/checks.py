@@ -417,14 +417,12 @@ def tie_points(*parts: Observations) -> TiePoints:
 
     An observation that is not finite is skipped, and such a position is unknown.
     """
-    before = np.cumsum([0, *(len(part.xyz) for part in parts)])
-    xyz = np.concatenate([part.xyz for part in parts])
+    xyz, point, camera, uv = (np.concatenate(column) for column in zip(*parts, strict=True))
+    is_there = (camera >= 0) & (point >= 0) & np.isfinite(uv).all(axis=1)
+    counts = [len(part.xyz) for part in parts]
+    point += np.repeat(np.cumsum([0, *counts[:-1]]), [len(part.point) for part in parts])
     xyz[~np.isfinite(xyz).all(axis=1)] = np.nan
-    point = np.concatenate([part.point + n for part, n in zip(parts, before, strict=False)])
-    is_there = np.concatenate([(part.camera >= 0) & (part.point >= 0) for part in parts])
-    camera = np.concatenate([part.camera for part in parts])
-    uv = np.concatenate([part.uv for part in parts])
-    used = np.flatnonzero(is_there & np.isfinite(uv).all(axis=1))
+    used = np.flatnonzero(is_there)
     used = used[np.argsort(point[used], kind="stable")]
     start = np.concatenate([[0], np.cumsum(np.bincount(point[used], minlength=len(xyz)))])
     return TiePoints(xyz, Views(start, camera[used]), uv[used])
