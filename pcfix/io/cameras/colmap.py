@@ -233,19 +233,19 @@ def read_images(path: Path, *, points: bool) -> list[Image]:
 def read_points(path: Path) -> tuple[IntArray, FloatArray]:
     """Read identifiers and places of ``points3D``; the tracks are in the images too."""
     with checks.reading(path):
-        if path.suffix != ".bin":
-            lines = [line.split(None, 4)[:4] for line in _lines(path) if line]
-            values = np.array([line[1:] for line in lines], float).reshape(-1, 3)
-            return np.array([int(line[0]) for line in lines], np.int64), values
-        data, at, rows = _open(path), _COUNT.size, []
-        for _ in range(*_take(data, _COUNT)):
-            *row, views = _POINT.unpack_from(data, at)
-            rows.append(row)
-            at += _POINT.size + _VIEW_BYTES * views
-        if at > len(data):
-            raise damaged(path, "its last point has too few views")
+        rows: list[list[Any]] = []
+        if path.suffix == ".bin":
+            data, at = _open(path), _COUNT.size
+            for _ in range(*_take(data, _COUNT)):
+                *row, views = _POINT.unpack_from(data, at)
+                rows.append(row)
+                at += _POINT.size + _VIEW_BYTES * views
+            if at > len(data):
+                raise damaged(path, "its last point has too few views")
+        else:
+            rows = [line.split(None, 4)[:4] for line in _lines(path) if line]
         places = np.array([row[1:] for row in rows], float).reshape(-1, 3)
-        return np.array([row[0] for row in rows], np.int64), places
+        return np.array([int(row[0]) for row in rows], np.int64), places
 
 
 WRITTEN = {k: model for k, model in BY_NAME.items() if k not in ("SIMPLE_FISHEYE", "FISHEYE")}

@@ -75,11 +75,8 @@ SPELLINGS: dict[str, tuple[str, ...]] = {
 """Roles of columns, and their names; if a table has several, the first counts."""
 POSE = ("x", "y", "z", "longitude", "latitude", "yaw", "pitch", "roll", "omega", "phi", "kappa")
 REALITY_CAPTURE = ("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
-_OWN_NAMES = (
-    *("omega", "phi", "kappa", "qw", "qx", "qy", "qz", "enable"),
-    *(f"r{i}{j}" for i in "123" for j in "123"),
-    *REALITY_CAPTURE,
-)
+QUATERNION, MATRIX = ("qw", "qx", "qy", "qz"), tuple(f"r{i}{j}" for i in "123" for j in "123")
+_OWN_NAMES = ("omega", "phi", "kappa", "enable", *QUATERNION, *MATRIX, *REALITY_CAPTURE)
 SPELLINGS |= {name: (name,) for name in _OWN_NAMES}
 SPELLINGS |= {f"{role}_est": (f"{role}_est",) for role in POSE}
 AXES = (("x", "y", "z"), ("longitude", "latitude", "z"))
@@ -225,7 +222,6 @@ CONVERSIONS = {
     "aircraft": (("yaw", "pitch", "roll"), rotations.from_aircraft),
 }
 OMEGA_PHI_KAPPA, YAW_PITCH_ROLL, _ = (roles for roles, _ in CONVERSIONS.values())
-QUATERNION, MATRIX = ("qw", "qx", "qy", "qz"), tuple(f"r{i}{j}" for i in "123" for j in "123")
 LARGEST_DEG = 360.0
 LOOKS_DOWN = 0.17
 """Least cosine of the tilt, about 80 degrees, of a camera that looks at the ground."""
