@@ -53,7 +53,8 @@ SRS_OF_ALL = re.compile(rb"<SRSId>\s*([^<]*?)\s*</SRSId>")
 MAIN_COMPONENT = "1"
 CENTRE = [f"Center/{axis}" for axis in "xyz"]
 DEGREES = ["Longitude", "Latitude", "Altitude"]
-MATRIX = [f"M_{row}{column}" for row in range(3) for column in range(3)]
+MATRIX = [f"Rotation/M_{row}{column}" for row in range(3) for column in range(3)]
+ANGLES = [f"Rotation/{angle}" for angle in ("Omega", "Phi", "Kappa")]
 EXIF = "EPSG:4326"
 """The CRS of positions in ExifData."""
 FIRST_PIXEL = 0.5
@@ -112,7 +113,7 @@ def _photos(path: Path, root: Element) -> tuple[list[Photo], tuple[str, ...]]:
                     continue
                 key = i, text_of(element, "Id")
                 centre = _numbers(path, f"image {label}", pose, CENTRE)
-                turn = _rotation(path, label, pose.find("Rotation"), axes)
+                turn = _rotation(path, label, pose, axes)
                 prior = _prior(path, label, element, srs)
                 is_main = text_of(element, "Component") in ("", MAIN_COMPONENT)
                 listed.append(Photo(is_main, key, label, lens, centre, turn, srs, prior))
@@ -140,20 +141,15 @@ def _prior(path: Path, label: str, photo: Element, srs: str) -> tuple[str, Float
     return None
 
 
-def _rotation(
-    path: Path, label: str, element: Element | None, axes: FloatArray
-) -> FloatArray | None:
+def _rotation(path: Path, label: str, pose: Element, axes: FloatArray) -> FloatArray | None:
     """Return world to x right, y down, z forward; None if there is no rotation."""
-    if element is None:
-        return None
     where = f"image {label}"
-    if element.find("M_00") is not None:
-        return axes @ _numbers(path, where, element, MATRIX).reshape(3, 3)
-    if element.find("Omega") is not None:
-        angles = _numbers(path, where, element, ["Omega", "Phi", "Kappa"])
-        matrix = from_photogrammetric(from_omega_phi_kappa(*angles.reshape(3, 1)))[0]
-        return np.asarray(axes @ matrix)
-    if element.find("Pitch") is not None:
+    if pose.find(MATRIX[0]) is not None:
+        return axes @ _numbers(path, where, pose, MATRIX).reshape(3, 3)
+    if pose.find(ANGLES[0]) is not None:
+        angles = _numbers(path, where, pose, ANGLES).reshape(3, 1)
+        return np.asarray(axes @ from_photogrammetric(from_omega_phi_kappa(*angles))[0])
+    if pose.find("Rotation/Pitch") is not None:
         what = f"the rotation of {label} by yaw (or heading), pitch and roll"
         raise checks.unsupported(path, what, "Export rotations as matrices", image=label)
     return None
@@ -232,8 +228,7 @@ def _photogroup(path: Path, element: Element) -> tuple[FloatArray, Lens | None]:
         given |= {f"c{side}": value(f"PrincipalPoint/{side}") + FIRST_PIXEL for side in "xy"}
     elif pixel_mm > 0.0:  # from the centre, in the axes of the camera
         mm = np.array([value("PrincipalPoint/xmm"), value("PrincipalPoint/ymm")])
-        x, y = axes[:2, :2] @ mm / pixel_mm
-        given |= {"cx": width / 2.0 + x, "cy": height / 2.0 + y}
+        given |= zip(("dx", "dy"), axes[:2, :2] @ mm / pixel_mm, strict=True)
     return axes, lens_by_name(given, width, height, sensor=name, **more)
 
 

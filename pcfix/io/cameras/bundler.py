@@ -87,8 +87,7 @@ def read(source: Source) -> Cameras:
         width, height = sizes[missing] = least_px.max(axis=0)
         sentence = f"the size of {missing.sum()} images is unknown; {width:.0f} x {height:.0f} px"
         sentence += " is estimated. Put the images next to the file."
-        values = {"size_px": [width, height]}
-        checks.warn(source.path, "cameras.frames_estimated", sentence, **values)
+        checks.warn(source.path, "cameras.frames_estimated", sentence, size_px=[width, height])
     more = {"relative": software == MVE, "inverse": software == VISUALSFM}
     pairs = zip(parameters, sizes.tolist(), strict=True)
     return replace(cameras, lenses=tuple(lens_by_name(of, *size, **more) for of, size in pairs))
