@@ -255,9 +255,8 @@ def _world(chunk: Document) -> tuple[str, str | None]:
         return LOCAL, None
     # the geocentric CRS on the same datum; of WGS 84 it has the code 4978
     axes = {"coordinate_system": type(crs)("EPSG:4978").to_json_dict()["coordinate_system"]}
-    given = (
-        unbound(crs.geodetic_crs or crs).to_json_dict() | axes | {"type": "GeodeticCRS", "id": None}
-    )
+    datum = unbound(crs.geodetic_crs or crs).to_json_dict()
+    given = datum | axes | {"type": "GeodeticCRS", "id": None}
     frame = crs_text(type(crs).from_json_dict({k: v for k, v in given.items() if v}))
     return frame, frame if crs.is_geocentric else text
 

@@ -125,13 +125,12 @@ def read(source: Source) -> Cameras:
         sentence = "its positions are those of the GNSS, not adjusted ones."
         checks.warn(source.path, "cameras.not_adjusted", sentence)
     labels, xyz = tuple(columns.labels), columns.of(axes(columns.place) or ())
-    lenses, sensor, scale = list[Lens](), sensor_file(source), np.array([1.0 / FILM_MM] + 8 * [1.0])
+    lenses, sensor = list[Lens](), sensor_file(source)
     if turns is not None and sensor and columns.has(*REALITY_CAPTURE[:3]):
-        frame = read_sensor(sensor)
+        frame, names = read_sensor(sensor), ("dx", "dy", "k1", "k2", "k3", "k4", "p1", "p2")
         given = [columns.of(REALITY_CAPTURE[:3]), columns.where_there(REALITY_CAPTURE[3:])]
-        names = ("f", "dx", "dy", "k1", "k2", "k3", "k4", "p1", "p2")
-        for row in (scale * np.nan_to_num(np.hstack(given))).tolist():
-            values = dict(zip(names, row, strict=True))
+        for focal, *others in np.nan_to_num(np.hstack(given)).tolist():
+            values = dict(zip(names, others, strict=True)) | {"f": focal / FILM_MM}
             lenses.append(lens_by_name(values, frame.width, frame.height, relative=True))
     gnss = gnss_positions(measured) if has_both else None
     known = tuple(lenses) or None
