@@ -40,6 +40,7 @@ from pcfix.model import (
     Views,
 )
 
+ZIP_MAGIC = b"PK\x03\x04"
 ROUNDING = 1e-3
 """Of a rotation's elements: files with four decimals pass, a mirrored or scaled one does not."""
 
@@ -71,7 +72,7 @@ class Source:
     @cached_property
     def text(self) -> str:
         """The first bytes as text, without a byte order mark; of an archive those of its XML."""
-        is_archive = self.head.startswith(b"PK\x03\x04")
+        is_archive = self.head.startswith(ZIP_MAGIC)
         return tables.decoded(read_document(self.path)[:_HEAD_BYTES] if is_archive else self.head)
 
 
@@ -141,7 +142,9 @@ def reading(path: object) -> Iterator[None]:
 def read_document(path: Path) -> bytes:
     """Return a file, or of an archive its ``doc.xml`` or else the first XML document."""
     with reading(path):
-        if not zipfile.is_zipfile(path):
+        with path.open("rb") as stream:
+            is_archive = stream.read(len(ZIP_MAGIC)) == ZIP_MAGIC
+        if not is_archive:
             return path.read_bytes()
         with zipfile.ZipFile(path) as archive:
             listed = [name for name in archive.namelist() if name.lower().endswith(".xml")]
