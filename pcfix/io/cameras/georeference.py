@@ -83,10 +83,8 @@ def is_tied(crs: str | None, name: str) -> bool:
 
 def _on_earth(crs: str | None, name: str) -> CRS | None:
     """Return a CRS that is tied to the earth; None for axes at a place and local frames."""
-    if crs is None or crs.strip().lower() == systems.LOCAL or systems.is_topocentric(crs):
-        return None
-    parsed = systems.parse_crs(crs, name)
-    return None if systems.is_local(parsed) else parsed
+    parsed = None if crs is None else systems.parse_crs(crs, name)
+    return None if parsed is None or systems.is_local(parsed) else parsed
 
 
 @dataclass(frozen=True, eq=False)

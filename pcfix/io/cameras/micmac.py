@@ -123,24 +123,24 @@ def _calibration(path: Path, element: Element) -> Lens:
     # MicMac's coefficients are of places in pixels, those of a Lens of places over the focal length
     powers = {"p1": 1, "p2": 1, "b1": 0, "b2": 0}
     given = {k: value * focal ** powers.get(k, 2 * int(k[1:])) for k, value in given.items()}
-    return _lens(path, focal, (size, principal, centre), given, is_inverse=_IS_INVERSE[convention])
+    frame = np.array([size, principal, centre])
+    return _lens(path, focal, frame, given, inverse=_IS_INVERSE[convention])
 
 
 def _lens(
-    path: Path, focal: float, frame: tuple[FloatArray, FloatArray, FloatArray],
-    given: dict[str, float], *, is_inverse: bool = False,
-) -> Lens:  # fmt: skip
+    path: Path, focal: float, frame: FloatArray, given: dict[str, float], *, inverse: bool = False
+) -> Lens:
     """Return the lens of coefficients k1, k2, ..., p1, p2, b1, b2 of places over the focal length.
 
     The `frame` is its size, the principal point and the centre of the distortion, pixels.
     """
-    b1, b2, (size, principal, centre) = given.get("b1", 0.0), given.get("b2", 0.0), frame
-    (width, height), (x, y), (cx, cy) = size.tolist(), principal.tolist(), centre.tolist()
+    b1, b2 = given.get("b1", 0.0), given.get("b2", 0.0)
+    (width, height), (x, y), (cx, cy) = frame.tolist()
     values = given | {"fx": focal + b1 * focal, "fy": focal, "skew": b2 * focal}
     values |= {"cx": x + b1 * (x - cx) + b2 * (y - cy), "cy": y}
     middle = ((cx - x) / focal, (cy - y) / focal)
-    more: dict[str, Any] = {"distortion_centre": middle, "inverse": is_inverse}
-    return checks.lens_by_name(values, width, height, sensor=path.stem, **more)
+    more: dict[str, Any] = {"distortion_centre": middle, "inverse": inverse, "sensor": path.stem}
+    return checks.lens_by_name(values, width, height, **more)
 
 
 def _calibration_2(path: Path, root: Element) -> Lens:
@@ -156,7 +156,7 @@ def _calibration_2(path: Path, root: Element) -> Lens:
     others = sorted(k for k, v in given.items() if v and k not in NAMES)
     if others:
         raise _not_held(path, f"terms {', '.join(others)}")
-    return _lens(path, focal, (size, principal, principal), given)
+    return _lens(path, focal, np.array([size, principal, principal]), given)
 
 
 def _not_held(path: Path, what: str) -> InputError:

@@ -98,11 +98,9 @@ class Project(NamedTuple):
             if resource.get("format") == form
         ]
 
-    def part(self, kind: str, form: str, *, needed: bool = True) -> tuple[Path, Part]:
-        """Return the one file of a format and its contents, which are empty if not needed."""
+    def part(self, kind: str, form: str) -> tuple[Path, Part]:
+        """Return the one file of a format and its contents."""
         found = self.files(kind, FORMAT.format(form))
-        if not found and not needed:
-            return self.path, {}
         if len(found) != 1:
             raise checks.damaged(self.path, f"{len(found)} files of {form} instead of one")
         return found[0], load_json(found[0])
@@ -123,9 +121,10 @@ def _open_project(path: Path) -> Project:
 
 def _frame_of(project: Project) -> AffineFrame:
     """Return the frame of the processing: east, north, up."""
-    path, scene = project.part("scene_reference_frame", "scene-reference-frame", needed=False)
-    if not scene:  # the frame of the processing is arbitrary
+    kind, form = "scene_reference_frame", "scene-reference-frame"
+    if not project.files(kind, FORMAT.format(form)):  # the frame of the processing is arbitrary
         return AffineFrame(np.eye(3), np.zeros(3), "local")
+    path, scene = project.part(kind, form)
     canonical = scene["base_to_canonical"]
     shift, scale = triple(canonical["shift"]), triple(canonical["scale"])
     if canonical.get("swap_xy"):
