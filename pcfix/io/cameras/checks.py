@@ -339,6 +339,7 @@ def lens_by_name(
     size = max(width, height) if relative else 1.0
     value = defaultdict(float, given)
     focal = given.get("fy", value["f"])
+    # k1, k2, ... up to the highest order of any term, without zeros at the end
     most = max((int(name[1:]) for name in given if name[1:].isdecimal()), default=0)
     orders = range(1, most + 1)
     terms = {
@@ -369,6 +370,7 @@ def model_of(
     values |= {"f": lens.focal, "fx": lens.focal + lens.b1, "fy": lens.focal}
     values |= {"cx": lens.principal_x, "cy": lens.principal_y, "skew": lens.b2, "b3": lens.b3}
     values |= dict(zip(SHAPES.get(lens.projection, "").split(), lens.shape, strict=False))
+    # a model fits if it images rays all over the frame as the lens does
     x, y = np.meshgrid(*(np.linspace(-0.5, 0.5, 8) * side for side in (lens.width, lens.height)))
     rays = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, lens.focal)])
     exact = project(lens, rays)

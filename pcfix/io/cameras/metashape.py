@@ -239,6 +239,7 @@ def _similarity(path: Path, element: Element | None) -> FloatArray | None:
         matrix[:3, :3] = numbers(path, where, rotation, 9).reshape(3, 3)
     if translation is not None:
         matrix[:3, 3] = numbers(path, where, translation, 3)
+    # a matrix contains the scale, unless this has an element of its own
     inside = np.cbrt(np.linalg.det(matrix[:3, :3])) if scale is None else 1.0
     size = inside if scale is None else number(path, where, scale)
     if not size > 0.0:

@@ -224,6 +224,7 @@ def _matches(
     if (first + count > len(index)).any() or len(count) > len(xyz):
         raise checks.damaged(path, "its points have more matches than there are")
     point = np.repeat(np.arange(len(count)), count)
+    # the first match of the point, and 0, 1, ... within it
     at = np.arange(len(point)) + np.repeat(first - (np.cumsum(count) - count), count)
     return checks.Observations(xyz, point, rows[index[at]], uv[at])
 

@@ -88,6 +88,7 @@ def read(source: Source) -> Cameras:
         poses = np.array([numbers(path, where, text, 6) for where, text in texts]).reshape(-1, 6)
         centres, rotations = poses[:, :3], from_omega_phi_kappa(*poses[:, 3:].T)
         if images:
+            # of several images of a name, those with the most similar rotations belong together
             rows_of = defaultdict[str, list[int]](list)
             for row, label in enumerate(labels):
                 rows_of[label].append(row)
