@@ -102,7 +102,7 @@ def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None)
     names, roles, wet = table.column("point"), _words(table, "role"), _words(table, "under_water")
     surfaces = ["on:water" if text in WATERLINE else text for text in roles]
     on = [text.removeprefix(ON) if text.startswith(ON) else "" for text in surfaces]
-    xyz = centres(table, needed=False)
+    xyz = centres(table)
     roles_of_sigma = ("sigma_x", "sigma_y", "sigma_z", "sigma_u", "sigma_v", "sigma_on")
     sigma = table.where_there(roles_of_sigma)
     is_check = np.array([role in CHECK for role in roles])

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, SettingError, bad_file
+from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Angles, Source, reading
 from pcfix.io.cameras.table import read_sensor, sensor_file
@@ -122,28 +122,23 @@ def read_cameras(
     (40, 3)
     """
     source, form = _recognised(path, sensor, angles)
-    try:
-        with reading(path), warnings.catch_warnings(record=True) as shown:
-            warnings.simplefilter("always")
-            cameras: Cameras = reader_of(form).read(source)
-            sensor_path = sensor_file(source)
-            if cameras.rotations is not None and cameras.lenses is None and sensor_path:
-                lenses = (read_sensor(sensor_path),) * len(cameras)
-                cameras = replace(cameras, lenses=lenses)
-            elif cameras.rotations is None or form not in TAKE_SENSOR:
-                if source.sensor is not None and len(cameras):
-                    why = "no angles" if cameras.rotations is None else "its own lenses"
-                    sentence = f"has {why}, so --sensor {sensor} has no effect. Omit it."
-                    raise bad_file(source.path, "cameras.sensor_unused", sentence, sensor=sensor)
-            elif cameras.lenses is None and form == "table":
-                sentence = "has angles but no sensor. Give --sensor a table with"
-                sentence += " focal,sensor_x,sensor_y (mm)."
-                raise bad_file(source.path, "cameras.sensor_missing", sentence)
-            cameras = checks.checked(source.path, cameras)
-    except SettingError as error:  # numbers that are finite in the file and not in the world
-        raise checks.damaged(path, str(error).rstrip(".")) from error
-    if not len(cameras):
-        raise checks.no_pose(source.path)
+    with reading(path), warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        cameras: Cameras = reader_of(form).read(source)
+        if not len(cameras):
+            raise checks.no_pose(source.path)
+        has_angles, sensor_path = cameras.rotations is not None, sensor_file(source)
+        if has_angles and cameras.lenses is None and sensor_path:
+            cameras = replace(cameras, lenses=(read_sensor(sensor_path),) * len(cameras))
+        elif has_angles and cameras.lenses is None and form == "table":
+            sentence = "has angles but no sensor. Give --sensor a table with"
+            sentence += " focal,sensor_x,sensor_y (mm)."
+            raise bad_file(source.path, "cameras.sensor_missing", sentence)
+        elif sensor is not None and not (has_angles and form in TAKE_SENSOR):
+            why = "its own lenses" if has_angles else "no angles"
+            sentence = f"has {why}, so --sensor {sensor} has no effect. Omit it."
+            raise bad_file(source.path, "cameras.sensor_unused", sentence, sensor=sensor)
+        cameras = checks.checked(source.path, cameras)
     for one in shown:
         warnings.warn(one.message, one.category, stacklevel=2)
     notes = [one.message for one in shown if isinstance(one.message, PcfixWarning)]

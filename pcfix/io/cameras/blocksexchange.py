@@ -53,6 +53,8 @@ SRS_OF_ALL = re.compile(rb"<SRSId>\s*([^<]*?)\s*</SRSId>")
 MAIN_COMPONENT = "1"
 CENTRE = [f"Center/{axis}" for axis in "xyz"]
 DEGREES = ["Longitude", "Latitude", "Altitude"]
+MATRIX = [f"Rotation/M_{row}{column}" for row in range(3) for column in range(3)]
+ANGLES = [f"Rotation/{angle}" for angle in ("Omega", "Phi", "Kappa")]
 EXIF = "EPSG:4326"
 """The CRS of positions in ExifData."""
 FIRST_PIXEL = 0.5
@@ -78,22 +80,17 @@ def read(source: Source) -> Cameras:
     path = source.path
     root = read_xml(path, TIE_POINTS.sub(b"", _read_bytes(path)))
     photos, unposed = _photos(path, root)
+    labels, centres = tuple(photo.label for photo in photos), [photo.centre for photo in photos]
     turns = [photo.rotation for photo in photos if photo.rotation is not None]
-    lenses = [photo.lens for photo in photos if photo.lens is not None]
-    priors = {photo.key: photo.prior for photo in photos if photo.prior is not None}
-    of = next(
-        (srs for srs, _ in priors.values()), ""
-    )  # GNSS positions of other systems are skipped
-    places = {key: (xyz, np.full(3, np.nan)) for key, (srs, xyz) in priors.items() if srs == of}
-    return Cameras(
-        labels=tuple(photo.label for photo in photos),
-        centres=np.array([photo.centre for photo in photos]),
-        rotations=np.array(turns) if turns else None,
-        lenses=tuple(lenses) if turns and len(lenses) == len(photos) else None,
-        crs=_crs_of(path, root, photos[0].srs),
-        gnss=checks.measured([photo.key for photo in photos], places, _crs_of(path, root, of)),
-        unposed=tuple(unposed),
-    )
+    lenses = [photo.lens for photo in photos if photo.lens is not None] if turns else []
+    known = tuple(lenses) if len(lenses) == len(photos) else None
+    priors = {i: photo.prior for i, photo in enumerate(photos) if photo.prior is not None}
+    gnss_srs = next(iter(priors.values()), ("",))[0]  # positions of other systems are skipped
+    places = {i: (xyz, [np.nan] * 3) for i, (srs, xyz) in priors.items() if srs == gnss_srs}
+    crs, gnss_crs = (_crs_of(path, root, srs) for srs in (photos[0].srs, gnss_srs))
+    gnss = checks.measured(range(len(photos)), places, gnss_crs)
+    rotations = np.array(turns) if turns else None
+    return Cameras(labels, np.array(centres), rotations, known, crs, gnss=gnss, unposed=unposed)
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -101,14 +98,13 @@ def _read_bytes(path: Path) -> bytes:
     return COMMENT.sub(b"", checks.read_document(path))
 
 
-def _photos(path: Path, root: Element) -> tuple[list[Photo], list[str]]:
+def _photos(path: Path, root: Element) -> tuple[list[Photo], tuple[str, ...]]:
     """Read the photos of the main component, if possible with rotations; and all other labels."""
-    listed, unposed, ignored = list[Photo](), list[str](), list[str]()
+    listed, unposed = list[Photo](), list[str]()
     for i, block in enumerate(root.iter("Block")):
         for group in block.iter("Photogroup"):
             axes, lens = _photogroup(path, group)
             is_ignored = text_of(group, "ManualPose").lower() == "false"
-            ignored += [text_of(group, "Name")] if is_ignored else []
             srs = text_of(group, "SRSId") or text_of(block, "SRSId")
             for element in group.iterfind("Photo"):
                 label, pose = _label(element), element.find("Pose")
@@ -117,7 +113,7 @@ def _photos(path: Path, root: Element) -> tuple[list[Photo], list[str]]:
                     continue
                 key = i, text_of(element, "Id")
                 centre = _numbers(path, f"image {label}", pose, CENTRE)
-                turn = _rotation(path, label, pose.find("Rotation"), axes)
+                turn = _rotation(path, label, pose, axes)
                 prior = _prior(path, label, element, srs)
                 is_main = text_of(element, "Component") in ("", MAIN_COMPONENT)
                 listed.append(Photo(is_main, key, label, lens, centre, turn, srs, prior))
@@ -129,12 +125,9 @@ def _photos(path: Path, root: Element) -> tuple[list[Photo], list[str]]:
     if len({(photo.key[0], photo.srs) for photo in photos}) > 1:
         sentence = "has several blocks or SRS. Export only the block of the cloud, in one SRS."
         raise bad_file(path, "cameras.several_blocks", sentence)
-    if ignored:
-        sentence = f"photogroup {', '.join(ignored[:10])} is skipped (its ManualPose is false)."
-        checks.warn(path, "cameras.poses_ignored", sentence, photogroups=ignored)
     chosen = {photo.key for photo in photos}
     unposed += [photo.label for photo in listed if photo.key not in chosen]
-    return photos, unposed
+    return photos, tuple(unposed)
 
 
 def _prior(path: Path, label: str, photo: Element, srs: str) -> tuple[str, FloatArray] | None:
@@ -148,21 +141,15 @@ def _prior(path: Path, label: str, photo: Element, srs: str) -> tuple[str, Float
     return None
 
 
-def _rotation(
-    path: Path, label: str, element: Element | None, axes: FloatArray
-) -> FloatArray | None:
+def _rotation(path: Path, label: str, pose: Element, axes: FloatArray) -> FloatArray | None:
     """Return world to x right, y down, z forward; None if there is no rotation."""
-    if element is None:
-        return None
     where = f"image {label}"
-    if element.find("M_00") is not None:
-        names = [f"M_{row}{column}" for row in range(3) for column in range(3)]
-        return axes @ _numbers(path, where, element, names).reshape(3, 3)
-    if element.find("Omega") is not None:
-        angles = _numbers(path, where, element, ["Omega", "Phi", "Kappa"])
-        matrix = from_photogrammetric(from_omega_phi_kappa(*angles.reshape(3, 1)))[0]
-        return np.asarray(axes @ matrix)
-    if element.find("Pitch") is not None:
+    if pose.find(MATRIX[0]) is not None:
+        return axes @ _numbers(path, where, pose, MATRIX).reshape(3, 3)
+    if pose.find(ANGLES[0]) is not None:
+        angles = _numbers(path, where, pose, ANGLES).reshape(3, 1)
+        return np.asarray(axes @ from_photogrammetric(from_omega_phi_kappa(*angles))[0])
+    if pose.find("Rotation/Pitch") is not None:
         what = f"the rotation of {label} by yaw (or heading), pitch and roll"
         raise checks.unsupported(path, what, "Export rotations as matrices", image=label)
     return None
@@ -195,7 +182,7 @@ def _photogroup(path: Path, element: Element) -> tuple[FloatArray, Lens | None]:
 
     The matrix takes camera axes to x right, y down, z forward.
     """
-    name = (element.findtext("Name") or "without a name").strip()
+    name = text_of(element, "Name") or "without a name"
 
     def value(tag: str, default: float = 0.0) -> float:
         text = text_of(element, tag)
@@ -241,8 +228,7 @@ def _photogroup(path: Path, element: Element) -> tuple[FloatArray, Lens | None]:
         given |= {f"c{side}": value(f"PrincipalPoint/{side}") + FIRST_PIXEL for side in "xy"}
     elif pixel_mm > 0.0:  # from the centre, in the axes of the camera
         mm = np.array([value("PrincipalPoint/xmm"), value("PrincipalPoint/ymm")])
-        x, y = axes[:2, :2] @ mm / pixel_mm
-        given |= {"cx": width / 2.0 + x, "cy": height / 2.0 + y}
+        given |= zip(("dx", "dy"), axes[:2, :2] @ mm / pixel_mm, strict=True)
     return axes, lens_by_name(given, width, height, sensor=name, **more)
 
 

@@ -65,22 +65,32 @@ class Model(NamedTuple):
     """
 
     cameras: Cameras
-    lenses: list[dict[str, float]]  # parameters; f is of the longer side in files of MVE
+    lenses: list[dict[str, float]]  # parameters; f is relative in files of MVE
     least_px: FloatArray
     points: Observations
     software: str
 
 
 def read(source: Source) -> Cameras:
-    """Read the poses of the largest model, and its lenses if sizes are known."""
+    """Read the poses of the largest model, and its lenses if sizes are known.
+
+    A size is that of the image, or else of the smallest frame, about the middle, that contains the
+    tie points of all images.
+    """
     cameras, parameters, least_px, _, software = _model(source)
-    frames = _frame_sizes(source.path, cameras.labels, least_px)
-    lenses = []
-    for given, (w, h) in zip(parameters, frames.tolist(), strict=False):
-        if software == MVE:
-            given["f"] *= max(w, h)
-        lenses.append(lens_by_name(given, w, h, inverse=software == VISUALSFM))
-    return replace(cameras, lenses=tuple(lenses) or None)
+    folder = source.path.parent
+    sizes = np.array([checks.image_size(folder, one) or (0, 0) for one in cameras.labels], float)
+    missing = sizes[:, 0] == 0
+    if missing.any() and not least_px.any():
+        return cameras
+    if missing.any():
+        width, height = sizes[missing] = least_px.max(axis=0)
+        sentence = f"the size of {missing.sum()} images is unknown; {width:.0f} x {height:.0f} px"
+        sentence += " is estimated. Put the images next to the file."
+        checks.warn(source.path, "cameras.frames_estimated", sentence, size_px=[width, height])
+    more = {"relative": software == MVE, "inverse": software == VISUALSFM}
+    pairs = zip(parameters, sizes.tolist(), strict=True)
+    return replace(cameras, lenses=tuple(lens_by_name(of, *size, **more) for of, size in pairs))
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
@@ -104,8 +114,14 @@ def _model(source: Source) -> Model:
     count, end = int(values[0]), 2 + _CAMERA_NUMBERS * int(values[0])
     rows = values[2:end].reshape(count, _CAMERA_NUMBERS)
     points = _points(path, values[end:], int(values[1]), count, 3 if is_mve else 4)
+    # the names are in the first list next to the file that has one for each image
+    own = path.with_name(f"{path.name.removesuffix('.out').removesuffix('.bundle')}.list.txt")
+    lists = (own, path.with_name("list.txt"), path.parent.parent / "list.txt")
+    named = [list(filter(str.strip, read_lines(place))) for place in lists if place.is_file()]
     kind = "view" if is_mve else "camera"
-    names = _listed_names(path, count) or [f"{kind} {i}" for i in range(count)]
+    unnamed = [f"{kind} {i}" for i in range(count)]
+    found = next((some for some in named if len(some) == count), unnamed)
+    names = [_FOCAL_OF_LIST.sub("", name.strip()) for name in found]
     rows, points, labels = _posed(path, rows, points, names)
     rotations = checks.rotations(path, labels, rows[:, 3:12])
     centres, least = checks.centres(rotations, rows[:, 12:]), np.zeros((len(rows), 2))
@@ -137,16 +153,6 @@ def _least_frames(points: Observations, count: int) -> FloatArray:
     return least
 
 
-def _listed_names(path: Path, count: int) -> list[str]:
-    """Return the names in the first list next to a file that has one for each image."""
-    own = path.with_name(f"{path.name.removesuffix('.out').removesuffix('.bundle')}.list.txt")
-    for place in (own, path.with_name("list.txt"), path.parent.parent / "list.txt"):
-        lines = [line.strip() for line in read_lines(place)] if place.is_file() else []
-        if len(listed := [line for line in lines if line]) == count:
-            return [_FOCAL_OF_LIST.sub("", line) for line in listed]
-    return []
-
-
 def _read_nvm(path: Path) -> Model:
     """Read the model with most posed images, of those with points if there are any."""
     head, *lines = [x for line in read_lines(path) if (x := line.strip()) and x[0] != "#"]
@@ -169,6 +175,7 @@ def _read_nvm(path: Path) -> Model:
         raise checks.no_pose(path)
     among = [model for model in models if len(model[2].xyz)] or models
     names, rows, points = max(among, key=lambda model: (model[1][:, 0] > 0.0).sum())
+    every = {name for model in models for name in model[0]}
     rows, points, labels = _posed(path, rows, points, names)
     if matrix:
         rotations = checks.rotations(path, labels, rows[:, 1:10])
@@ -184,9 +191,8 @@ def _read_nvm(path: Path) -> Model:
         expected = rows[points.camera, :1] * np.column_stack([x / z, y / z])
         points, least = _from_the_middle(points, expected, rows[:, 0])
     given = [{"f": f, "k1": k1} | fixed for f, k1 in rows[:, [0, -2]].tolist()]
-    unposed = tuple(sorted({name for model in models for name in model[0]} - {*labels}))
     checks.warn_several(path, len(among), len(labels))
-    cameras = Cameras(labels, centres, rotations, unposed=unposed)
+    cameras = Cameras(labels, centres, rotations, unposed=tuple(sorted(every - {*labels})))
     return Model(cameras, given, least, points, VISUALSFM)
 
 
@@ -238,21 +244,3 @@ def _from_the_middle(
             seen[rows] = (seen[rows] - frame / 2.0) * frame.max() / frame
             least[focal == f] = frame
     return points._replace(uv=seen), least
-
-
-def _frame_sizes(path: Path, labels: tuple[str, ...], least_px: FloatArray) -> FloatArray:
-    """Return width and height of images, from the images themselves or from their tie points.
-
-    If an image cannot be opened, its frame is the smallest that contains the tie points of all
-    images, about the middle of the frame. Without tie points no size is returned.
-    """
-    sizes = np.array([checks.image_size(path.parent, one) or (0, 0) for one in labels], float)
-    missing = sizes[:, 0] == 0
-    if missing.any() and not least_px.any():
-        return np.empty((0, 2))
-    if missing.any():
-        width, height = sizes[missing] = least_px.max(axis=0)
-        sentence = f"the size of {missing.sum()} images is unknown; {width:.0f} x {height:.0f} px"
-        sentence += " is estimated. Put the images next to the file."
-        checks.warn(path, "cameras.frames_estimated", sentence, size_px=[width, height])
-    return sizes

@@ -2,7 +2,8 @@
 
 Lenses are made of parameters by name, as all packages have the same few. Here they are called
 ``f``, or ``fx`` across and ``fy`` down the image; ``cx``, ``cy``, the principal point from the
-upper left corner of the image; ``skew`` and ``b3``, the affine terms off the diagonal; ``k1``, ...
+upper left corner of the image, or ``dx``, ``dy`` from its centre; ``skew`` and ``b3``, the affine
+terms off the diagonal; ``k1``, ...
 radial and ``d1``, ... in the denominator; ``p1``, ``p2``, ... in Brown's order, so OpenCV's p1 is
 ``p2``; ``s1``, ... of thin prisms; and the parameters of a projection, see `SHAPES`.
 `pcfix.model.Lens` has the formulas.
@@ -24,7 +25,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from pcfix.errors import InputError, NoTiePointsError, PcfixError, PcfixWarning, bad_file
+from pcfix.errors import InputError, NoTiePointsError, PcfixWarning, bad_file
 from pcfix.io import tables
 from pcfix.io.files import check_input, check_output, parse_json, write_bytes
 from pcfix.model import (
@@ -127,7 +128,7 @@ def reading(path: object) -> Iterator[None]:
     try:
         with np.errstate(all="ignore"):
             yield
-    except PcfixError:
+    except InputError:
         raise
     except FileNotFoundError as error:
         sentence = "is missing. Keep all files of the project together."
@@ -135,7 +136,7 @@ def reading(path: object) -> Iterator[None]:
     except KeyError as error:
         raise damaged(path, f"{error} is missing") from error
     except Exception as error:  # whatever a reader runs into where a file is cut off
-        raise damaged(path, error or type(error).__name__) from error
+        raise damaged(path, str(error).rstrip(".") or type(error).__name__) from error
 
 
 def read_document(path: Path) -> bytes:
@@ -287,7 +288,7 @@ class AffineFrame(NamedTuple):
 
     matrix: FloatArray
     shift: FloatArray
-    crs: str
+    crs: str | None
     project_crs: str | None = None
 
     def points(self, xyz: FloatArray) -> FloatArray:
@@ -321,14 +322,24 @@ class LensModel(NamedTuple):
     projection: Projection = "perspective"
     in_turn: bool = False
 
+    def lens(self, given: Mapping[str, float], width: float, height: float, **more: Any) -> Lens:
+        """Return the lens with the given parameters, see `lens_by_name`."""
+        more |= {"projection": self.projection, "in_turn": self.in_turn}
+        return lens_by_name(given, width, height, **more)
 
-def lens_by_name(given: Mapping[str, float], width: float, height: float, **more: Any) -> Lens:
+
+def lens_by_name(
+    given: Mapping[str, float], width: float, height: float, *, relative: bool = False, **more: Any
+) -> Lens:
     """Return the lens with the given parameters; `more` are other fields of a `Lens`.
 
-    Without ``cx`` and ``cy`` the principal point is in the middle of the frame.
+    With `relative`, the focal lengths, ``dx``, ``dy`` and ``skew`` are in units of the larger side
+    of the frame. Without a principal point it is in the middle of the frame.
     """
+    size = max(width, height) if relative else 1.0
     value = defaultdict(float, given)
     focal = given.get("fy", value["f"])
+    # k1, k2, ... up to the highest order of any term, without zeros at the end
     most = max((int(name[1:]) for name in given if name[1:].isdecimal()), default=0)
     orders = range(1, most + 1)
     terms = {
@@ -336,9 +347,10 @@ def lens_by_name(given: Mapping[str, float], width: float, height: float, **more
         for field, letter in LETTERS.items()
     }
     shape = tuple(value[name] for name in SHAPES.get(more.get("projection", ""), "").split())
-    middle = given.get("cx", width / 2.0), given.get("cy", height / 2.0)
-    affine = given.get("fx", focal) - focal, value["skew"], value["b3"]
-    return Lens(focal, width, height, *middle, *affine, **{"shape": shape} | terms | more)
+    x = given.get("cx", width / 2.0 + value["dx"] * size)
+    y = given.get("cy", height / 2.0 + value["dy"] * size)
+    affine = (given.get("fx", focal) - focal) * size, value["skew"] * size, value["b3"] * size
+    return Lens(focal * size, width, height, x, y, *affine, **{"shape": shape} | terms | more)
 
 
 def model_of(
@@ -358,6 +370,7 @@ def model_of(
     values |= {"f": lens.focal, "fx": lens.focal + lens.b1, "fy": lens.focal}
     values |= {"cx": lens.principal_x, "cy": lens.principal_y, "skew": lens.b2, "b3": lens.b3}
     values |= dict(zip(SHAPES.get(lens.projection, "").split(), lens.shape, strict=False))
+    # a model fits if it images rays all over the frame as the lens does
     x, y = np.meshgrid(*(np.linspace(-0.5, 0.5, 8) * side for side in (lens.width, lens.height)))
     rays = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, lens.focal)])
     exact = project(lens, rays)
@@ -365,8 +378,7 @@ def model_of(
     alike = [one for one in models if models[one].projection == lens.projection] if fits else []
     for name in sorted(alike, key=lambda one: models[one].names.count(" ")):
         given = {one: values.get(one, 0.0) for one in models[name].names.split()}
-        more = {"projection": lens.projection, "in_turn": models[name].in_turn}
-        held = project(lens_by_name(given, lens.width, lens.height, **more), rays)
+        held = project(models[name].lens(given, lens.width, lens.height), rays)
         if np.allclose(held, exact, rtol=0.0, atol=EXACT * lens.focal, equal_nan=True):
             return name, given
     kind = f"{lens.sensor or 'of the images'} ({lens.projection} in {lens.unit})"
@@ -410,14 +422,12 @@ def tie_points(*parts: Observations) -> TiePoints:
 
     An observation that is not finite is skipped, and such a position is unknown.
     """
-    before = np.cumsum([0, *(len(part.xyz) for part in parts)])
-    xyz = np.concatenate([part.xyz for part in parts])
+    xyz, point, camera, uv = (np.concatenate(column) for column in zip(*parts, strict=True))
+    is_there = (camera >= 0) & (point >= 0) & np.isfinite(uv).all(axis=1)
+    counts = [len(part.xyz) for part in parts]
+    point += np.repeat(np.cumsum([0, *counts[:-1]]), [len(part.point) for part in parts])
     xyz[~np.isfinite(xyz).all(axis=1)] = np.nan
-    point = np.concatenate([part.point + n for part, n in zip(parts, before, strict=False)])
-    is_there = np.concatenate([(part.camera >= 0) & (part.point >= 0) for part in parts])
-    camera = np.concatenate([part.camera for part in parts])
-    uv = np.concatenate([part.uv for part in parts])
-    used = np.flatnonzero(is_there & np.isfinite(uv).all(axis=1))
+    used = np.flatnonzero(is_there)
     used = used[np.argsort(point[used], kind="stable")]
     start = np.concatenate([[0], np.cumsum(np.bincount(point[used], minlength=len(xyz)))])
     return TiePoints(xyz, Views(start, camera[used]), uv[used])
@@ -442,11 +452,14 @@ def image_size(folder: Path, name: str) -> tuple[int, int] | None:
 
 
 def block_to_write(path: Path, cameras: Cameras) -> tuple[FloatArray, tuple[Lens, ...]]:
-    """Return rotations and lenses of cameras."""
+    """Return the rotations as unit quaternions, shape (k, 4), scalar first, and the lenses."""
+    from scipy.spatial.transform import Rotation
+
     if cameras.rotations is None or cameras.lenses is None:
         sentence = "the cameras have no rotations or no lenses, so they cannot be written."
         raise bad_file(path, "output.no_lenses", sentence)
-    return cameras.rotations, cameras.lenses
+    wxyz = np.roll(Rotation.from_matrix(cameras.rotations).as_quat(canonical=True), 1, axis=1)
+    return wxyz, cameras.lenses
 
 
 def write_new(folder: Path, contents: Mapping[str, bytes]) -> None:

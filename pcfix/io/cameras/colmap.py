@@ -31,9 +31,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.errors import InputError, bad_file
+from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
-from pcfix.io.cameras.checks import LensModel, Source, damaged, lens_by_name, model_of
+from pcfix.io.cameras.checks import LensModel, Source, damaged, model_of
 from pcfix.io.crs import is_topocentric
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 from pcfix.options.declare import File
@@ -51,23 +51,14 @@ def read(source: Source) -> Cameras:
     """Read the poses of registered images and their lenses."""
     listed, *others = _models_at(source.path)
     path, folder = listed.with_stem("images"), listed.parent
-    cameras, images = read_list(listed), read_images(path, points=False)
-    if not images:
-        raise checks.no_pose(path)
-    poses = np.array([image.pose for image in images])
+    lens_of, images = read_lenses(listed), read_images(path, points=False)
+    poses = np.array([image.pose for image in images]).reshape(-1, 7)
     labels = tuple(image.name for image in images)
     rotations = checks.quaternions(path, labels, poses[:, :4])
-    used = dict.fromkeys(image.camera for image in images)
-    lenses = {number: lens_of(number, cameras[number]) for number in used}
+    lenses = tuple(lens_of[image.camera] for image in images)
     offset, crs = read_place(folder)
     checks.warn_several(folder, len(others) + 1, len(images))
-    return Cameras(
-        labels=labels,
-        centres=checks.centres(rotations, poses[:, 4:]) + offset,
-        rotations=rotations,
-        lenses=tuple(lenses[image.camera] for image in images),
-        crs=crs,
-    )
+    return Cameras(labels, checks.centres(rotations, poses[:, 4:]) + offset, rotations, lenses, crs)
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
@@ -141,22 +132,14 @@ BY_NAME = {
 MODELS = tuple(BY_NAME)
 
 
-Camera = tuple[str, float, float, tuple[float, ...]]
-"""A row of the camera list: model, width, height, parameters."""
-
-
-def lens_of(identifier: int, camera: Camera) -> Lens:
-    """Return the lens of a camera."""
-    name, width, height, values = camera
-    model = BY_NAME[name]
-    more = {"in_turn": model.in_turn, "sensor": f"{identifier} {name}"}
-    given = dict(zip(model.names.split(), values, strict=True))
-    return lens_by_name(given, width, height, projection=model.projection, **more)
-
-
-def _no_model(path: Path, camera: object, model: object) -> InputError:
-    what, remedy = f"the model {model} of camera {camera}", "Give the undistorted model"
-    return checks.unsupported(path, what, remedy, model=model)
+def make_lens(path: Path, camera: object, name: str, numbers: Any) -> Lens:
+    """Return the lens of a camera; the numbers are width, height (pixels) and parameters."""
+    if name not in BY_NAME:
+        what, remedy = f"the model {name} of camera {camera}", "Give the undistorted model"
+        raise checks.unsupported(path, what, remedy, model=name)
+    width, height, *parameters = map(float, numbers)
+    given = dict(zip(BY_NAME[name].names.split(), parameters, strict=True))
+    return BY_NAME[name].lens(given, width, height, sensor=f"{camera} {name}")
 
 
 class Image(NamedTuple):
@@ -198,28 +181,22 @@ def _lines(path: Path) -> Iterator[str]:
                 yield line.strip()
 
 
-def read_list(path: Path) -> dict[int, Camera]:
+def read_lenses(path: Path) -> dict[int, Lens]:
     """Read ``cameras``, binary or text: identifier, model, width, height, parameters."""
-    cameras: dict[int, Camera] = {}
+    lenses: dict[int, Lens] = {}
     with checks.reading(path):
         if path.suffix == ".bin":
             file = _open(path)
             for _ in range(*_take(file, _COUNT)):
-                identifier, number, width, height = _take(file, _CAMERA)
-                if not 0 <= number < len(MODELS):
-                    raise _no_model(path, identifier, number)
-                count = len(BY_NAME[MODELS[number]].names.split())
+                number, model, *frame = _take(file, _CAMERA)
+                name = MODELS[model] if 0 <= model < len(MODELS) else str(model)
+                count = len(BY_NAME[name].names.split()) if name in BY_NAME else 0
                 values = _take(file, struct.Struct(f"<{count}d"))
-                cameras[identifier] = MODELS[number], float(width), float(height), values
-            return cameras
-        for name, model, *words in filter(None, map(str.split, _lines(path))):
-            if model not in BY_NAME:
-                raise _no_model(path, name, model)
-            width, height, *numbers = map(float, words)
-            if len(numbers) != len(BY_NAME[model].names.split()):
-                raise damaged(path, f"camera {name}: {len(numbers)} parameters of {model}")
-            cameras[int(name)] = model, width, height, tuple(numbers)
-    return cameras
+                lenses[number] = make_lens(path, number, name, (*frame, *values))
+            return lenses
+        for number, name, *words in filter(None, map(str.split, _lines(path))):
+            lenses[int(number)] = make_lens(path, number, name, words)
+    return lenses
 
 
 def read_images(path: Path, *, points: bool) -> list[Image]:
@@ -229,10 +206,8 @@ def read_images(path: Path, *, points: bool) -> list[Image]:
             file, images = _open(path), []
             for _ in range(*_take(file, _COUNT)):
                 identifier, *pose, camera = _take(file, _IMAGE)
-                end = file.find(b"\0", file.tell())
-                if end < 0:
-                    raise ValueError("a name does not end")
-                name = file.read(end + 1 - file.tell())[:-1].decode("utf-8", "replace")
+                end = file.find(b"\0", file.tell()) + 1
+                name = file.read(end - file.tell())[:-1].decode("utf-8", "replace")
                 (count,) = _take(file, _COUNT)
                 seen = np.empty(0, OBSERVATION)
                 if points and count:
@@ -258,19 +233,19 @@ def read_images(path: Path, *, points: bool) -> list[Image]:
 def read_points(path: Path) -> tuple[IntArray, FloatArray]:
     """Read identifiers and places of ``points3D``; the tracks are in the images too."""
     with checks.reading(path):
-        if path.suffix != ".bin":
-            lines = [line.split(None, 4)[:4] for line in _lines(path) if line]
-            values = np.array([line[1:] for line in lines], float).reshape(-1, 3)
-            return np.array([int(line[0]) for line in lines], np.int64), values
-        data, at, rows = _open(path), _COUNT.size, []
-        for _ in range(*_take(data, _COUNT)):
-            *row, views = _POINT.unpack_from(data, at)
-            rows.append(row)
-            at += _POINT.size + _VIEW_BYTES * views
-        if at > len(data):
-            raise damaged(path, "its last point has too few views")
+        rows: list[list[Any]] = []
+        if path.suffix == ".bin":
+            data, at = _open(path), _COUNT.size
+            for _ in range(*_take(data, _COUNT)):
+                *row, views = _POINT.unpack_from(data, at)
+                rows.append(row)
+                at += _POINT.size + _VIEW_BYTES * views
+            if at > len(data):
+                raise damaged(path, "its last point has too few views")
+        else:
+            rows = [line.split(None, 4)[:4] for line in _lines(path) if line]
         places = np.array([row[1:] for row in rows], float).reshape(-1, 3)
-        return np.array([row[0] for row in rows], np.int64), places
+        return np.array([int(row[0]) for row in rows], np.int64), places
 
 
 WRITTEN = {k: model for k, model in BY_NAME.items() if k not in ("SIMPLE_FISHEYE", "FISHEYE")}
@@ -291,10 +266,8 @@ def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = 
     tie_points : TiePoints, optional
         In the frame of the cameras; those without a position or without a view are skipped.
     """
-    from scipy.spatial.transform import Rotation
-
     target = Path(folder)
-    rotations, lenses = checks.block_to_write(target, cameras)
+    turns, lenses = checks.block_to_write(target, cameras)
     for label in cameras.labels:  # the format would cut other names
         if not label == label.strip() != "" or {"\0", "\n"} & {*label}:
             sentence = f"the format cannot hold the image name {label!r}. Rename the image."
@@ -323,8 +296,7 @@ def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = 
         size = int(lens.width), int(lens.height)
         listed.append(struct.pack("<IiQQ", i, MODELS.index(model), *size))
         listed.append(np.array([*values.values()], "<f8").tobytes())
-    turns = np.roll(Rotation.from_matrix(rotations).as_quat(canonical=True), 1, axis=1)
-    shifts = -np.einsum("kij,kj->ki", rotations, cameras.centres - offset)
+    shifts = -np.einsum("kij,kj->ki", np.asarray(cameras.rotations), cameras.centres - offset)
     posed = list[bytes]()
     for i, (label, lens) in enumerate(zip(cameras.labels, lenses, strict=True)):
         posed.append(struct.pack("<I7dI", i + 1, *turns[i], *shifts[i], number_of[lens]))

@@ -83,10 +83,8 @@ def is_tied(crs: str | None, name: str) -> bool:
 
 def _on_earth(crs: str | None, name: str) -> CRS | None:
     """Return a CRS that is tied to the earth; None for axes at a place and local frames."""
-    if crs is None or crs.strip().lower() == systems.LOCAL or systems.is_topocentric(crs):
-        return None
-    parsed = systems.parse_crs(crs, name)
-    return None if systems.is_local(parsed) else parsed
+    parsed = None if crs is None else systems.parse_crs(crs, name)
+    return None if parsed is None or systems.is_local(parsed) else parsed
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,28 +187,19 @@ def georeference(
         sentence = f"is in {systems.shortened(crs)}, the cloud in a local frame. Set the cloud's"
         sentence += " CRS, or give --cameras-crs local to use the numbers as they are."
         raise bad_file(name, "cloud.local", sentence, crs=crs, cloud_crs=cloud.name)
-    frame = frame_of(crs, name)
-    if cloud is not None:
-        return _into(cloud, frame, project, cameras, offset, name, trusted=trusted)
-    if frame.topocentric or (frame.direct and frame.crs.is_projected):
-        words = systems.shortened(crs) if frame.topocentric else frame.crs.name
-        found = Georeference(name, offset, stated)
-    elif frame.direct or project is None or not project.is_projected:
-        kind = "degrees" if frame.direct else "geocentric coordinates"
-        sentence = f"is in {kind} ({frame.crs.name}). Give a cloud that names its CRS."
-        raise bad_file(name, "cloud.no_crs", sentence, crs=frame.crs.name)
-    else:
-        words = project.name
-        found = _into(project, frame, project, cameras, offset, name, trusted=trusted)
-    sentence = f"the cloud names no CRS; that of the cameras is assumed ({words})."
-    return replace(found, notes=(note(name, "cloud.crs_assumed", sentence), *found.notes))
-
-
-def _into(
-    cloud: CRS, frame: Frame, project: CRS | None, cameras: Cameras, offset: FloatArray, name: str,
-    *, trusted: bool,
-) -> Georeference:  # fmt: skip
-    """Return the transformation of a frame that is tied to the earth to a CRS."""
+    frame, notes = frame_of(crs, name), list[PcfixWarning]()
+    if cloud is None:
+        is_map = frame.topocentric or (frame.direct and frame.crs.is_projected)
+        if not is_map and (frame.direct or project is None or not project.is_projected):
+            kind = "degrees" if frame.direct else "geocentric coordinates"
+            sentence = f"is in {kind} ({frame.crs.name}). Give a cloud that names its CRS."
+            raise bad_file(name, "cloud.no_crs", sentence, crs=frame.crs.name)
+        cloud = frame.crs if is_map or project is None else project
+        words = systems.shortened(crs) if frame.topocentric else cloud.name
+        sentence = f"the cloud names no CRS; that of the cameras is assumed ({words})."
+        notes.append(note(name, "cloud.crs_assumed", sentence))
+        if is_map:
+            return Georeference(name, offset, stated, tuple(notes))
     systems.check_projected_metres(cloud, "the cloud")
     if frame.direct and frame.crs.is_geographic and offset.any():
         sentence = f"an offset in metres cannot be added to degrees ({frame.crs.name}). Omit it."
@@ -219,21 +208,22 @@ def _into(
     if systems.heights_of(cloud) == "unstated":  # then the heights are those that the software uses
         vertical = systems.parts(frame.crs if project is None else project)[1]
         target = cloud if vertical is None else systems.with_heights(cloud, vertical)
-    crs = systems.crs_text(target)
-    own, there = systems.heights_of(frame.crs), systems.heights_of(target)
+    here, there = systems.heights_of(frame.crs), systems.heights_of(target)
     unit, size = systems.plan_unit(frame.crs)
     is_guess = project is None and not frame.topocentric
     assumed = ""
-    if own == "unstated" and frame.crs.is_projected and size != 1.0:
+    if here == "unstated" and frame.crs.is_projected and size != 1.0:
         assumed = f"heights are assumed to be in {unit}, like x and y"
-    elif own == "unstated" != there and not trusted:
+    elif here == "unstated" != there and not trusted:
         assumed = f"names no vertical datum; that of the cloud is assumed ({target.name})"
-    elif own == "ellipsoidal" and there == "unstated" and is_guess and not trusted:
+    elif here == "ellipsoidal" and there == "unstated" and is_guess and not trusted:
         assumed = f"the cloud's CRS ({target.name}) names no vertical datum; ellipsoidal is assumed"
-    notes = (note(name, "cameras.heights_assumed", f"{assumed}."),) if assumed else ()
+    guesses = [note(name, "cameras.heights_assumed", f"{assumed}.")] if assumed else []
+    # heights change only if both sides state different datums, and the user does not trust them
     heights = not ((trusted and not frame.direct) or systems.heights_agree(frame.crs, target))
+    into = systems.crs_text(target)
     if frame.direct and not heights and systems.is_same_numbers(frame.crs, target):
-        return Georeference(name, offset, crs, notes)
+        return Georeference(name, offset, into, (*notes, *guesses))
     plan = systems.crs_text(systems.parts(frame.crs if frame.direct else target)[0])
     given = "ENU:latitude,longitude,height" if frame.topocentric else systems.shortened(plan)
     instead = f"or, if the heights of cameras and cloud agree, give --cameras-crs {given}"
@@ -242,8 +232,11 @@ def _into(
     forward, of_step = systems.transformation(
         frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
     )
-    notes = (*(PcfixWarning("crs.transformation", str(one), path=name) for one in of_step), *notes)
-    return Georeference(name, offset, crs, notes, frame, lambda xyz: forward(frame.enter(xyz)))
+    notes += [PcfixWarning("crs.transformation", str(one), path=name) for one in of_step]
+    notes += guesses
+    return Georeference(
+        name, offset, into, tuple(notes), frame, lambda xyz: forward(frame.enter(xyz))
+    )
 
 
 def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatArray, str]:
@@ -288,6 +281,3 @@ def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatA
         off[:, :2] = np.column_stack([metres * np.sin(azimuth), metres * np.cos(azimuth)])
     found[rows] = off * [1.0, 1.0, np.nan] if reason else off
     return found, reason
-
-
-# ---- cameras that are not over their cloud ----

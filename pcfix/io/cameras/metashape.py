@@ -41,7 +41,7 @@ import numpy as np
 from pcfix.errors import bad_file
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import Source, damaged, number, numbers, read_xml, text_of, warn
-from pcfix.io.crs import LOCAL, crs_text, is_local, parse_crs, shortened, unbound
+from pcfix.io.crs import LOCAL, crs_text, is_local, parse_crs, unbound
 from pcfix.io.ply import parse_header
 from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, Projection, TiePoints
 
@@ -70,19 +70,17 @@ def read(source: Source) -> Cameras:
     """Read the aligned images of a chunk: geocentric, or in a ``local`` frame."""
     chunk = open_chunk(source.path)
     images, unposed = aligned_images(chunk)
-    crs, project_crs = _world(chunk)
+    labels = tuple(image.label for image in images)
     in_world = np.array([image.place @ image.pose for image in images])
-    scales = np.cbrt(np.linalg.det(in_world[:, :3, :3]))[:, None, None]
-    lenses = {one: _lens(chunk.path, one) for one in dict.fromkeys(i.sensor for i in images)}
+    turns, centres = in_world[:, :3, :3], in_world[:, :3, 3]
+    scales = np.cbrt(np.linalg.det(turns))[:, None, None]
+    rotations = np.ascontiguousarray((turns / scales).transpose(0, 2, 1))  # world to camera
+    lens_of = {one: _lens(chunk.path, one) for one in dict.fromkeys(i.sensor for i in images)}
+    lenses = tuple(lens_of[image.sensor] for image in images)
+    crs, project_crs = _world(chunk)
+    gnss = _gnss_positions(chunk, images)
     return Cameras(
-        labels=tuple(image.label for image in images),
-        centres=in_world[:, :3, 3],
-        rotations=np.ascontiguousarray((in_world[:, :3, :3] / scales).transpose(0, 2, 1)),
-        lenses=tuple(lenses[image.sensor] for image in images),
-        crs=crs,
-        project_crs=project_crs,
-        gnss=_gnss_positions(chunk, images),
-        unposed=unposed,
+        labels, centres, rotations, lenses, crs, project_crs=project_crs, gnss=gnss, unposed=unposed
     )
 
 
@@ -215,10 +213,8 @@ def _places(path: Path, chunk: Element) -> tuple[dict[str | None, FloatArray | N
     transform; the active one can have that of the chunk. If none has a transform, the world is the
     frame of the chunk.
     """
-    places: dict[str | None, FloatArray | None]
-    places = {None: _similarity(path, chunk.find("transform"))}
-    for one in chunk.iterfind("components/component"):
-        places[one.get("id")] = _similarity(path, one.find("transform"))
+    framed = {None: chunk} | {one.get("id"): one for one in chunk.iterfind("components/component")}
+    places = {name: _similarity(path, one.find("transform")) for name, one in framed.items()}
     has_place = any(place is not None for place in places.values())
     if not has_place:
         places[None] = np.eye(4)
@@ -243,6 +239,7 @@ def _similarity(path: Path, element: Element | None) -> FloatArray | None:
         matrix[:3, :3] = numbers(path, where, rotation, 9).reshape(3, 3)
     if translation is not None:
         matrix[:3, 3] = numbers(path, where, translation, 3)
+    # a matrix contains the scale, unless this has an element of its own
     inside = np.cbrt(np.linalg.det(matrix[:3, :3])) if scale is None else 1.0
     size = inside if scale is None else number(path, where, scale)
     if not size > 0.0:
@@ -253,17 +250,14 @@ def _similarity(path: Path, element: Element | None) -> FloatArray | None:
 
 def _world(chunk: Document) -> tuple[str, str | None]:
     """Return the frame that a chunk's transforms lead to, and its CRS if that is another."""
-    text, name = text_of(chunk.root, "reference"), str(chunk.path)
-    if not text or text.upper() == "LOCAL" or not _places(chunk.path, chunk.root)[1]:
+    text = text_of(chunk.root, "reference")
+    has_place = bool(text) and _places(chunk.path, chunk.root)[1]
+    if not has_place or is_local(crs := parse_crs(text, str(chunk.path))):
         return LOCAL, None
-    crs = parse_crs(text, name)
-    if is_local(crs):
-        return LOCAL, None
-    if crs.geodetic_crs is None:
-        raise damaged(chunk.path, f"the CRS {shortened(text)} has no datum")
     # the geocentric CRS on the same datum; of WGS 84 it has the code 4978
     axes = {"coordinate_system": type(crs)("EPSG:4978").to_json_dict()["coordinate_system"]}
-    given = unbound(crs.geodetic_crs).to_json_dict() | axes | {"type": "GeodeticCRS", "id": None}
+    datum = unbound(crs.geodetic_crs or crs).to_json_dict()
+    given = datum | axes | {"type": "GeodeticCRS", "id": None}
     frame = crs_text(type(crs).from_json_dict({k: v for k, v in given.items() if v}))
     return frame, frame if crs.is_geocentric else text
 
@@ -324,13 +318,13 @@ def _calibrated(
         for entry in calibration
         if entry.tag in PARAMETERS
     }
-    (width, height), value = size, defaultdict(float, given)
+    value = defaultdict(float, given)
     if "f" in given:
-        given |= {"fx": value["f"] + value["b1"], "fy": value["f"], "skew": value["b2"]}
-        given |= {"cx": width / 2.0 + value["cx"], "cy": height / 2.0 + value["cy"]}
+        given = given | {"fx": value["f"] + value["b1"], "skew": value["b2"]}
+        given |= {"dx": given.pop("cx", 0.0), "dy": given.pop("cy", 0.0)}
     else:  # PhotoScan's
         given |= {"fy": given.get("fy", value["fx"]), "p1": value["p2"], "p2": value["p1"]}
-    return checks.lens_by_name(given, width, height, projection=PROJECTIONS[kind], sensor=sensor)
+    return checks.lens_by_name(given, *size, projection=PROJECTIONS[kind], sensor=sensor)
 
 
 # ---- what was measured ----
@@ -361,7 +355,7 @@ def _gnss_positions(chunk: Document, images: list[Image]) -> GnssPositions | Non
     found = checks.measured(range(len(images)), places, crs)
     if found is None:
         return None
-    if crs.upper() == "LOCAL" or is_local(parsed := parse_crs(crs, str(path))):
+    if is_local(parsed := parse_crs(crs, str(path))):
         return replace(found, crs=LOCAL)
     largest = np.nanmax(np.abs(found.xyz[:, :2]), axis=0)
     if own or parsed.is_geographic or (largest > [180.0, 90.0]).any():

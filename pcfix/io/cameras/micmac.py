@@ -26,6 +26,7 @@ write the formula of each coefficient next to it.
 from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
+from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -50,14 +51,10 @@ def read(source: Source) -> Cameras:
     if source.path.is_dir():
         found = [sorted(source.path.glob(f"{one}*{SUFFIX}")) for one in (PREFIX, PREFIX_2)]
         paths = [path for path in found[0] or found[1] if path.is_file()]
-    poses = [_orientation(path) for path in paths]
-    labels = [path.name.removesuffix(SUFFIX).removeprefix(PREFIX) for path in paths]
-    return Cameras(
-        labels=tuple(label.removeprefix(PREFIX_2) for label in labels),
-        centres=np.array([centre for centre, _, _ in poses]),
-        rotations=np.array([rotation for _, rotation, _ in poses]),
-        lenses=tuple(lens for _, _, lens in poses),
-    )
+    names = [path.name.removesuffix(SUFFIX).removeprefix(PREFIX) for path in paths]
+    labels = tuple(name.removeprefix(PREFIX_2) for name in names)
+    centres, rotations, lenses = zip(*map(_orientation, paths), strict=True)
+    return Cameras(labels, np.array(centres), np.array(rotations), lenses)
 
 
 def _orientation(path: Path) -> tuple[FloatArray, FloatArray, Lens]:
@@ -126,23 +123,23 @@ def _calibration(path: Path, element: Element) -> Lens:
     # MicMac's coefficients are of places in pixels, those of a Lens of places over the focal length
     powers = {"p1": 1, "p2": 1, "b1": 0, "b2": 0}
     given = {k: value * focal ** powers.get(k, 2 * int(k[1:])) for k, value in given.items()}
-    return _lens(path, focal, (size, principal, centre), given, is_inverse=_IS_INVERSE[convention])
+    frame = np.array([size, principal, centre])
+    return _lens(path, focal, frame, given, inverse=_IS_INVERSE[convention])
 
 
 def _lens(
-    path: Path, focal: float, frame: tuple[FloatArray, FloatArray, FloatArray],
-    given: dict[str, float], *, is_inverse: bool = False,
-) -> Lens:  # fmt: skip
+    path: Path, focal: float, frame: FloatArray, given: dict[str, float], *, inverse: bool = False
+) -> Lens:
     """Return the lens of coefficients k1, k2, ..., p1, p2, b1, b2 of places over the focal length.
 
     The `frame` is its size, the principal point and the centre of the distortion, pixels.
     """
-    b1, b2, (size, principal, centre) = given.get("b1", 0.0), given.get("b2", 0.0), frame
-    (width, height), (x, y), (cx, cy) = size.tolist(), principal.tolist(), centre.tolist()
+    b1, b2 = given.get("b1", 0.0), given.get("b2", 0.0)
+    (width, height), (x, y), (cx, cy) = frame.tolist()
     values = given | {"fx": focal + b1 * focal, "fy": focal, "skew": b2 * focal}
     values |= {"cx": x + b1 * (x - cx) + b2 * (y - cy), "cy": y}
     middle = ((cx - x) / focal, (cy - y) / focal)
-    more = {"distortion_centre": middle, "inverse": is_inverse, "sensor": path.stem}
+    more: dict[str, Any] = {"distortion_centre": middle, "inverse": inverse, "sensor": path.stem}
     return checks.lens_by_name(values, width, height, **more)
 
 
@@ -159,7 +156,7 @@ def _calibration_2(path: Path, root: Element) -> Lens:
     others = sorted(k for k, v in given.items() if v and k not in NAMES)
     if others:
         raise _not_held(path, f"terms {', '.join(others)}")
-    return _lens(path, focal, (size, principal, principal), given)
+    return _lens(path, focal, np.array([size, principal, principal]), given)
 
 
 def _not_held(path: Path, what: str) -> InputError:

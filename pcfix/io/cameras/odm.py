@@ -36,18 +36,19 @@ stages `opensfm` and `odm_report` of https://github.com/OpenDroneMap/ODM.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path, PurePath
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from pcfix.io.cameras import checks
 from pcfix.io.cameras.checks import AffineFrame, LensModel, Source, damaged, lens_by_name, triple
-from pcfix.io.crs import Topocentric
+from pcfix.io.crs import Topocentric, is_topocentric
 from pcfix.io.tables import read_lines, unnamed
 from pcfix.lens.rotations import from_rotation_vectors
-from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, Lens, TiePoints
+from pcfix.model import Cameras, FloatArray, GnssPositions, Lens, TiePoints
 
 SHOTS = "shots.geojson"
 RECONSTRUCTION = "reconstruction.json"
@@ -60,6 +61,8 @@ ROUNDING_M = 2e-3
 """Newer ODM puts the origin at whole metres; reference_lla is rounded a little."""
 SAME_FOCAL = 1e-6
 GNSS_KEYS = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev")
+NO_GNSS = 999999.0
+"""The gps_dop that OpenSfM writes for an image without a position."""
 
 _FOLDERS = ("opensfm", "odm_georeferencing", "odm_georeferencing_25d", "odm_report")
 _OF_CRS = ("proj.txt", "coords.txt", "odm_georeferencing_model_geo.txt")
@@ -68,17 +71,15 @@ _SHOTS_HEAD = re.compile(
     r'\s*\{.*"features"\s*:\s*\[.*"(translation|rotation|filename)"', re.DOTALL
 )
 _KEYS = "cameras|shots|points|pano_shots|reference_lla|biases|rig_cameras|rig_instances"
-_HEAD = re.compile(rf'\[\s*\{{\s*"({_KEYS})"\s*:\s*\{{')
-NO_GNSS = 999999.0
-"""The gps_dop that OpenSfM writes for an image without a position."""
-Files = dict[str, Path]
+_HEAD = re.compile(rf'\s*\[\s*\{{\s*"({_KEYS})"\s*:\s*\{{')
+Files = Mapping[str, Path]
 """The existing files of a project by name, and the one with the ``poses``."""
 
 
 def recognises(source: Source) -> bool:
     """Whether it is shots.geojson or a reconstruction, or a folder with one."""
     files = _files_of(source.path)
-    text = Source(files["poses"]).text.lstrip() if "poses" in files else ""
+    text = Source(files["poses"]).text if "poses" in files else ""
     return bool(_SHOTS_HEAD.match(text) or _HEAD.match(text))
 
 
@@ -87,21 +88,45 @@ def read(source: Source) -> Cameras:
     files = _files_of(source.path)
     if _SHOTS_HEAD.match(Source(files["poses"]).text):
         return _read_shots(files)
-    found = read_reconstruction(files["poses"])
-    own, placed = found.cameras, _frame(files, found)
-    if placed is None:
-        middle = np.median(own.centres[:, :2], axis=0)
-        return own if np.abs(middle).max() <= TOPOCENTRIC_LIMIT_M else replace(own, crs=None)
-    gnss, listed = read_images(files.get("images.json"), own.labels)
+    own, _ = read_reconstruction(files["poses"])
+    frame, (gnss, listed) = _frame(files, own), _read_images(files, own.labels)
     return replace(
         own,
-        centres=placed.points(own.centres),
-        rotations=placed.rotations(np.asarray(own.rotations)),
-        crs=placed.crs,
-        project_crs=placed.project_crs,
+        centres=frame.points(own.centres),
+        rotations=frame.rotations(np.asarray(own.rotations)),
+        crs=frame.crs,
+        project_crs=frame.project_crs,
         gnss=gnss or own.gnss,
         unposed=unnamed([*own.unposed, *listed], own.labels),
     )
+
+
+def tie_points(source: Source, cameras: Cameras) -> TiePoints:
+    """Read points and tracks, in the frame of the poses."""
+    files = _files_of(source.path)
+    path = files["poses"]
+    own, points = read_reconstruction(path)
+    tracks = path.with_name("tracks.csv")
+    if not points or not tracks.is_file():
+        why = "it has no points" if not points else "there is no tracks.csv next to it"
+        raise checks.no_tie_points(path, why)
+    xyz = np.array([point["coordinates"] for point in points.values()], float).reshape(-1, 3)
+    camera_of, point_of = (
+        {name.encode(errors="replace"): i for i, name in enumerate(names)}
+        for names in (cameras.labels, points)
+    )
+    with checks.reading(tracks), tracks.open("rb") as stream:  # can have many millions of lines
+        listed = (line.split(b"\t", 5) for line in stream if b"\t" in line)
+        rows = (
+            (camera_of.get(f[0], -1), point_of.get(f[1], -1), *map(float, f[3:5])) for f in listed
+        )
+        values = np.fromiter(rows, np.dtype((np.float64, 4)))
+    camera, point = values[:, :2].T.astype(np.int64)
+    order = np.lexsort((camera, point))
+    size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]
+    uv = values[:, 2:] * size.max(axis=1, initial=0.0)[:, None] + size / 2.0
+    xyz = _frame(files, own).points(xyz)
+    return checks.tie_points(checks.Observations(xyz, point[order], camera[order], uv[order]))
 
 
 def _files_of(path: Path) -> Files:
@@ -123,24 +148,20 @@ def _files_of(path: Path) -> Files:
     return {name: there[0] for name, there in found.items() if there} | {"poses": poses}
 
 
-def _crs_of(files: Files) -> str | None:
-    """Return the projected CRS that the project names."""
-    return next((named_crs(files[name]) for name in _OF_CRS if name in files), None)
+# ---- the frame of a reconstruction ----
 
 
-def named_crs(path: Path) -> str:
-    """Return the CRS in the first line of a file: a PROJ string, EPSG:n or WGS84 UTM 16N."""
-    return checks.crs(path, [*read_lines(path), ""][0])
-
-
-def _frame(files: Files, found: Reconstruction) -> AffineFrame | None:
-    """Decide the frame, see the top of this module for the rules; None for OpenSfM's own."""
-    crs, reference = _crs_of(files), found.reference
-    located = None if reference is None else _located(*reference[:2], crs)
-    if not (located or files.keys() & {*_OF_CRS, SHOTS, TOPOCENTRIC}):
-        return None
-    unmoved = AffineFrame(np.eye(3), np.zeros(3), found.cameras.crs or "", crs)
-    if reference is None or files["poses"].name == TOPOCENTRIC:
+def _frame(files: Files, own: Cameras) -> AffineFrame:
+    """Decide the frame of a reconstruction, see the top of this module for the rules."""
+    crs, own_crs = _crs_of(files), own.crs or ""
+    origin = Topocentric.from_text(own_crs, "") if is_topocentric(own_crs) else None
+    lon, lat = (origin.longitude_deg, origin.latitude_deg) if origin else (np.nan, np.nan)
+    located = _located(lon, lat, crs) if origin else None
+    unmoved = AffineFrame(np.eye(3), np.zeros(3), own_crs, crs)
+    if not (located or files.keys() & {*_OF_CRS, SHOTS, TOPOCENTRIC}):  # OpenSfM's own
+        is_far = np.abs(np.median(own.centres[:, :2], axis=0)).max() > TOPOCENTRIC_LIMIT_M
+        return unmoved._replace(crs=None) if is_far else unmoved
+    if origin is None or files["poses"].name == TOPOCENTRIC:
         return unmoved
     if path := files.get(TRANSFORMATION):
         with checks.reading(path):
@@ -149,7 +170,7 @@ def _frame(files: Files, found: Reconstruction) -> AffineFrame | None:
         turn, shift = matrix[:3, :3], matrix[:3, 3]
         if not (np.abs(turn.T @ turn - np.eye(3)).max() <= SCALE_TOLERANCE):
             raise damaged(path, "it does not turn and shift the reconstruction")
-        if named := _located(*reference[:2], crs, shift[:2]):  # else the file is of another origin
+        if named := _located(lon, lat, crs, shift[:2]):  # else the file is of another origin
             return AffineFrame(turn, shift, named[0])
     if located is None:
         return unmoved
@@ -157,24 +178,24 @@ def _frame(files: Files, found: Reconstruction) -> AffineFrame | None:
     moved = AffineFrame(np.eye(3), np.array([*place, 0.0]), crs)
     # centres of shots.geojson, else the GNSS, which stays topocentric, show whether it was moved:
     # the two readings differ by the meridian convergence and the scale
-    own, gnss = found.cameras.centres, found.cameras.gnss
-    truth = np.full(own.shape, np.nan)
+    truth = np.full((len(own), 2), np.nan)
     if SHOTS in files:
         shots = _shots(files[SHOTS])
-        for i, label in enumerate(found.cameras.labels):
-            truth[i] = triple(shots[label]["translation"]) if label in shots else np.nan
-    elif gnss is not None:
-        truth = _from_topocentric(gnss.xyz, reference, crs)
+        for i, label in enumerate(own.labels):
+            truth[i] = triple(shots[label]["translation"])[:2] if label in shots else np.nan
+    elif own.gnss is not None:
+        truth = _projected(crs, origin.to_degrees(own.gnss.xyz))
+    still = _projected(crs, origin.to_degrees(own.centres))
     known = np.isfinite(truth).all(axis=1)
     still_m, moved_m = (
-        np.linalg.norm((guess - truth)[known, :2])
-        for guess in (_from_topocentric(own, reference, crs), moved.points(own))
+        np.linalg.norm((guess - truth)[known])
+        for guess in (still, moved.points(own.centres)[:, :2])
     )
     return unmoved._replace(project_crs=crs) if still_m < 0.5 * moved_m else moved
 
 
 def _located(
-    lat: float, lon: float, crs: str | None, place: FloatArray | None = None
+    lon: float, lat: float, crs: str | None, place: FloatArray | None = None
 ) -> tuple[str, FloatArray] | None:
     """Return the CRS in which a place has these coordinates to a metre, and the coordinates.
 
@@ -185,25 +206,32 @@ def _located(
     first = 32601 if lat >= 0.0 else 32701
     zones = [f"EPSG:{first + (zone + step) % 60}" for step in (0, -1, 1)]
     for candidate in [crs] if crs else zones:
-        there = _projected(candidate, lon, lat)
+        there = _projected(candidate, np.array([[lon, lat]]))[0]
         expected, within_m = (np.round(there), ROUNDING_M) if place is None else (place, 1.0)
         if np.linalg.norm(there - expected) < within_m:
             return candidate, expected
     return None
 
 
-def _from_topocentric(
-    xyz: FloatArray, reference: tuple[float, float, float], crs: str
-) -> FloatArray:
-    """Return topocentric points in a projected CRS, heights on the ellipsoid, shape (n, 3)."""
-    degrees = Topocentric(*reference).to_degrees(xyz)
-    return np.column_stack([*_projected(crs, *degrees[:, :2].T), degrees[:, 2]])
-
-
-def _projected(crs: str, lon: float | FloatArray, lat: float | FloatArray) -> FloatArray:
+def _projected(crs: str, degrees: FloatArray) -> FloatArray:
+    """Return x and y, shape (n, 2), of longitudes and latitudes."""
     from pyproj import Transformer
 
-    return np.array(Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon, lat))
+    step = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+    return np.column_stack(step.transform(degrees[:, 0], degrees[:, 1]))
+
+
+def _crs_of(files: Files) -> str | None:
+    """Return the projected CRS that the project names."""
+    return next((named_crs(files[name]) for name in _OF_CRS if name in files), None)
+
+
+def named_crs(path: Path) -> str:
+    """Return the CRS in the first line of a file: a PROJ string, EPSG:n or WGS84 UTM 16N."""
+    return checks.crs(path, [*read_lines(path), ""][0])
+
+
+# ---- shots.geojson and images.json of ODM ----
 
 
 def _read_shots(files: Files) -> Cameras:
@@ -216,55 +244,29 @@ def _read_shots(files: Files) -> Cameras:
     centres = np.array([triple(shot["translation"]) for shot in each])
     if crs is None and (place := (next(iter(each))["geometry"] or {}).get("coordinates")):
         lon, lat, _ = triple(place).tolist()  # without GNSS its coordinates are arbitrary
-        crs, _ = _located(lat, lon, None, centres[0, :2]) or (None, None)
+        crs, _ = _located(lon, lat, None, centres[0, :2]) or (None, None)
     known = {}
     if lenses_file := files.get("cameras.json"):
         with checks.reading(lenses_file):
-            known = {
-                k: lens(lenses_file, k, entry) for k, entry in checks.load_json(lenses_file).items()
-            }
-    lenses, plain = [], 0
+            listed = checks.load_json(lenses_file).items()
+            known = {name: lens(lenses_file, name, entry) for name, entry in listed}
+    lenses, bare = [], 0
     for shot in each:
-        width, height = float(shot["width"]), float(shot["height"])
-        focal = float(shot["focal"]) * max(width, height)
-        near = SAME_FOCAL * focal
-        alike = [one for one in known.values() if abs(one.focal + one.b1 - focal) < near]
-        found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else None)
-        plain += found is None
-        lenses.append(found or lens_by_name({"f": focal}, width, height))
-    if plain:
-        sentence = f"cameras.json has no camera of {plain} images; no distortion is assumed."
-        checks.warn(files["poses"], "cameras.no_distortion", sentence, images=plain)
-    gnss, listed = read_images(files.get("images.json"), labels)
-    return Cameras(
-        labels=labels,
-        centres=centres,
-        rotations=from_rotation_vectors(np.array([triple(shot["rotation"]) for shot in each])),
-        lenses=tuple(lenses),
-        crs=crs or "local",
-        gnss=gnss,
-        unposed=unnamed(listed, labels),
-    )
-
-
-def read_images(
-    path: Path | None, labels: tuple[str, ...]
-) -> tuple[GnssPositions | None, list[str]]:
-    """Return the GNSS positions of images.json per label, and the names of all its images.
-
-    Longitude, latitude, and the altitude as the image states it.
-    """
-    if path is None:
-        return None, []
-    places = {}
-    with checks.reading(path):
-        images = {str(image.get("filename")): image for image in checks.load_json(path)}
-        for label in labels:
-            image = images.get(label) or images.get(PurePath(label).stem) or {}
-            if image.get("latitude") is not None:
-                values = [np.nan if image.get(k) is None else float(image[k]) for k in GNSS_KEYS]
-                places[label] = values[:3], np.where(np.isfinite(values), values, np.nan)[[3, 3, 4]]
-    return checks.measured(labels, places, "EPSG:4326"), list(images)
+        plain = {"f": float(shot["focal"])}
+        own = lens_by_name(plain, float(shot["width"]), float(shot["height"]), relative=True)
+        near = SAME_FOCAL * own.focal
+        alike = [one for one in known.values() if abs(one.focal + one.b1 - own.focal) < near]
+        found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else own)
+        bare += found is own
+        lenses.append(found)
+    if bare:
+        sentence = f"cameras.json has no camera of {bare} images; no distortion is assumed."
+        checks.warn(files["poses"], "cameras.no_distortion", sentence, images=bare)
+    turns = from_rotation_vectors(np.array([triple(shot["rotation"]) for shot in each]))
+    gnss, images = _read_images(files, labels)
+    unposed = unnamed(images, labels)
+    crs = crs or "local"
+    return Cameras(labels, centres, turns, tuple(lenses), crs, gnss=gnss, unposed=unposed)
 
 
 def _shots(path: Path) -> dict[str, dict[str, Any]]:
@@ -279,24 +281,33 @@ def _shots(path: Path) -> dict[str, dict[str, Any]]:
     return shots
 
 
+def _read_images(files: Files, labels: tuple[str, ...]) -> tuple[GnssPositions | None, list[str]]:
+    """Return the GNSS positions of images.json per label, and the names of all its images.
+
+    Longitude, latitude, and the altitude as the image states it.
+    """
+    if (path := files.get("images.json")) is None:
+        return None, []
+    places = {}
+    with checks.reading(path):
+        images = {str(image.get("filename")): image for image in checks.load_json(path)}
+        for label in labels:
+            image = images.get(label) or images.get(PurePath(label).stem) or {}
+            if image.get("latitude") is not None:
+                values = [np.nan if image.get(k) is None else float(image[k]) for k in GNSS_KEYS]
+                places[label] = values[:3], np.where(np.isfinite(values), values, np.nan)[[3, 3, 4]]
+    return checks.measured(labels, places, "EPSG:4326"), list(images)
+
+
 # ---- reconstructions of OpenSfM ----
 
 
-class Reconstruction(NamedTuple):
-    """The largest reconstruction of a file, in the frame of the file.
+def read_reconstruction(path: Path) -> tuple[Cameras, dict[str, Any]]:
+    """Read the reconstruction with the most images, in the frame of the file; and its points.
 
-    `cameras` and their `gnss` are topocentric at `reference`, else local. `reference` is latitude
-    and longitude in degrees and the height in metres of the topocentric origin; None if the file
-    has none, or the zeros that OpenSfM writes for images without positions.
+    The frame is topocentric at the reference, or local if the file has none, or the zeros that
+    OpenSfM writes for images without positions.
     """
-
-    cameras: Cameras
-    reference: tuple[float, float, float] | None
-    points: dict[str, Any]
-
-
-def read_reconstruction(path: Path) -> Reconstruction:
-    """Read the reconstruction with the most images."""
     data = checks.load_json(path)
     with checks.reading(path):
         sets = [entry.get("shots", {}) for entry in data]
@@ -307,9 +318,9 @@ def read_reconstruction(path: Path) -> Reconstruction:
             raise checks.no_pose(path)
         used = dict.fromkeys(shot["camera"] for shot in shots.values())
         lenses = {name: lens(path, name, chosen["cameras"][name]) for name in used}
-        turns = np.array([checks.triple(shot["rotation"]) for shot in shots.values()])
+        turns = np.array([triple(shot["rotation"]) for shot in shots.values()])
+        shifts = np.array([triple(shot["translation"]) for shot in shots.values()])
         rotations = from_rotation_vectors(turns)
-        shifts = np.array([checks.triple(shot["translation"]) for shot in shots.values()])
         places = {}
         for label, shot in shots.items():
             position, dop = shot.get("gps_position"), shot.get("gps_dop")
@@ -318,97 +329,52 @@ def read_reconstruction(path: Path) -> Reconstruction:
         origin, other = chosen.get("reference_lla"), path.with_name("reference_lla.json")
         if origin is None and other.is_file() and other.read_bytes()[:100].lstrip()[:1] == b"{":
             origin = checks.load_json(other)
-        reference = None
+        crs = "local"
         if origin is not None:
             lat, lon, alt = (float(origin[key]) for key in ("latitude", "longitude", "altitude"))
             if not (abs(lat) <= 90.0 and abs(lon) <= 360.0 and abs(alt) < np.inf):
-                raise checks.damaged(path, f"reference_lla {lat:g}, {lon:g} is no place on earth")
-            reference = None if lat == lon == 0.0 else (lat, lon, alt)
-        crs = "local" if reference is None else "ENU:" + ",".join(map(repr, reference))
+                raise damaged(path, f"reference_lla {lat:g}, {lon:g} is no place on earth")
+            crs = crs if lat == lon == 0.0 else f"ENU:{lat!r},{lon!r},{alt!r}"
         cameras = Cameras(
             labels=tuple(shots),
             centres=checks.centres(rotations, shifts),
             rotations=rotations,
             lenses=tuple(lenses[shot["camera"]] for shot in shots.values()),
             crs=crs,
-            gnss=checks.measured([*shots], places, crs) if reference else None,
+            gnss=None if crs == "local" else checks.measured([*shots], places, crs),
             unposed=unnamed(others, shots),
         )
-        return Reconstruction(cameras, reference, chosen.get("points", {}))
-
-
-CHUNK_BYTES = 1 << 24
-
-
-def tie_points(source: Source, cameras: Cameras) -> TiePoints:
-    """Read points and tracks, in the frame of the poses."""
-    files = _files_of(source.path)
-    path = files["poses"]
-    found = read_reconstruction(path)
-    points, placed = found.points, _frame(files, found)
-    tracks = path.with_name("tracks.csv")
-    if not points or not tracks.is_file():
-        why = "it has no points" if not points else "there is no tracks.csv next to it"
-        raise checks.no_tie_points(path, why)
-    xyz = np.array([point["coordinates"] for point in points.values()], float).reshape(-1, 3)
-    xyz = xyz if placed is None else placed.points(xyz)
-    camera_of, point_of = (
-        {name.encode(errors="replace"): i for i, name in enumerate(names)}
-        for names in (cameras.labels, points)
-    )
-    parts: list[tuple[IntArray, IntArray, FloatArray]] = []
-    with checks.reading(tracks), tracks.open("rb") as stream:
-        while block := stream.readlines(CHUNK_BYTES):  # there can be many millions of lines
-            lines = [line.split(b"\t", 5) for line in block if line.count(b"\t")]
-            point = np.array([point_of.get(fields[1], -1) for fields in lines], dtype=np.int64)
-            camera = np.array([camera_of.get(fields[0], -1) for fields in lines], dtype=np.int64)
-            values = np.array([fields[3:5] for fields in lines], dtype=float).reshape(-1, 2)
-            parts.append((point, camera, values))
-    point, camera, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
-    order = np.lexsort((camera, point))
-    size = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])[camera]
-    uv = xy * size.max(axis=1, initial=0.0)[:, None] + size / 2.0
-    return checks.tie_points(checks.Observations(xyz, point[order], camera[order], uv[order]))
+        return cameras, chosen.get("points", {})
 
 
 _MODELS = {
-    "perspective": LensModel("f k1 k2"),
-    "simple_radial": LensModel("fx fy cx cy k1"),
-    "radial": LensModel("fx fy cx cy k1 k2"),
-    "brown": LensModel("fx fy cx cy k1 k2 k3 p2 p1"),
-    "fisheye": LensModel("f k1 k2", "equidistant"),
-    "fisheye_opencv": LensModel("fx fy cx cy k1 k2 k3 k4", "equidistant"),
-    "fisheye62": LensModel("fx fy cx cy k1 k2 k3 k4 k5 k6 p2 p1", "equidistant"),
-    "fisheye624": LensModel("fx fy cx cy k1 k2 k3 k4 k5 k6 p2 p1 s1 s2 s3 s4", "equidistant"),
-    "dual": LensModel("f k1 k2 transition", "dual"),
+    "perspective": LensModel("k1 k2"),
+    "simple_radial": LensModel("k1"),
+    "radial": LensModel("k1 k2"),
+    "brown": LensModel("k1 k2 k3 p1 p2"),
+    "fisheye": LensModel("k1 k2", "equidistant"),
+    "fisheye_opencv": LensModel("k1 k2 k3 k4", "equidistant"),
+    "fisheye62": LensModel("k1 k2 k3 k4 k5 k6 p1 p2", "equidistant"),
+    "fisheye624": LensModel("k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4", "equidistant"),
+    "dual": LensModel("k1 k2 transition", "dual"),
 }
-"""By names of `checks`; not every version of OpenSfM knows simple_radial and radial."""
-_PARAMETERS = {"f": "focal", "fx": "focal_x", "fy": "focal_y", "cx": "c_x", "cy": "c_y"}
-_PARAMETERS |= {"p1": "p2", "p2": "p1", "s1": "s0", "s2": "s1", "s3": "s2", "s4": "s3"}
+"""By names of `checks`, besides the focal lengths and the principal point of every model."""
+_CALLED = {"dx": "c_x", "dy": "c_y", "p1": "p2", "p2": "p1"}
+_CALLED |= {"s1": "s0", "s2": "s1", "s3": "s2", "s4": "s3"}
 """What OpenSfM calls what has another name in `checks`."""
-_DEFAULTS = {"transition": 0.5}
 
 
 def lens(path: Path, name: str, camera: dict[str, Any]) -> Lens:
     """Return the lens of an entry of `cameras`."""
-    model = str(camera.get("projection_type", "perspective"))
-    if model not in _MODELS:
+    kind = str(camera.get("projection_type", "perspective"))
+    if kind not in _MODELS:
         remedy = f"Remove its images, or use one of {', '.join(_MODELS)}"
-        what = f"the projection_type '{model}' of camera {name}"
-        raise checks.unsupported(path, what, remedy, model=model, camera=name)
-
-    def value(key: str, default: Any = 0.0) -> float:
-        return float(camera.get(key, default))
-
-    width, height = value("width"), value("height")
-    scale = max(width, height)
-    given = {
-        one: value(_PARAMETERS.get(one, one), _DEFAULTS.get(one, 0.0))
-        for one in _MODELS[model].names.split()
-    }
-    across = value("focal_x", camera.get("focal"))
-    down = value("focal_y", across)
-    given |= {"fx": across * scale, "fy": down * scale}
-    given |= {"cx": width / 2.0 + value("c_x") * scale, "cy": height / 2.0 + value("c_y") * scale}
-    projection = _MODELS[model].projection
-    return lens_by_name(given, width, height, projection=projection, sensor=name)
+        what = f"the projection_type '{kind}' of camera {name}"
+        raise checks.unsupported(path, what, remedy, model=kind, camera=name)
+    model, camera = _MODELS[kind], {"transition": 0.5} | camera  # 0.5 where OpenSfM omits it
+    frame = (float(camera.get(side, 0.0)) for side in ("width", "height"))
+    names = ("dx", "dy", *model.names.split())
+    given = {one: float(camera.get(_CALLED.get(one, one), 0.0)) for one in names}
+    across: Any = camera.get("focal_x", camera.get("focal"))
+    given |= {"fx": float(across), "fy": float(camera.get("focal_y", across))}
+    return model.lens(given, *frame, relative=True, sensor=name)

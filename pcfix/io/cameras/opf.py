@@ -21,7 +21,6 @@ Reference: Pix4D, "Open Photogrammetry Format Specification" 1.0, https://pix4d.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import unquote
@@ -39,6 +38,14 @@ FORMAT = "application/opf-{}+json"
 PROJECT = FORMAT.format("project")
 CONTENT = '"application/opf-|"orientation_deg"'
 INSIDE = r".*\.opf"
+INTERNALS = {
+    "perspective": {
+        **{"principal_point_px": "cx cy", "focal_length_px": "f"},
+        **{"radial_distortion": "k1 k2 k3", "tangential_distortion": "p2 p1"},
+    },
+    "fisheye": {"principal_point_px": "cx cy", "affine": "fx skew b3 fy"},
+}
+"""The parameters of each type of sensor, by names of `checks`."""
 Part = dict[str, Any]
 """An object of a JSON file."""
 
@@ -91,11 +98,9 @@ class Project(NamedTuple):
             if resource.get("format") == form
         ]
 
-    def part(self, kind: str, form: str, *, needed: bool = True) -> tuple[Path, Part]:
-        """Return the one file of a format and its contents, which are empty if not needed."""
+    def part(self, kind: str, form: str) -> tuple[Path, Part]:
+        """Return the one file of a format and its contents."""
         found = self.files(kind, FORMAT.format(form))
-        if not found and not needed:
-            return self.path, {}
         if len(found) != 1:
             raise checks.damaged(self.path, f"{len(found)} files of {form} instead of one")
         return found[0], load_json(found[0])
@@ -116,9 +121,10 @@ def _open_project(path: Path) -> Project:
 
 def _frame_of(project: Project) -> AffineFrame:
     """Return the frame of the processing: east, north, up."""
-    path, scene = project.part("scene_reference_frame", "scene-reference-frame", needed=False)
-    if not scene:  # the frame of the processing is arbitrary
+    kind, form = "scene_reference_frame", "scene-reference-frame"
+    if not project.files(kind, FORMAT.format(form)):  # the frame of the processing is arbitrary
         return AffineFrame(np.eye(3), np.zeros(3), "local")
+    path, scene = project.part(kind, form)
     canonical = scene["base_to_canonical"]
     shift, scale = triple(canonical["shift"]), triple(canonical["scale"])
     if canonical.get("swap_xy"):
@@ -141,21 +147,15 @@ def _lens(path: Path, sensor: Part, given: Part) -> Lens:
     """Return the calibrated lens of a sensor, with the frame of the input cameras."""
     frame, inner = map(float, given["image_size_px"]), sensor["internals"]
     name = str(given.get("name") or f"sensor {sensor['id']}")
-    values = dict(zip(("cx", "cy"), map(float, inner["principal_point_px"]), strict=True))
-    if inner.get("type") == "perspective":
-        values["f"] = float(inner["focal_length_px"])
-        values |= dict(zip(("k1", "k2", "k3"), triple(inner["radial_distortion"]), strict=True))
-        values |= zip(("p2", "p1"), map(float, inner["tangential_distortion"]), strict=True)
-        lens = lens_by_name(values, *frame)
-    elif inner.get("type") == "fisheye":
-        values |= zip(("fx", "skew", "b3", "fy"), map(float, inner["affine"]), strict=True)
-        shape = tuple(map(float, inner["polynomial"]))
-        lens = lens_by_name(values, *frame, projection="polynomial", shape=shape)
-    else:
-        what = f"the type {inner.get('type')!r:.40} of sensor {name}"
+    if (kind := str(inner.get("type"))) not in INTERNALS:
         remedy = "Remove its images and calibrate again"
-        raise checks.unsupported(path, what, remedy, sensor=name)
-    return replace(lens, sensor=name)
+        raise checks.unsupported(path, f"the type {kind:.40} of sensor {name}", remedy, sensor=name)
+    values, more = dict[str, float](), dict[str, Any](sensor=name)
+    for field, names in INTERNALS[kind].items():
+        values |= zip(names.split(), np.ravel(inner[field]).astype(float).tolist(), strict=True)
+    if kind == "fisheye":
+        more |= {"projection": "polynomial", "shape": tuple(map(float, inner["polynomial"]))}
+    return lens_by_name(values, *frame, **more)
 
 
 def _gnss(path: Path, captures: list[Part], ids: list[int]) -> GnssPositions | None:
@@ -224,6 +224,7 @@ def _matches(
     if (first + count > len(index)).any() or len(count) > len(xyz):
         raise checks.damaged(path, "its points have more matches than there are")
     point = np.repeat(np.arange(len(count)), count)
+    # the first match of the point, and 0, 1, ... within it
     at = np.arange(len(point)) + np.repeat(first - (np.cumsum(count) - count), count)
     return checks.Observations(xyz, point, rows[index[at]], uv[at])
 

@@ -23,7 +23,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from pathlib import Path, PurePath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,10 +45,10 @@ NAMES = {
 }
 """Names of the files of a project, after its own name."""
 TABLE = re.compile(r"(.*_|)calibrated_(?:external_)?camera_parameters(_wgs84)?\.txt")
-HEADERS = (
-    ["filename", "imagewidth", "imageheight"],
-    ["imagename", "x", "y", "z", "omega", "phi", "kappa"],
-    ["imagename", "longitude", "latitude", "altitude", "omega", "phi", "kappa"],
+HEADER = re.compile(
+    r"(?i)\s*(filename imagewidth imageheight|imagename (x y z|longitude latitude altitude)"
+    r" omega phi kappa)\s*?$",
+    re.MULTILINE,
 )
 FOLDERS = ("", "params/", "1_initial/params/", "*/params/", "*/1_initial/params/")
 """Folders of the files, seen from the folder of a project."""
@@ -70,7 +70,7 @@ def recognises(source: Source) -> bool:
     """Whether a file begins like one of the tables, or a folder has a table."""
     if source.path.is_dir():
         return bool(_tables_in(source.path))
-    return _columns(source) in HEADERS
+    return HEADER.match(source.text) is not None
 
 
 def read(source: Source) -> Cameras:
@@ -78,7 +78,7 @@ def read(source: Source) -> Cameras:
     files = _find(source)
     images = read_parameters(files["parameters"]) if "parameters" in files else []
     names, posed = [image.label for image in images], [*range(len(images))]
-    turns = np.array([image.fields["rotation"] for image in images])
+    turns = np.array([image.rotation for image in images])
     turns = checks.rotations(files.get("parameters", source.path), names, turns)
     if "external" in files:
         path = files["external"]
@@ -88,6 +88,7 @@ def read(source: Source) -> Cameras:
         poses = np.array([numbers(path, where, text, 6) for where, text in texts]).reshape(-1, 6)
         centres, rotations = poses[:, :3], from_omega_phi_kappa(*poses[:, 3:].T)
         if images:
+            # of several images of a name, those with the most similar rotations belong together
             rows_of = defaultdict[str, list[int]](list)
             for row, label in enumerate(labels):
                 rows_of[label].append(row)
@@ -101,28 +102,19 @@ def read(source: Source) -> Cameras:
             centres, rotations = (each[rows][posed] for each in (centres, rotations))
     else:
         labels, rotations = names, turns
-        centres = np.array([image.fields["centre"] for image in images]).reshape(-1, 3)
+        centres = np.array([image.centre for image in images]).reshape(-1, 3)
         centres += _offset(files)
-    given = [*names, *labels]
+    every = dict.fromkeys([*names, *labels])
     labels = [names[i] for i in posed] or labels
-    lenses = tuple(lens for i in posed if (lens := _lens(images[i])) is not None)
+    unposed = tuple(name for name in every if name not in set(labels))
+    lenses = tuple(images[i].lens for i in posed if images[i].lens is not None)
+    known = lenses if len(lenses) == len(labels) else None
     wkt = " ".join(read_lines(files["wkt"])).strip() if "wkt" in files else ""
-    return Cameras(
-        labels=tuple(labels),
-        centres=centres,
-        rotations=rotations,
-        lenses=lenses if len(lenses) == len(labels) else None,
-        crs=checks.crs(files["wkt"], wkt) if wkt else None,
-        unposed=tuple(name for name in dict.fromkeys(given) if name not in set(labels)),
-    )
+    crs = checks.crs(files["wkt"], wkt) if wkt else None
+    return Cameras(tuple(labels), centres, rotations, known, crs, unposed=unposed)
 
 
 # ---- files ----
-
-
-def _columns(source: Source) -> list[str]:
-    """Return the words of the first line of a file, lower case."""
-    return source.text.lstrip().partition("\n")[0].lower().split()
 
 
 def _find(source: Source) -> dict[str, Path]:
@@ -130,7 +122,7 @@ def _find(source: Source) -> dict[str, Path]:
 
     The project's name precedes that of the files.
     """
-    path, columns = source.path, _columns(source)
+    path, begin = source.path, source.text.lstrip().lower()
     found = TABLE.fullmatch(path.name)
     tables = _tables_in(path) if path.is_dir() else [(path.parent, found[1] if found else "")]
     folder, prefix = tables[0]
@@ -139,9 +131,9 @@ def _find(source: Source) -> dict[str, Path]:
         sentence = f"has several projects ({', '.join(sorted(prefixes))}). Give one file."
         raise bad_file(folder, "cameras.several_projects", sentence, projects=len(prefixes))
     files = {kind: folder / (prefix + name) for kind, name in NAMES.items()}
-    if columns[:1] == ["filename"]:
+    if begin.startswith("filename"):
         files["parameters"] = path
-    elif columns[1:2] == ["x"]:
+    elif begin.startswith("imagename x"):
         files["external"] = path
     return {kind: file for kind, file in files.items() if file.is_file()}
 
@@ -173,11 +165,12 @@ def _offset(files: dict[str, Path]) -> FloatArray:
 
 
 class Image(NamedTuple):
-    """One image of the camera parameters; `fields` has its numbers by the names in `FIELDS`."""
+    """An image of the camera parameters; the rotation is world to camera, shape (9,)."""
 
     label: str
-    size: tuple[float, float]
-    fields: dict[str, FloatArray]
+    centre: FloatArray
+    rotation: FloatArray
+    lens: Lens | None
 
 
 def read_parameters(path: Path) -> list[Image]:
@@ -205,21 +198,14 @@ def read_parameters(path: Path) -> list[Image]:
         width, height = numbers(path, where, " ".join(size), 2).tolist()
         parts = np.split(numbers(path, where, " ".join(words_of), ends[-1]), ends[:-1])
         fields = {name: part for (name, _), part in zip(layout, parts, strict=True) if name}
-        images.append(Image(label.strip(), (width, height), fields))
+        given, more = dict[str, float](), dict[str, Any]()
+        for names, values in fields.items():
+            given |= zip(names.split(), values.tolist(), strict=False)
+        if "polynomial" in fields:
+            more = {"projection": "polynomial", "shape": tuple(fields["polynomial"].tolist())}
+        lens = lens_by_name(given, width, height, **more) if "fx" in given else None
+        images.append(Image(label.strip(), fields["centre"], fields["rotation"], lens))
     return images
-
-
-def _lens(image: Image) -> Lens | None:
-    """Return the lens of an image; None if the table does not have it."""
-    given: dict[str, float] = {}
-    for names, values in image.fields.items():
-        given |= zip(names.split(), values.tolist(), strict=False)
-    if "fx" not in given:
-        return None
-    if "polynomial" not in given:
-        return lens_by_name(given, *image.size)
-    shape = tuple(image.fields["polynomial"].tolist())
-    return lens_by_name(given, *image.size, projection="polynomial", shape=shape)
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:

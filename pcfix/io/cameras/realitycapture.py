@@ -99,10 +99,9 @@ def _lens(path: Path, fields: dict[str, str], width: float, height: float) -> Le
     def value(name: str, default: str = "0") -> float:
         return number(path, f"xcr:{name}", fields.get(name, default))
 
-    scale = max(width, height)
-    across = value("FocalLength35mm", "") / FILM_MM * scale
-    focal = across * value("AspectRatio", "1")
-    x, y = (value(f"PrincipalPoint{axis}") * scale for axis in "UV")
+    across = value("FocalLength35mm", "") / FILM_MM  # all in units of the larger side
+    down = across * value("AspectRatio", "1")
+    x, y = (value(f"PrincipalPoint{axis}") for axis in "UV")
     model = fields.get("DistortionModel", "perspective")
     if model not in MODELS:
         what = f"the distortion model '{model}'"
@@ -110,12 +109,11 @@ def _lens(path: Path, fields: dict[str, str], width: float, height: float) -> Le
     words = fields.get("DistortionCoeficients", "")  # misspelt in the files too
     found = numbers(path, "xcr:DistortionCoeficients", words, len(words.split())).tolist()
     values = dict(zip(MODELS[model].split(), found, strict=False))
-    values |= {"fx": across, "fy": focal, "skew": value("Skew") * scale}
-    values |= {"cx": width / 2.0 + x, "cy": height / 2.0 + y}
+    values |= {"fx": across, "fy": down, "dx": x, "dy": y, "skew": value("Skew")}
     if model != "division":
-        return lens_by_name(values, width, height)
+        return lens_by_name(values, width, height, relative=True)
     # In plane coordinates the centre of the image is at minus the principal point over the focal
     # length, and a length there is a share of the image divided by that of the focal length.
-    values["d1"] = values.get("d1", 0.0) * (across / scale) ** 2
-    centre = (-x / across, -y / focal)
-    return lens_by_name(values, width, height, distortion_centre=centre, inverse=True)
+    values["d1"] = values.get("d1", 0.0) * across**2
+    more = {"distortion_centre": (-x / across, -y / down), "inverse": True}
+    return lens_by_name(values, width, height, relative=True, **more)

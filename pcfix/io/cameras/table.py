@@ -74,11 +74,9 @@ SPELLINGS: dict[str, tuple[str, ...]] = {
 }
 """Roles of columns, and their names; if a table has several, the first counts."""
 POSE = ("x", "y", "z", "longitude", "latitude", "yaw", "pitch", "roll", "omega", "phi", "kappa")
-_OWN_NAMES = (
-    *("omega", "phi", "kappa", "qw", "qx", "qy", "qz", "enable"),
-    *(f"r{i}{j}" for i in "123" for j in "123"),
-    *("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"),
-)
+REALITY_CAPTURE = ("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+QUATERNION, MATRIX = ("qw", "qx", "qy", "qz"), tuple(f"r{i}{j}" for i in "123" for j in "123")
+_OWN_NAMES = ("omega", "phi", "kappa", "enable", *QUATERNION, *MATRIX, *REALITY_CAPTURE)
 SPELLINGS |= {name: (name,) for name in _OWN_NAMES}
 SPELLINGS |= {f"{role}_est": (f"{role}_est",) for role in POSE}
 AXES = (("x", "y", "z"), ("longitude", "latitude", "z"))
@@ -126,17 +124,17 @@ def read(source: Source) -> Cameras:
     if by_gnss:
         sentence = "its positions are those of the GNSS, not adjusted ones."
         checks.warn(source.path, "cameras.not_adjusted", sentence)
-    sensor = sensor_file(source)
-    has_lens = turns is not None and columns.has("f", "px", "py")
-    return Cameras(
-        labels=tuple(columns.labels),
-        centres=centres(columns, needed=True),
-        rotations=turns,
-        lenses=_own_lenses(columns, read_sensor(sensor)) if has_lens and sensor else None,
-        crs=system,
-        gnss=gnss_positions(measured) if has_both else None,
-        unposed=tuple(unposed),
-    )
+    labels, xyz = tuple(columns.labels), columns.of(axes(columns.place) or ())
+    lenses, sensor = list[Lens](), sensor_file(source)
+    if turns is not None and sensor and columns.has(*REALITY_CAPTURE[:3]):
+        frame, names = read_sensor(sensor), ("dx", "dy", "k1", "k2", "k3", "k4", "p1", "p2")
+        given = [columns.of(REALITY_CAPTURE[:3]), columns.where_there(REALITY_CAPTURE[3:])]
+        for focal, *others in np.nan_to_num(np.hstack(given)).tolist():
+            values = dict(zip(names, others, strict=True)) | {"f": focal / FILM_MM}
+            lenses.append(lens_by_name(values, frame.width, frame.height, relative=True))
+    gnss = gnss_positions(measured) if has_both else None
+    known = tuple(lenses) or None
+    return Cameras(labels, xyz, turns, known, system, gnss=gnss, unposed=tuple(unposed))
 
 
 WGS84, WGS84_ELLIPSOIDAL = "EPSG:4326", "EPSG:4979"
@@ -185,12 +183,9 @@ def axes(place: Iterable[str]) -> tuple[str, str, str] | None:
     return next((three for three in AXES if {*three} <= {*place}), None)
 
 
-def centres(columns: Table, *, needed: bool = False) -> FloatArray:
-    """Return positions, shape (k, 3), NaN for rows without when they are not `needed`."""
-    three = axes(columns.place)
-    if three is None:
-        return np.full((len(columns.rows), 3), np.nan)
-    xyz = columns.of(three) if needed else columns.where_there(three)
+def centres(columns: Table) -> FloatArray:
+    """Return positions, shape (k, 3), NaN for rows without."""
+    xyz = columns.where_there(axes(columns.place) or AXES[0])
     xyz[np.isnan(xyz).any(axis=1)] = np.nan
     return xyz
 
@@ -226,7 +221,6 @@ CONVERSIONS = {
     "aircraft": (("yaw", "pitch", "roll"), rotations.from_aircraft),
 }
 OMEGA_PHI_KAPPA, YAW_PITCH_ROLL, _ = (roles for roles, _ in CONVERSIONS.values())
-QUATERNION, MATRIX = ("qw", "qx", "qy", "qz"), tuple(f"r{i}{j}" for i in "123" for j in "123")
 LARGEST_DEG = 360.0
 LOOKS_DOWN = 0.17
 """Least cosine of the tilt, about 80 degrees, of a camera that looks at the ground."""
@@ -289,18 +283,6 @@ def _degrees(columns: Table, roles: tuple[str, ...]) -> FloatArray:
     return values.T
 
 
-def _own_lenses(columns: Table, frame: Lens) -> tuple[Lens, ...]:
-    """Return the lens of each row from RealityCapture's columns, with the size of a sensor."""
-    width, height = frame.width, frame.height
-    side, lenses = max(width, height), []
-    distortion = np.nan_to_num(columns.where_there(DISTORTION))
-    for focal, x, y, *brown in np.hstack([columns.of(("f", "px", "py")), distortion]).tolist():
-        given = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), brown, strict=True))
-        given |= {"cx": width / 2.0 + x * side, "cy": height / 2.0 + y * side}
-        lenses.append(lens_by_name(given | {"f": focal * side / FILM_MM}, width, height))
-    return tuple(lenses)
-
-
 # ---- sensors ----
 
 
@@ -310,7 +292,6 @@ OPENCV_NAMES = {"d1": "k4", "d2": "k5", "d3": "k6", "p2": "p1", "p1": "p2"}
 """What OpenCV calls the parameters that have another name in `checks`."""
 OPENCV = {"OpenCV": LensModel("f cx cy k1 k2 k3 d1 d2 d3 p2 p1")}
 TERMS = OPENCV["OpenCV"].names.split()[1:]
-DISTORTION = ("k1", "k2", "k3", "k4", "t1", "t2")
 FILM_MM = 36.0
 """Larger side of the film that 35 mm focal lengths mean."""
 
@@ -370,8 +351,6 @@ def write_table(folder: File, cameras: Cameras) -> None:
     cameras : Cameras
         With rotations and lenses.
     """
-    from scipy.spatial.transform import Rotation
-
     target = Path(folder)
     turns, lenses = checks.block_to_write(target, cameras)
     if cameras.crs is not None and is_topocentric(cameras.crs):
@@ -386,8 +365,7 @@ def write_table(folder: File, cameras: Cameras) -> None:
     frame = (values.pop("f"), given.width, given.height)
     sensor = dict(zip(PIXELS if is_px else MILLIMETRES, map(float, frame), strict=True))
     sensor |= {OPENCV_NAMES.get(name, name): float(value) for name, value in values.items()}
-    quaternions = Rotation.from_matrix(turns).as_quat(canonical=True)
-    poses = np.column_stack([cameras.centres, np.roll(quaternions, 1, axis=1)]).tolist()
+    poses = np.column_stack([cameras.centres, turns]).tolist()
     has_crs = cameras.crs is not None and cameras.crs.strip().lower() != "local"
     comment = f"# CoordinateSystem: {' '.join((cameras.crs or '').split())}\n" if has_crs else ""
     rows = [[label, *row] for label, row in zip(cameras.labels, poses, strict=True)]

@@ -243,21 +243,13 @@ def test_tie_points(tmp_path, external, packed):
             document(block(group(photo(1)), group(photo(2), head=GROUP + "<SRSId>0</SRSId>"))),
             "cameras.several_blocks",
         ),
+        (simple(photo(1)), "cameras.no_tie_points"),
+        (
+            simple(photo(1), tail="<TiePoints><Path>gone.xml</Path></TiePoints>"),
+            "cameras.missing_file",
+        ),
     ],
 )
 def test_refused(tmp_path, text, code):
-    path = write(tmp_path, text)
-    with refused(code, path=path):
-        read(path)
-
-
-@pytest.mark.parametrize(
-    ("tail", "code"),
-    [
-        ("", "cameras.no_tie_points"),
-        ("<TiePoints><Path>gone.xml</Path></TiePoints>", "cameras.missing_file"),
-    ],
-)
-def test_tie_points_refused(tmp_path, tail, code):
     with refused(code):
-        read_ties(write(tmp_path, simple(photo(1), tail=tail)))
+        read_ties(write(tmp_path, text))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pcfix.io.cameras.colmap import BY_NAME, MODELS, lens_of
+from pcfix.io.cameras.colmap import BY_NAME, MODELS, make_lens
 from pcfix.lens.imaging import project
 from tests.utils.camera_files import read, read_ties
 from tests.utils.codes import refused
@@ -38,8 +38,7 @@ def folder(path, cameras=CAMERAS, images=IMAGES, points=POINTS):
     path.mkdir(parents=True, exist_ok=True)
     (path / "cameras.txt").write_text(cameras)
     (path / "images.txt").write_text(images)
-    if points is not None:
-        (path / "points3D.txt").write_text(points)
+    (path / "points3D.txt").write_text(points)
     return path
 
 
@@ -113,7 +112,7 @@ def test_binary_knows_the_models_by_their_numbers(tmp_path, number):
     values = [*twin.params[: len(twin.params) - len(extra)], *extra] if len(extra) else twin.params
     twin.params = values
     rays = np.random.default_rng(1).uniform((-0.4, -0.4, 1), (0.4, 0.4, 1), (100, 3))
-    made = lens_of(1, (model, 800.0, 600.0, tuple(values)))
+    made = make_lens(tmp_path, 1, model, (800, 600, *values))
     assert project(made, rays) == pytest.approx(np.array(twin.img_from_cam(rays)), abs=1e-8)
 
 
@@ -126,22 +125,15 @@ def test_binary_knows_the_models_by_their_numbers(tmp_path, number):
         ("images", "4 1 0 0 0", "4 2 0 0 0", "cameras.rotation"),
         ("images", IMAGES, "# none\n", "cameras.no_pose"),
         ("images", "a.jpg\n\n", "a.jpg\n", "cameras.damaged"),
+        ("points", POINTS, "# none\n", "cameras.no_tie_points"),
     ],
 )  # fmt: skip
 def test_text_refused(tmp_path, part, old, new, code):
-    text = {"cameras": CAMERAS, "images": IMAGES}
+    text = {"cameras": CAMERAS, "images": IMAGES, "points": POINTS}
     assert old in text[part]
     text[part] = text[part].replace(old, new)
     with refused(code):
-        read(folder(tmp_path, **text))
-
-
-@pytest.mark.parametrize(
-    ("points", "code"), [(None, "cameras.no_tie_points"), ("# none\n", "cameras.no_tie_points")]
-)
-def test_tie_points_refused(tmp_path, points, code):
-    with refused(code):
-        read_ties(folder(tmp_path, points=points))
+        read_ties(folder(tmp_path, **text))
 
 
 @pytest.mark.parametrize(

@@ -93,23 +93,6 @@ def test_tie_points_go_the_same_way_and_unknown_ones_stay_unknown():
 # ---- rotations ----
 
 
-def frames_of_a_place(kind, lon, lat, h):
-    """Return CRS, centre, axes (east, north, up, one a row) of a frame, and its way to a map."""
-    f84 = 1 / 298.257223563
-    centre = geocentric(lon, lat, h, f=f84)
-    if kind == "ECEF":
-        return "EPSG:4978", centre, east_north_up(lon, lat), lambda p: p
-    axes = east_north_up(lon + 0.01, lat - 0.01)
-    origin = geocentric(lon + 0.01, lat - 0.01, 20.0, f=f84)
-    crs = f"ENU:{lat - 0.01!r},{lon + 0.01!r},20"
-    return (
-        crs,
-        axes @ (centre - origin),
-        (axes @ east_north_up(lon, lat).T).T,
-        (lambda p: origin + p @ axes),
-    )
-
-
 @pytest.mark.parametrize("kind", ["ECEF", "ENU", "degrees"])
 @pytest.mark.parametrize(
     ("lon", "lat"), [(-0.38, 39.44), (-3.1, 39.4), (-5.9, 65.0), (-2.0, -33.0)]
@@ -117,22 +100,26 @@ def frames_of_a_place(kind, lon, lat, h):
 @pytest.mark.parametrize("tilt_deg", [0.0, 30.0])
 def test_points_below_a_camera_fall_on_the_same_pixels(kind, lon, lat, tilt_deg):
     """But for the scale of the map against the heights: up to |k - 1| of the image distance."""
-    h = 150.0
+    h, f84 = 150.0, 1 / 298.257223563
     code = "EPSG:32630" if lat > 0 else "EPSG:32730"
-    truth = frames_of_a_place("ECEF" if kind == "degrees" else kind, lon, lat, h)
-    crs, centre, axes, to_ecef = truth
+    centre, axes = geocentric(lon, lat, h, f=f84), east_north_up(lon, lat)
     looks = NADIR @ Rotation.from_euler("zx", [40.0, tilt_deg], degrees=True).as_matrix()
     x, y = np.meshgrid(*[np.linspace(-0.5, 0.5, 9) * FRAME_PX / FOCAL_PX] * 2)
     rays = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)]) @ looks  # east, north, up
     enu = rays * (-BELOW_M / rays[:, 2])[:, None]
     seen = image_px(looks, 0.0, enu)
-    ecef = to_ecef(centre + enu @ axes)
+    ecef = centre + enu @ axes
     to_map = Transformer.from_crs("EPSG:4978", CRS(code).to_3d(), always_xy=True)
     points = np.column_stack(to_map.transform(*ecef.T))
     if kind == "degrees":
         read = cameras([lon, lat, h], "EPSG:4979", looks[None])
-    else:
-        read = cameras(centre, crs, (looks @ axes)[None])
+    elif kind == "ECEF":
+        read = cameras(centre, "EPSG:4978", (looks @ axes)[None])
+    else:  # in axes at a place that is 1.4 km away
+        there = east_north_up(lon + 0.01, lat - 0.01)
+        origin = geocentric(lon + 0.01, lat - 0.01, 20.0, f=f84)
+        crs = f"ENU:{lat - 0.01!r},{lon + 0.01!r},20"
+        read = cameras(there @ (centre - origin), crs, (looks @ axes @ there.T)[None])
     found = bring_to(read, code)
     areas = [np.linalg.det(np.cov(xyz[:, :2].T)) for xyz in (points, enu)]
     k = (areas[0] / areas[1]) ** 0.25
@@ -341,14 +328,8 @@ def test_in_the_axes_of_a_map():
     ],
 )
 def test_heights_that_cannot_be_compared_leave_the_plan(crs, gnss_crs, reason):
-    flat = [text.partition("+")[0] for text in (crs, gnss_crs)]
-    as_metres = moved_block(flat[0], flat[1])
-    read = Cameras(
-        as_metres.labels,
-        as_metres.centres,
-        crs=crs,
-        gnss=GnssPositions(as_metres.gnss.xyz, as_metres.gnss.sigma_m, gnss_crs),
-    )
+    flat = moved_block(*(text.partition("+")[0] for text in (crs, gnss_crs)))
+    read = replace(flat, crs=crs, gnss=replace(flat.gnss, crs=gnss_crs))
     enu_m, why = adjusted_minus_gnss(read, "a.xml")
     assert why.startswith("a.xml: ")
     assert reason in why

@@ -88,9 +88,9 @@ def lens_of(tmp_path, inner, **kwargs):
     return read_chunk(tmp_path, sensors=sensor(inner, **kwargs)).lenses[0]
 
 
-def put_zip(path, entries, compression=zipfile.ZIP_DEFLATED):
+def put_zip(path, entries):
     path.parent.mkdir(parents=True, exist_ok=True)
-    with zipfile.ZipFile(path, "w", compression) as archive:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in entries.items():
             archive.writestr(name, content)
     return path
@@ -345,9 +345,8 @@ def test_active_chunk(tmp_path):
     cameras = read(project_of(tmp_path, chunks, active=1))
     assert cameras.labels == ("img5.jpg",)
     assert cameras.notes[0].values.items() >= {"chunk": "two", "others": ["one"]}.items()
-    assert read(project_of(tmp_path, chunks[::-1][:2])).labels == (
-        "img5.jpg",
-    )  # the first is empty
+    path = project_of(tmp_path, chunks[::-1][:2])  # the first is empty
+    assert read(path).labels == ("img5.jpg",)
     assert read(tmp_path / "river.files/1/chunk.zip").labels == ("img5.jpg",)
 
 

@@ -14,7 +14,6 @@ POSE = (
     + "".join(f"<L{i + 1}>{x} {y} {z}</L{i + 1}>" for i, (x, y, z) in enumerate(TURN))
     + "</CodageMatr></ParamRotation>"
 )
-NO_DISTORTION = "<ModNoDist><Inutile>0</Inutile></ModNoDist>"
 F, PP = 3000.0, (2010.0, 1490.0)
 
 
@@ -89,17 +88,13 @@ def test_distortion_from_observed_to_ideal(tmp_path, model):
         assert ray[:2] / ray[2] == pytest.approx([(x - PP[0]) / F, (y - PP[1]) / F], abs=1e-9)
 
 
-def calibration_file(path):
-    path.parent.mkdir(exist_ok=True)
-    path.write_text(f"<ExportAPERO><CalibrationInternConique>{interior(RADIAL)}"
-                    "</CalibrationInternConique></ExportAPERO>")  # fmt: skip
-
-
 @pytest.mark.parametrize("where", ["Ori-Out/AutoCal.xml", "Ori-Calib/AutoCal.xml"])
 def test_calibration_file_is_beside_or_where_the_path_says(tmp_path, where):
-    calibration_file(tmp_path / where)
+    for path in (tmp_path / "Ori-Out", tmp_path / "Ori-Calib"):
+        path.mkdir()
+    inner = f"<CalibrationInternConique>{interior(RADIAL)}</CalibrationInternConique>"
+    (tmp_path / where).write_text(f"<ExportAPERO>{inner}</ExportAPERO>")
     folder = tmp_path / "Ori-Out"
-    folder.mkdir(exist_ok=True)
     text = orientation("<FileInterne>Ori-Calib/AutoCal.xml</FileInterne>")
     for name in ("b.tif", "a.tif"):
         (folder / f"Orientation-{name}.xml").write_text(text)

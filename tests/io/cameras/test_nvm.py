@@ -70,9 +70,7 @@ def test_pose_and_lens(tmp_path):
 
 
 def test_frame_of_the_image(tmp_path):
-    from PIL import Image
-
-    Image.new("L", (600, 400)).save(tmp_path / "my a.png")
+    picture(tmp_path / "my a.png", 600, 400)
     path = write(tmp_path, model(camera_line('my"a.png'), points=point_lines(measured())))
     cameras = read(path)
     assert cameras.labels == ("my a.png",)

@@ -156,24 +156,10 @@ def test_tracks_of_every_version(tmp_path, header, tail):
         ({"cameras": {"c": {"width": 4000, "height": 3000}}}, "cameras.damaged"),
         ({"cameras": {"c": {"projection_type": "equirectangular"}}}, "cameras.unsupported"),
         ({"reference_lla": {**LLA, "latitude": 4700.0}}, "cameras.damaged"),
+        ({"points": {"1": {"coordinates": [1, 2, 3]}}}, "cameras.no_tie_points"),  # no tracks
     ],
 )
 def test_refused(tmp_path, change, code):
     path = write(tmp_path, scene(**change))
     with refused(code, path=path):
-        read_file(path)
-
-
-@pytest.mark.parametrize(
-    ("point", "tracks", "code"),
-    [
-        ([1, 2, 3], None, "cameras.no_tie_points"),
-        (None, "a.jpg\t1\t2\t0\t0\n", "cameras.no_tie_points"),
-    ],
-)
-def test_tie_points_refused(tmp_path, point, tracks, code):
-    if tracks is not None:
-        (tmp_path / "tracks.csv").write_text(tracks)
-    points = {} if point is None else {"1": {"coordinates": point}}
-    with refused(code):
-        read_ties(write(tmp_path, scene(points=points)))
+        read_ties(path)

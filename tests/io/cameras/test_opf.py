@@ -27,17 +27,8 @@ FLOAT32_PX = 3e-4
 
 def seen(kind, angles_deg, centre, point):
     """Return u, v by the specification, one point at a time: R = Rx Ry Rz, then the lens."""
-    turns = []
-    for axis, angle in zip("xyz", np.radians(angles_deg), strict=True):
-        c, s = math.cos(angle), math.sin(angle)
-        turns.append(
-            {
-                "x": np.array([[1, 0, 0], [0, c, -s], [0, s, c]]),
-                "y": np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]),
-                "z": np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]),
-            }[axis]
-        )
-    right, top, back = (turns[0] @ turns[1] @ turns[2]).T @ (point - centre)
+    turn = Rotation.from_euler("XYZ", angles_deg, degrees=True)
+    right, top, back = turn.inv().apply(point - centre)
     x, y, z = right, -top, -back
     cx, cy = SIZE[0] / 2 + 11.0, SIZE[1] / 2 - 7.0
     if kind == "fisheye":

@@ -163,20 +163,10 @@ GOOD = {"parameters": HEADER + block("a.jpg", (1, 2, 3)), "offset": "0 0 0"}
         ({"external": external()}, "cameras.no_pose"),
         ({**GOOD, "offset": "1 2"}, "cameras.damaged"),
         ({**GOOD, "wkt": "PROJCS[nothing"}, "cameras.crs"),
+        (GOOD, "cameras.no_tie_points"),
+        ({**GOOD, "bingo": "z H_12.0_8.0\n7 1 2\n-99\n"}, "cameras.no_tie_points"),
     ],
 )
 def test_refused(tmp_path, files, code):
     with refused(code):
-        read(params(tmp_path, **files))
-
-
-@pytest.mark.parametrize(
-    ("form", "code"),
-    [
-        ({}, "cameras.no_tie_points"),
-        ({"bingo": "z H_12.0_8.0\n7 1 2\n-99\n"}, "cameras.no_tie_points"),
-    ],
-)
-def test_tie_points_refused(tmp_path, form, code):
-    with refused(code):
-        read_ties(params(tmp_path, **GOOD, **form))
+        read_ties(params(tmp_path, **files))

@@ -5,7 +5,6 @@ that a right reading leaves (`res_px`), for all of the block its RMS, and for so
 view.
 """
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -13,8 +12,8 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-import pcfix
 from pcfix.io.cameras import read_tie_points
+from tests.utils.camera_files import read
 from tests.utils.geodesy import axes_at
 from tests.utils.reprojection import (
     check_file,
@@ -90,33 +89,15 @@ VIEW_DEG, APPROXIMATE_DEG = 1e-3, 0.1
 views that are nearly vertical."""
 
 
-def sample(name):
-    """Return how to take a sample, its cameras as `pcfix.read_cameras` gives them, and check."""
-    told = SAMPLES[name]
-    folder = needs("cameras", *name.split("/"))[0]
-    options = {key: folder / value for key, value in told.options.items()}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pcfix.PcfixWarning)  # the tests of each format ask for them
-        cameras = pcfix.read_cameras(folder / told.path, **options)
-    return told, cameras, check_file(folder), folder / told.path
-
-
-def observations_of(told, cameras, check):
-    """Return observations in the frame of the cameras, from the upper left corner."""
-    listed = check.get("observations", [])
-    listed = [{**seen, "image": told.name_of(seen["image"])} for seen in listed]
-    if told.frame is not None and listed:
-        listed = in_geocentric(listed, told.frame, cameras.crs)
-    return told.seen(cameras, listed)
-
-
 def centre_and_view(told, cameras, given):
     """Return how far a projection centre (m) and its view or top (degrees) are off."""
     i = row_of(cameras, told.name_of(given["image"]))
     centre = given.get("ECEF") or [given[axis] for axis in "XYZ"]
     apart = np.abs(cameras.centres[i] - centre).max()
-    axes = np.eye(3) if told.frame is None else east_north_up(cameras.crs, cameras.centres[i])
-    rotation = cameras.rotations[i] @ axes.T
+    rotation = cameras.rotations[i]
+    if told.frame is not None:  # in axes east, north, up
+        step = Transformer.from_crs(cameras.crs, "EPSG:4979", always_xy=True)
+        rotation = rotation @ axes_at(*step.transform(*cameras.centres[i])[:2]).T
     view = given.get("view_dir", given.get("view_dir_approx"))
     pairs = [(rotation[2], view)]
     if "up_dir_minus_cam_y" in given:
@@ -125,24 +106,20 @@ def centre_and_view(told, cameras, given):
 
 
 def degrees_between(one, other):
-    one, other = np.array(one), np.array(other)
-    return np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other))
-
-
-def east_north_up(geocentric_crs, centre):
-    """Return the axes at a place, one a row, up along the normal of the ellipsoid."""
-    step = Transformer.from_crs(geocentric_crs, "EPSG:4979", always_xy=True)
-    return axes_at(*step.transform(*centre)[:2])
-
-
-def rms(misses):
-    return float(np.sqrt(np.mean(np.square(misses))))
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other)), np.dot(one, other)))
 
 
 @pytest.mark.parametrize("name", MARKED)
 def test_sample(name):
-    told, cameras, check, path = sample(name)
-    observations = observations_of(told, cameras, check)
+    told, folder = SAMPLES[name], needs("cameras", *name.split("/"))[0]
+    check, path = check_file(folder), folder / told.path
+    cameras = read(path, **{key: folder / value for key, value in told.options.items()})
+    # observations in the frame of the cameras, from the upper left corner
+    listed = check.get("observations", [])
+    listed = [{**seen, "image": told.name_of(seen["image"])} for seen in listed]
+    if told.frame is not None and listed:
+        listed = in_geocentric(listed, told.frame, cameras.crs)
+    observations = told.seen(cameras, listed)
     if observations:
         taken = cameras
         if not told.distorted:
@@ -155,7 +132,8 @@ def test_sample(name):
     if told.rms_px is not None:
         every = tie_point_residuals_px(cameras, read_tie_points(path, cameras))
         assert len(every) == check["n_observations_used_for_rms"]
-        assert rms(every) == pytest.approx(check["reprojection_rms_px"], abs=told.rms_px)
+        rms = np.sqrt(np.mean(np.square(every)))
+        assert rms == pytest.approx(check["reprojection_rms_px"], abs=told.rms_px)
     offs = [
         centre_and_view(told, cameras, given)
         for given in check["projection_centres"]

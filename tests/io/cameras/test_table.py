@@ -61,11 +61,17 @@ def test_yaw_pitch_roll(tmp_path, kind, angles, forward, top, right):
         '"label","x","y","z"\n"a, b",1,2,3\n',
         b"label,x,y,z\nStra\xdfe.jpg,1,2,3\n",
         "label;x;y;z\na;1,0;2,00;3\n",
+        "#Label,X/Easting,Y/Northing,Z/Altitude\na.jpg,1,2,3\n",
+        "filename,X[m],Y[m],Z[m]\na.jpg,1,2,3\n",
+        "PhotoID,x_m,y_m,z_m\na.jpg,1,2,3\n",
+        "imageName,East,North,Elevation (m)\na.jpg,1,2,3\n",
+        '"file name","projectedX","projectedY","projectedZ"\na.jpg,1,2,3\n',
     ],
 )
-def test_dialects(tmp_path, text):
+def test_dialects_and_spellings(tmp_path, text):
     cameras = pcfix.read_cameras(write(tmp_path, text, sensor=None))
     assert cameras.centres.tolist() == [[1, 2, 3]]
+    assert (cameras.crs, cameras.notes) == (None, ())
 
 
 # Columns
@@ -74,25 +80,6 @@ def test_dialects(tmp_path, text):
 def plain(tmp_path, text, **options):
     """Return the cameras of a table as this module reads it, with the usual sensor beside it."""
     return read(write(tmp_path, text), **options)
-
-
-@pytest.mark.parametrize(
-    "header",
-    [
-        "name,x,y,z",
-        "#Label,X/Easting,Y/Northing,Z/Altitude",
-        "filename,X[m],Y[m],Z[m]",
-        "PhotoID,x_m,y_m,z_m",
-        "imageName,East,North,Elevation (m)",
-        '"file name","projectedX","projectedY","projectedZ"',
-    ],
-)
-def test_spellings(tmp_path, header):
-    cameras = plain(tmp_path, header + "\na.jpg,1,2,3\nb.jpg,4,5,6\n")
-    assert cameras.labels == ("a.jpg", "b.jpg")
-    assert cameras.centres.tolist() == [[1, 2, 3], [4, 5, 6]]
-    assert cameras.crs is None
-    assert cameras.notes == ()
 
 
 @pytest.mark.parametrize(
@@ -254,19 +241,15 @@ def test_a_sensor_in_pixels_has_the_order_of_opencv(tmp_path):
 # GNSS
 
 
-def gnss_of(path):
-    columns = table.open_table(path)
-    return tuple(columns.labels), table.gnss_positions(columns)
-
-
 def test_geo_txt(tmp_path):
     path = tmp_path / "geo.txt"
     path.write_text(
         "WGS84 UTM 16S\nDJI_0028.JPG 500000.5 4000000 198.6\n\n"
         "DJI_0032.JPG 500010 4000000 199 10 0 0 0.02 0.04 more of it\nDJI_0033.JPG 1 2\n"
     )
-    labels, gnss = gnss_of(path)
-    assert labels == ("DJI_0028.JPG", "DJI_0032.JPG", "DJI_0033.JPG")
+    columns = table.open_table(path)
+    gnss = table.gnss_positions(columns)
+    assert columns.labels == ["DJI_0028.JPG", "DJI_0032.JPG", "DJI_0033.JPG"]
     assert gnss.crs == "EPSG:32716"
     assert gnss.xyz[:2].tolist() == [[500000.5, 4000000, 198.6], [500010, 4000000, 199]]
     assert np.isnan(gnss.xyz[2]).all()

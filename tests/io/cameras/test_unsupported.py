@@ -6,8 +6,6 @@ import re
 import pytest
 
 import pcfix
-from pcfix.io.cameras import table
-from pcfix.io.cameras.checks import Source
 from tests.io.cameras.test_blocksexchange import photo, simple
 from tests.utils.codes import refused
 
@@ -28,62 +26,28 @@ FILES = {
     "sensor.csv": (b"focal,sensor_x,sensor_y\n8.8,13.2,8.8\n", "a table of the sensor"),
     "cameras.json": (b'{"v2 dji": {"projection_type": "brown"}}', "without poses"),
     "bare.csv": (b"a.jpg,456010,5432010,90\nb.jpg,456060,5432010,90\n", "without a header"),
-}
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_file(tmp_path, name):
-    data, what = FILES[name]
-    (tmp_path / name).write_bytes(data)
-    assert not table.recognises(Source(tmp_path / name))
-    with refused("cameras.not_read", path=tmp_path / name) as caught:
-        pcfix.read_cameras(tmp_path / name)
-    assert what in caught.value.values["what"]
-
-
-PARTS = {
-    "a_calibrated_images_position.txt": "a.jpg,456010.1,5432010.2,90.3\n",
+    "AutoCal_Foc-8800.xml": (b"<ExportAPERO><CalibrationInternConique>", "MicMac"),
+    "a_calibrated_images_position.txt": (b"a.jpg,456010.1,5432010.2,90.3\n", "of Pix4D"),
+    # standard errors have the very header of a table of poses
     "a_calibrated_external_camera_parameters_error.txt": (
-        "imageName X Y Z Omega Phi Kappa\na.jpg 0.01 0.01 0.02 0.001 0.001 0.001\n"
+        b"imageName X Y Z Omega Phi Kappa\na.jpg 0.01 0.01 0.02 0.001 0.001 0.001\n",
+        "of Pix4D",
     ),
 }
 
 
-@pytest.mark.parametrize("name", PARTS)
-@pytest.mark.parametrize("what", ["file", "folder"])
-def test_part_of_an_export(tmp_path, name, what):
-    """Standard errors have the very header of a table of poses."""
-    (tmp_path / name).write_text(PARTS[name])
-    with refused("cameras.not_read") as caught:
-        pcfix.read_cameras(tmp_path / name if what == "file" else tmp_path)
-    assert "of Pix4D" in caught.value.values["what"]
-
-
-@pytest.mark.parametrize(
-    ("inside", "data", "what"),
-    [
-        ("DJI_0001.JPG", b"\xff\xd8\xff\xe0\0\x10JFIF", "an image"),
-        ("AutoCal_Foc-8800.xml", b"<ExportAPERO><CalibrationInternConique>", "MicMac"),
-        ("cameras.json", b'{"v2 dji": {"projection_type": "brown"}}', "without poses"),
-    ],
-)
-def test_folder(tmp_path, inside, data, what):
-    (tmp_path / inside).write_bytes(data)
+@pytest.mark.parametrize("name", FILES)
+def test_file_and_its_folder(tmp_path, name):
+    data, what = FILES[name]
+    (tmp_path / name).write_bytes(data)
     (tmp_path / "a page.html").write_text("<html>")
-    with refused("cameras.not_read") as caught:
-        pcfix.read_cameras(tmp_path)
-    assert what in caught.value.values["what"]
+    for given in (tmp_path / name, tmp_path):
+        with refused("cameras.not_read", path=given) as caught:
+            pcfix.read_cameras(given)
+        assert what in caught.value.values["what"]
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"",
-        b"some words\nand more words\n",
-        b"<?xml version='1.0'?><other/>",
-        b'{"something": "else"}',
-    ],
-)
+@pytest.mark.parametrize("data", [b"", b"some words\nand more\n", b"<other/>", b'{"a": "b"}'])
 def test_unknown(tmp_path, data):
     (tmp_path / "what").write_bytes(data)
     with refused("cameras.unknown"):
