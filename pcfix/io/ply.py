@@ -22,47 +22,43 @@ _TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1"},
     **{"short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2"},
     **{"int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "int64": "i8", "uint64": "u8"},
-    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8", "": ""},
 }
 _FORMATS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _MOST_HEADER_BYTES = 1 << 20
 _KINDS = {"vertex": "vertices", "face": "faces"}
 _ROWS_AT_ONCE = 1_000_000
-"""Of lists that are copied at a time, which bounds the memory."""
+"""Records that are read at a time, which bounds the memory."""
 
 
-class Property(NamedTuple):
-    """A field of a record; `length` is the type of a list's length, empty for a single number."""
-
-    name: str
-    item: str
-    length: str = ""
-
-
-class Header(NamedTuple):
-    """The header of a PLY file, for its vertices or another element."""
+class Element(NamedTuple):
+    """The vertices or the faces of a PLY file, as its header describes them."""
 
     name: str  # of the file, for messages
-    order: str  # of the bytes, "<" or ">"
     kind: str  # of the records, in the plural, for messages
+    order: str  # of the bytes, "<" or ">"
     records: int  # stated, not checked
-    properties: tuple[Property, ...]  # of a record
-    skipped: tuple[tuple[int, tuple[Property, ...]], ...]  # elements that come before these
-    end: int  # bytes of the header
+    properties: dict[str, tuple[str, str]]  # type of a number, and of a list's length or empty
+    first: int  # byte of the file where the records begin
 
-    def item(self, name: str, *, is_list: bool) -> str | None:
-        """Return the type of a number, or of a list's items; None without such a property."""
-        found = [p.item for p in self.properties if p.name == name and bool(p.length) == is_list]
-        return found[0] if found else None
+    def has(self, *names: str, lists: bool = False) -> bool:
+        """Whether a record has numbers, or lists, of these names."""
+        return all(n in self.properties and bool(self.properties[n][1]) == lists for n in names)
 
 
-def parse_header(name: str, head: bytes, element: str = "vertex") -> Header:
+class Column(NamedTuple):
+    """A property of all n records: those of record i are ``items[start[i]:start[i + 1]]``."""
+
+    start: IntArray  # (n + 1,)
+    items: npt.NDArray[Any]  # (n,) of a number
+
+
+def parse_header(name: str, head: bytes, element: str = "vertex") -> Element:
     """Parse the first bytes of a PLY file, for its vertices or faces."""
     end = re.search(rb"end_header[ \t]*\r?\n", head)
     if not head.startswith(b"ply") or end is None:
         raise bad_file(name, "ply.header", "is not a PLY file with a complete header.")
-    order: str | None = None
-    elements: list[tuple[str, int, list[Property]]] = []
+    order, elements = "", list[tuple[str, int, dict[str, tuple[str, str]]]]()
     lines = [line.split() for line in head[: end.start()].decode("latin-1").splitlines()]
     try:
         for key, *fields in filter(None, lines):
@@ -71,131 +67,105 @@ def parse_header(name: str, head: bytes, element: str = "vertex") -> Header:
             if key == "format":
                 order = _FORMATS[fields[0]]
             elif key == "element":
-                elements.append((fields[0], int(fields[1]), []))
-            elif key == "property" and fields[0] == "list":
-                elements[-1][2].append(Property(fields[3], _TYPES[fields[2]], _TYPES[fields[1]]))
+                elements.append((fields[0], int(fields[1]), {}))
             elif key == "property":
-                elements[-1][2].append(Property(fields[1], _TYPES[fields[0]]))
-        if order is None or any(count < 0 for _, count, _ in elements):
+                length, item, own = fields[1:4] if fields[0] == "list" else ("", *fields[:2])
+                if own in elements[-1][2] or length.startswith(("f", "d")):
+                    raise ValueError(f"property {own} twice, or counted by a fraction")
+                elements[-1][2][own] = _TYPES[item], _TYPES[length]
+        if not order or any(count < 0 for _, count, _ in elements):
             raise ValueError("no format, or a negative number of records")
-        if any(p.length.startswith("f") for _, _, properties in elements for p in properties):
-            raise ValueError("a list counted by a fraction")
     except (KeyError, ValueError, IndexError) as error:
         sentence = f"the PLY header is damaged ({error}). Export it again."
         raise bad_file(name, "ply.header", sentence) from error
-    names, kind = [one for one, _, _ in elements], _KINDS[element]
+    kind, first = _KINDS[element], end.end()
+    names = [own for own, _, _ in elements]
     if element not in names:
         raise bad_file(name, "ply.element_missing", f"has no {kind}. Export it again with them.")
     at = names.index(element)
-    skipped = tuple((count, tuple(p)) for _, count, p in elements[:at])
-    return Header(name, order, kind, elements[at][1], tuple(elements[at][2]), skipped, end.end())
+    for _, count, properties in elements[:at]:
+        if count and any(length for _, length in properties.values()):
+            sentence = f"has lists before the {kind}. Export the {kind} first."
+            raise bad_file(name, "ply.order", sentence)
+        first += count * sum(int(item[1]) for item, _ in properties.values())
+    return Element(name, kind, order, *elements[at][1:], first)
 
 
-def read_header(path: Path, element: str = "vertex") -> Header:
+def read_header(path: Path, element: str = "vertex") -> Element:
     """Return `parse_header` of a file."""
     with path.open("rb") as stream:
         return parse_header(str(path), stream.read(_MOST_HEADER_BYTES), element)
 
 
-class Records:
-    """The records of a file; it is checked that all are there."""
-
-    def __init__(self, path: Path, header: Header) -> None:
-        self.header = header
-        self._units = _units(path, header)
-        # neighbouring numbers are one field, whose count is 1: units of an item and of a count
-        fields: list[tuple[int, int]] = []
-        self._place: dict[tuple[str, bool], tuple[int, int]] = {}
-        for p in header.properties:
-            size, is_list = int(p.item[1]), bool(p.length)
-            if is_list or not fields or fields[-1][1]:
-                fields.append((0, int(p.length[1]) if is_list else 0))
-            before, count = fields[-1]
-            self._place[p.name, is_list] = len(fields) - 1, before
-            fields[-1] = before + size, count
-        self._item, prefix = np.array(fields, np.int64).reshape(-1, 2).T.copy()
-        least = int((prefix + self._item * (prefix == 0)).sum())
-        complete = len(self._units) // max(least, 1)
-        if header.records <= complete:
-            shape = header.records, len(fields)
-            self._start, self._count = np.empty(shape, np.int64), np.empty(shape, np.int64)
-            complete, self.end = _list_starts(
-                self._units, self._item, prefix, header.order == ">", self._start, self._count
-            )
-        if complete < header.records:
-            sentence = f"is cut short: {complete:,} of {header.records:,} {header.kind} are there."
-            raise bad_file(header.name, "ply.cut_short", sentence, records=header.records)
-
-    def numbers(self, *names: str) -> FloatArray:
-        """Return properties that are not lists as columns, shape (n, names)."""
-        columns = []
-        for name in names:
-            field, offset = self._place[name, False]
-            kind = self.header.item(name, is_list=False)
-            items = _items_at(self._units, self.header.order, kind)
-            columns.append(items[self._start[:, field] + offset])
-        return np.column_stack(columns).astype(np.float64)
-
-    def lists(self, name: str) -> tuple[IntArray, npt.NDArray[Any]]:
-        """Return where the lists of a property start, shape (n + 1,), and their items."""
-        field, _ = self._place[name, True]
-        items = _items_at(self._units, self.header.order, self.header.item(name, is_list=True))
-        first, count, size = self._start[:, field], self._count[:, field], int(self._item[field])
-        start = np.concatenate([[0], np.cumsum(count)])
-        values = np.empty(start[-1], items.dtype)
-        for at in range(0, len(count), _ROWS_AT_ONCE):
-            rows = slice(at, at + _ROWS_AT_ONCE)
-            low, high = start[at], start[min(at + _ROWS_AT_ONCE, len(count))]
-            unit = np.repeat(first[rows] - size * start[:-1][rows], count[rows])
-            values[low:high] = items[unit + size * np.arange(low, high)]
-        return start, values
+def read_columns(path: Path, element: Element, *names: str) -> dict[str, Column]:
+    """Return properties of all records by name; refuse a file that lacks records."""
+    units = np.memmap(path, np.uint8, "r")[element.first :]
+    # neighbouring numbers are one field, as is a list: bytes of its items, and of a list's length
+    fields, place = list[tuple[int, int]](), dict[str, tuple[int, int]]()
+    for name, (kind, length) in element.properties.items():
+        if length or not fields or fields[-1][1]:
+            fields.append((0, int(length[1:] or 0)))
+        size, prefix = fields[-1]
+        place[name] = len(fields) - 1, size
+        fields[-1] = size + int(kind[1]), prefix
+    sizes = np.array(fields, np.int64)
+    shape = 2, min(element.records, _ROWS_AT_ONCE), len(fields)
+    begin, count = np.empty(shape, np.int64)
+    kinds = {name: element.order + element.properties[name][0] for name in names}
+    found = {name: ([np.zeros(1, np.int64)], [np.zeros(0, kind)]) for name, kind in kinds.items()}
+    at = 0
+    for first in range(0, element.records, _ROWS_AT_ONCE):
+        rows = slice(min(element.records - first, _ROWS_AT_ONCE))
+        at = _list_starts(units, at, sizes, element.order == ">", begin[rows], count[rows])
+        if at < 0:
+            sentence = f"is cut short: not all of its {element.records:,} {element.kind} are there."
+            raise bad_file(element.name, "ply.cut_short", sentence, records=element.records)
+        for name, (counts, parts) in found.items():
+            (field, offset), kind = place[name], parts[0].dtype
+            # the bytes as the item of this type that begins at each of them
+            items = np.ndarray(max(len(units) - kind.itemsize + 1, 0), kind, units, strides=(1,))
+            many = count[rows, field].copy()
+            near = begin[rows, field] + offset - sizes[field, 0] * (np.cumsum(many) - many)
+            parts.append(items[np.repeat(near, many) + sizes[field, 0] * np.arange(many.sum())])
+            counts.append(many)
+    return {
+        name: Column(np.cumsum(np.concatenate(counts)), np.concatenate(parts))
+        for name, (counts, parts) in found.items()
+    }
 
 
-def _items_at(units: npt.NDArray[Any], order: str, item: str | None) -> npt.NDArray[Any]:
-    """View bytes as the item of a type that begins at each of them."""
-    kind = np.dtype(f"{order}{item}")
-    return np.ndarray(max(len(units) - kind.itemsize + 1, 0), kind, units, strides=(1,))
-
-
-def _units(path: Path, header: Header) -> npt.NDArray[Any]:
-    """Return the bytes of the records, to the end of the file."""
-    skip = 0
-    for count, properties in header.skipped:
-        if count and any(p.length for p in properties):
-            sentence = f"has lists before the {header.kind}. Export the {header.kind} first."
-            raise bad_file(path, "ply.order", sentence)
-        skip += count * sum(int(p.item[1]) for p in properties)
-    if path.stat().st_size <= header.end:  # an empty map is not allowed
-        return np.zeros(0, np.uint8)
-    return np.memmap(path, np.uint8, "r", offset=header.end)[skip:]
+def positions(path: Path, vertices: Element) -> FloatArray:
+    """Return x, y and z of all vertices, shape (n, 3)."""
+    columns = read_columns(path, vertices, *"xyz")
+    return np.column_stack([columns[axis].items for axis in "xyz"]).astype(np.float64)
 
 
 @kernel
 def _list_starts(
-    units: npt.NDArray[Any], item: IntArray, prefix: IntArray, big: bool, start: IntArray,
-    count: IntArray,
-) -> tuple[int, int]:  # fmt: skip
+    units: npt.NDArray[Any], at: int, sizes: IntArray, big: bool, start: IntArray, count: IntArray
+) -> int:
     """Walk over records, and fill in where each of their fields starts and how many items it has.
 
-    Field f of a record has items of ``item[f]`` units; it is a list if ``prefix[f]``, the units of
-    its count, is not zero. `start` and `count` have a row per record and a column per field.
-    Return how many records are complete, and the unit where they end.
+    The first record begins at the byte `at` of `units`. Field f of a record has items of
+    ``sizes[f, 0]`` bytes; it is a list if ``sizes[f, 1]``, the bytes of its length, is not zero.
+    `start` and `count` have a row per record and a column per field. Return the byte where the
+    records end, -1 if the last ones are not complete.
     """
-    at = 0
     for i in range(start.shape[0]):
-        for f in range(item.size):
+        for f in range(sizes.shape[0]):
+            item, prefix = sizes[f]
             length = 1
-            if prefix[f]:
-                if prefix[f] > units.size - at:
-                    return i, at
-                length = 0  # from the bytes of the count, or its one number in a text
-                for j in range(prefix[f]):
-                    length = length * 256 + int(units[at + (j if big else prefix[f] - 1 - j)])
-                at += prefix[f]
-            # divided, not multiplied: a damaged count times the item would overflow
-            if length < 0 or length > (units.size - at) // item[f]:
-                return i, at
+            if prefix:
+                if prefix > units.size - at:
+                    return -1
+                length = 0  # its bytes, the highest first
+                for j in range(prefix):
+                    length = length * 256 + int(units[at + (j if big else prefix - 1 - j)])
+                at += prefix
+            # divided, not multiplied: a damaged length times the item would overflow
+            if length < 0 or length > (units.size - at) // item:
+                return -1
             start[i, f] = at
             count[i, f] = length
-            at += length * item[f]
-    return start.shape[0], at
+            at += length * item
+    return at

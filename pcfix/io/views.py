@@ -26,21 +26,19 @@ row number. Then the numbers of points must agree, and the geometry is tested at
 from __future__ import annotations
 
 from contextlib import suppress
-from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io.cameras.colmap import read_images
 from pcfix.io.crs import Points
 from pcfix.io.files import check_input
-from pcfix.io.ply import Header, Property, Records, read_header
+from pcfix.io.ply import Column, Element, positions, read_columns, read_header
 from pcfix.io.tables import match_labels
 from pcfix.lens.imaging import straight_images
 from pcfix.model import Cameras, FloatArray, IntArray, TiePoints, Views
@@ -118,7 +116,7 @@ def read_views(path: File, cameras: Cameras, *, to_cloud: Points | None = None) 
     with found.open("rb") as stream:
         is_ply = stream.read(3) == b"ply"
     vis = found.with_name(f"{found.name}.vis")
-    if is_ply and vis.is_file() and read_header(found).item(_IMAGES, is_list=True) is None:
+    if is_ply and vis.is_file() and not read_header(found).has(_IMAGES, lists=True):
         found, is_ply = vis, False
     views = _openmvs(found) if is_ply else _colmap(found)
     return _placed(replace(views, orders=image_orders(views, cameras)), cameras, to_cloud)
@@ -153,7 +151,6 @@ def _placed(views: ViewList, cameras: Cameras, to_cloud: Points | None) -> ViewL
     if views.xyz is None:
         return views
     xyz = views.xyz if to_cloud is None else to_cloud(views.xyz)
-    xyz = np.ascontiguousarray(xyz, np.float64)
     return fitted(replace(views, xyz=xyz), cameras, xyz)
 
 
@@ -161,31 +158,30 @@ def _colmap(path: Path) -> ViewList:
     """Read ``fused.ply.vis``, and positions from the PLY file next to it, if it fits."""
     with path.open("rb") as stream:
         count = int.from_bytes(stream.read(_HEAD), "little")
-    lists = Header(str(path), "<", "lists", count, (Property(_IMAGES, "u4", "u4"),), (), _HEAD)
-    records = None
+    lists = Element(str(path), "lists", "<", count, {_IMAGES: ("u4", "u4")}, _HEAD)
+    column = None
     with suppress(InputError):
-        records = Records(path, lists)
-    if not count or records is None or _HEAD + records.end < path.stat().st_size:
+        column = read_columns(path, lists, _IMAGES)[_IMAGES] if count else None
+    if column is None or _HEAD + 4 * (count + len(column.items)) < path.stat().st_size:
         sentence = f"is no complete COLMAP view list of {count:,} points. {_REMEDY}"
         raise bad_file(path, "views.damaged", sentence, points=count)
-    listed = _listed(path, records)
     bare = path.with_suffix("")
     ply = bare if bare.suffix.lower() == ".ply" else bare.with_suffix(".ply")
-    xyz = None
-    if ply.is_file() and (header := read_header(ply)).records == count:
-        xyz = _positions(Records(ply, header))
-    return ViewList(path, "COLMAP view list", listed, xyz)
+    vertices = read_header(ply) if ply.is_file() else None
+    fits = vertices is not None and vertices.records == count
+    xyz = _positions(ply, vertices) if vertices and fits else None
+    return ViewList(path, "COLMAP view list", _listed(path, column), xyz)
 
 
 def _openmvs(path: Path) -> ViewList:
     """Read positions, view lists and, if there are any, weights."""
-    header = read_header(path)
-    if header.item(_IMAGES, is_list=True) is None:
+    vertices = read_header(path)
+    if not vertices.has(_IMAGES, lists=True):
         raise bad_file(path, "views.no_lists", f"its points have no {_IMAGES}. {_REMEDY}")
-    vertices = Records(path, header)
-    listed, xyz = _listed(path, vertices), _positions(vertices)
-    if header.item(_WEIGHTS, is_list=True) is not None:
-        start, weight = vertices.lists(_WEIGHTS)
+    listed = _listed(path, read_columns(path, vertices, _IMAGES)[_IMAGES])
+    xyz = _positions(path, vertices)
+    if vertices.has(_WEIGHTS, lists=True):
+        start, weight = read_columns(path, vertices, _WEIGHTS)[_WEIGHTS]
         is_positive = ((weight >= 0.0) & (weight < np.inf)).all()
         if not (np.array_equal(start, listed.start) and is_positive):
             sentence = f"its {_WEIGHTS} are not one positive number for each image. {_REMEDY}"
@@ -194,29 +190,26 @@ def _openmvs(path: Path) -> ViewList:
     return ViewList(path, "OpenMVS point cloud", listed, xyz)
 
 
-def _positions(vertices: Records) -> FloatArray:
+def _positions(path: Path, vertices: Element) -> FloatArray:
     """Return the vertices of a PLY file, shape (n, 3)."""
-    header = vertices.header
-    if header.records == 0 or None in (header.item(axis, is_list=False) for axis in "xyz"):
-        sentence = f"has no points with x, y and z. {_REMEDY}"
-        raise bad_file(header.name, "views.no_positions", sentence)
-    xyz = vertices.numbers(*"xyz")
+    if vertices.records == 0 or not vertices.has(*"xyz"):
+        raise bad_file(path, "views.no_positions", f"has no points with x, y and z. {_REMEDY}")
+    xyz = positions(path, vertices)
     if not np.isfinite(xyz).all():
         sentence = "a vertex has no finite position. Export the points again."
-        raise bad_file(header.name, "views.not_finite", sentence)
+        raise bad_file(path, "views.not_finite", sentence)
     return xyz
 
 
-def _listed(path: Path, records: Records) -> Views:
+def _listed(path: Path, column: Column) -> Views:
     """Return the image numbers of each point as int32, if they are whole and not negative."""
-    start, number = records.lists(_IMAGES)
-    image: npt.NDArray[Any] = number.astype(np.int32)
-    wrong = np.flatnonzero((image < 0) | (image != number))
+    image: IntArray = column.items.astype(np.int32)
+    wrong = np.flatnonzero((image < 0) | (image != column.items))
     if wrong.size:
-        value = number[wrong[0]].item()
+        value = column.items[wrong[0]].item()
         sentence = f"names image {value}, which is not a whole number from 0 on. {_REMEDY}"
         raise bad_file(path, "views.image_number", sentence, value=value)
-    return Views(start, image, kind="depth-maps")
+    return Views(column.start, image, kind="depth-maps")
 
 
 def image_orders(raw: ViewList, cameras: Cameras) -> tuple[IntArray, ...]:
@@ -247,14 +240,12 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray) -> ViewList:
 
     The apparent points, shape (m, 3), are the first of the list, in the frame of the cameras.
     """
-    if cameras.rotations is None or cameras.lenses is None:
-        return replace(views, orders=views.orders[:1])
     rows = np.arange(0, len(xyz), max(1, len(xyz) // SAMPLE_POINTS))
     some = views.listed.take(rows)
     points = np.repeat(xyz[rows], np.diff(some.start), axis=0)
-    sizes = np.array([(lens.width, lens.height) for lens in cameras.lenses])
+    sizes = np.array([(lens.width, lens.height) for lens in cameras.lenses or ()])
     shares = []
-    for order in views.orders:
+    for order in views.orders if len(sizes) else ():  # without frames there is no test
         camera = order[some.camera]
         known = np.flatnonzero(camera >= 0)
         if len(known):
@@ -272,87 +263,84 @@ def fitted(views: ViewList, cameras: Cameras, xyz: FloatArray) -> ViewList:
     return replace(views, orders=(best,), share_seen=share)
 
 
+@dataclass(frozen=True, eq=False)
 class ViewMatch:
-    """A view list and the cloud whose points it gives cameras.
+    """A view list, read with some cameras, and the cloud whose points it gives cameras.
 
-    A match by position may be off by `tolerance_m`; it is None where rows are matched by number.
+    The cloud has `points` points, whose coordinates are rounded to `step_m`, the scale of a LAS
+    file. A list without positions must have as many.
     """
 
-    def __init__(
-        self, views: ViewList, cameras: Cameras, *, points: int | None = None, step_m: float = 0.0
-    ) -> None:
-        """Check that a list, read with these cameras, can belong to a cloud of `points` points.
+    view_list: ViewList
+    cameras: Cameras
+    points: int | None = None
+    step_m: float = 0.0
 
-        The cloud's coordinates are rounded to `step_m`, the scale of a LAS file.
-        """
-        self.view_list, self._cameras = views, cameras
-        self.tolerance_m: float | None = None
-        self._tree: Any = None  # a cKDTree of the list's positions, when one is needed
-        if views.xyz is not None:
-            # a match may be off by the rounding of the cloud, or by a share of the spacing
-            rounding_m = _ROUNDING * step_m / 2.0
-            self.tolerance_m = max(rounding_m, views.tolerance_spacings * views.spacing_m)
-            self._same_m = max(rounding_m, _SAME * views.spacing_m)
-        elif points != len(views):
-            sentence = f"has {len(views):,} points, the cloud {points}. Put its PLY next to it."
-            values = {"listed": len(views), "points": points}
-            raise bad_file(views.path, "views.other_points", sentence, **values)
+    def __post_init__(self) -> None:
+        """Check that the list can belong to the cloud."""
+        listed, points = len(self.view_list), self.points
+        if self.view_list.xyz is None and points != listed:
+            sentence = f"has {listed:,} points, the cloud {points}. Put its PLY next to it."
+            values = {"listed": listed, "points": points}
+            raise bad_file(self.view_list.path, "views.other_points", sentence, **values)
+
+    @property
+    def tolerance_m(self) -> float | None:
+        """How far a match by position may be off; None where rows are matched by number."""
+        views = self.view_list
+        return None if views.xyz is None else self._reach(views.tolerance_spacings)
+
+    def _reach(self, spacings: float) -> float:
+        """Return a share of the spacing, metres, or more where the cloud is rounded coarsely."""
+        return float(max(_ROUNDING * self.step_m / 2.0, spacings * self.view_list.spacing_m))
+
+    @cached_property
+    def _tree(self) -> Any:
+        return cKDTree(self.view_list.xyz, balanced_tree=False, compact_nodes=False)
 
     def with_image_order(self, xyz: FloatArray) -> ViewMatch:
         """Return the match with the order of the images that the cloud's first points show.
 
         A list that is matched by row number is refused if its cameras do not see them.
         """
-        one = copy(self)
-        if self.view_list.xyz is None:  # else the positions of the list decided it
-            one.view_list = fitted(self.view_list, self._cameras, xyz)
-        return one
+        if self.view_list.xyz is not None:  # its positions decided it
+            return self
+        return replace(self, view_list=fitted(self.view_list, self.cameras, xyz))
 
     def views_of(self, xyz: FloatArray, first_row: int) -> tuple[Views, ViewReport]:
         """Return the cameras of a chunk's points, and the counts of the matches.
 
         The points, shape (n, 3), are apparent ones in the frame of the cameras, from the cloud's
-        `first_row` on. One without a match has no cameras. The match is settled.
+        `first_row` on. One without a match has no cameras.
         """
         views = self.view_list
-        report = ViewReport(f"{views.what} {views.path}", len(views), tolerance_m=self.tolerance_m)
-        if views.xyz is None:
-            row = np.arange(first_row, first_row + len(xyz))
-            report.by_row = len(row)
-        else:
-            row = self._rows(xyz, first_row, views.xyz, report)
+        report = ViewReport(
+            f"{views.what} {views.path}", len(views), views.share_seen, self.tolerance_m
+        )
+        own_row = np.arange(first_row, first_row + len(xyz))
+        row = own_row if views.xyz is None else self._rows(xyz, own_row, views.xyz)
         matched = np.flatnonzero(row >= 0)
+        report.by_row = int(np.count_nonzero(row == own_row))
+        report.by_position = len(matched) - report.by_row
+        report.unmatched = len(row) - len(matched)
         some = views.listed.take(row[matched])
         camera = views.orders[0][some.camera]
         posed = camera >= 0
         start = np.zeros(len(row) + 1, np.int64)
         start[matched + 1] = np.diff(np.concatenate([[0], np.cumsum(posed)])[some.start])
         weight = None if some.weight is None else some.weight[posed]
-        report.share_seen = views.share_seen
         report.entries, report.unposed_entries = int(posed.sum()), int((~posed).sum())
         return Views(np.cumsum(start), camera[posed], weight, some.kind), report
 
-    def _rows(
-        self, xyz: FloatArray, first_row: int, listed: FloatArray, report: ViewReport
-    ) -> IntArray:
-        """Return the list's row of each point, -1 if it has none, and count the matches."""
-        row = np.full(len(xyz), -1)
-        same_row = listed[first_row : first_row + len(xyz)]
-        away_m = np.linalg.norm(same_row - xyz[: len(same_row)], axis=1)
-        near = np.flatnonzero(away_m <= self._same_m)
-        row[near] = first_row + near
-        report.by_row = len(near)
+    def _rows(self, xyz: FloatArray, own_row: IntArray, listed: FloatArray) -> IntArray:
+        """Return the list's row of points at some rows of the cloud, -1 for those without one."""
+        row = np.where(own_row < len(listed), own_row, -1)
+        row[np.linalg.norm(listed[row] - xyz, axis=1) > self._reach(_SAME)] = -1
         rest = np.flatnonzero(row < 0)
-        if not len(rest):
-            return row
-        if self._tree is None:
-            self._tree = cKDTree(listed, balanced_tree=False, compact_nodes=False)
-        reach = float(np.nextafter(self.tolerance_m or 0.0, np.inf))
-        away, nearest = self._tree.query(xyz[rest], distance_upper_bound=reach, workers=-1)
-        found = np.isfinite(away)
-        row[rest] = np.where(found, nearest, -1)
-        report.by_position = int(np.count_nonzero(found))
-        report.unmatched = len(rest) - report.by_position
+        if len(rest):
+            reach = float(np.nextafter(self.tolerance_m or 0.0, np.inf))
+            away, nearest = self._tree.query(xyz[rest], distance_upper_bound=reach, workers=-1)
+            row[rest] = np.where(np.isfinite(away), nearest, -1)
         return row
 
 

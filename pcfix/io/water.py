@@ -20,7 +20,7 @@ import numpy as np
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
 from pcfix.io import crs as systems
 from pcfix.io.files import check_input
-from pcfix.io.ply import Records, read_header
+from pcfix.io.ply import positions, read_columns, read_header
 from pcfix.io.rasters import IMPOSSIBLE_M, open_raster, place_of, read_masked
 from pcfix.io.tables import METRES, match_labels, number
 from pcfix.model import (
@@ -146,17 +146,17 @@ def _read_obj(path: Path) -> tuple[FloatArray, IntArray]:
 
 def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
     """Return vertices and triangles as `_read_obj` does."""
-    vertices, faces = (Records(path, read_header(path, one)) for one in ("vertex", "face"))
-    named = [n for n in _CORNERS if faces.header.item(n, is_list=True)]
-    if not named or None in (vertices.header.item(axis, is_list=False) for axis in "xyz"):
+    vertex, face = (read_header(path, one) for one in ("vertex", "face"))
+    corners = next((name for name in _CORNERS if face.has(name, lists=True)), "")
+    if not corners or not vertex.has(*"xyz"):
         sentence = f"needs vertices with x, y, z and faces with {_CORNERS[0]}. Export a mesh."
         raise bad_file(path, "water.mesh_damaged", sentence)
-    start, corners = faces.lists(named[0])
-    corner = corners.astype(np.int64)
+    start, corner = read_columns(path, face, corners)[corners]
     count = np.maximum(np.diff(start) - 2, 0)
     first = np.repeat(start[:-1], count)
     other = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(count) - count, count)
-    return vertices.numbers(*"xyz"), corner[np.column_stack([first, other, other + 1])]
+    rows = np.column_stack([first, other, other + 1])
+    return positions(path, vertex), corner.astype(np.int64)[rows]
 
 
 MOST_CELLS = 10_000_000

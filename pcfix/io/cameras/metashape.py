@@ -437,10 +437,10 @@ def _vertices(archive: zipfile.ZipFile, name: str | None, axes: str) -> tuple[Fl
     """Return the coordinates and tracks (id) of a binary PLY in an archive."""
     where, data = f"{archive.filename}: {name}", archive.read(name or "")
     header = parse_header(where, data)
-    kinds = {p.name: header.order + p.item for p in header.properties if not p.length}
-    if header.skipped or not {*axes, "id"} <= kinds.keys():
+    kinds = {own: header.order + item for own, (item, _) in header.properties.items()}
+    if not header.has(*header.properties, *axes, "id"):
         raise damaged(where, f"it is not a binary PLY of vertices with {', '.join(axes)}, id")
     with checks.reading(where):
-        rows = np.frombuffer(data, np.dtype([*kinds.items()]), header.records, header.end)
+        rows = np.frombuffer(data, np.dtype([*kinds.items()]), header.records, header.first)
         columns = np.column_stack([rows[axis] for axis in axes]).astype(np.float64)
     return columns, rows["id"].astype(np.int64)
