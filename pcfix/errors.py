@@ -8,6 +8,7 @@ import errno
 import math
 import re
 import sys
+import warnings
 from collections.abc import Iterable
 from dataclasses import asdict, is_dataclass
 from types import SimpleNamespace
@@ -66,6 +67,11 @@ class GeometryError(PcfixError):
 
 class PcfixWarning(CodedError, UserWarning):  # noqa: N818
     """A warning: it affects the result, and the user can do something about it."""
+
+
+def warn(name: object, code: str, sentence: str, **values: Any) -> None:
+    """Warn about a file; the message is its path and a sentence."""
+    warnings.warn(PcfixWarning(code, f"{name}: {sentence}", **values), stacklevel=3)
 
 
 def coded(code: str, notes: Iterable[object]) -> list[PcfixWarning]:

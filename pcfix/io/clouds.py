@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -13,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.compare.match import Reference, SurveyCloud
-from pcfix.errors import PcfixWarning, bad_file
+from pcfix.errors import bad_file, warn
 from pcfix.io.crs import is_same, parts
 from pcfix.io.files import check_input, path_of
 from pcfix.io.las.columns import SHIFTS
@@ -120,10 +119,10 @@ def read_cloud(
     first = 0
     with open_cloud(path) as source:
         own, crs, most = water or own_water(source), stated_crs(source), len(source)
-        names = {"WaterDepth", *SHIFTS}.intersection(
-            source.header.point_format.extra_dimension_names
-        )
-        for points in _few_points(source, own, names):
+        extra = source.header.point_format.extra_dimension_names
+        names = {"WaterDepth", *SHIFTS}.intersection(extra)
+        few = (c[rows] for c in source.chunks() for rows in blocks(len(c), FEW_ROWS))
+        for points in (points_of(chunk, source, own, names) for chunk in few):
             known, used = points.dimensions or {}, points.counts(skip_classes)
             if water is None and "WaterDepth" in known:
                 depth = known["WaterDepth"]
@@ -159,15 +158,6 @@ def read_cloud(
         water_m,
         own if exact and not isinstance(own, WaterDimension) else None,
     )
-
-
-def _few_points(
-    source: LasSource, water: WaterSurface | None, names: Collection[str]
-) -> Iterator[Points]:
-    """Yield the points of a cloud, few at a time."""
-    for chunk in source.chunks():
-        for rows in blocks(len(chunk), FEW_ROWS):
-            yield points_of(chunk[rows], source, water, names)
 
 
 def own_water(source: LasSource) -> WaterSurface | None:
@@ -243,8 +233,7 @@ def check_same_crs(cloud: str, crs: CRS | None, reference: str, other: CRS | Non
     if crs is None or other is None:
         if crs is not other:
             bare, name = (cloud, other.name) if other else (reference, crs.name if crs else "")
-            sentence = f"{bare} names no CRS; {name} is assumed."
-            warnings.warn(PcfixWarning("crs.assumed", sentence, path=bare), stacklevel=3)
+            warn(bare, "crs.assumed", f"names no CRS; {name} is assumed.", path=bare)
         return
     for code, one, another in zip(
         ("crs.differs", "crs.heights_differ"), parts(crs), parts(other), strict=True

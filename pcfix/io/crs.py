@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.errors import InputError, PcfixWarning, bad_file, warn
 from pcfix.model import FloatArray
 
 if TYPE_CHECKING:
@@ -351,10 +351,6 @@ def to_cloud_crs(
     A CRS that is None is not stated; that of the file is ``local`` to use its numbers unchanged.
     The cloud's is projected, in metres. With `heights` z matters.
     """
-
-    def assume(code: str, sentence: str) -> None:
-        warnings.warn(PcfixWarning(code, f"{name}: {sentence}"), stacklevel=4)
-
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
     if isinstance(crs, str) and crs.strip().lower() == LOCAL:
         return None
@@ -368,7 +364,7 @@ def to_cloud_crs(
             sentence = f"is in {unit} ({source.name}), the cloud names no CRS. Set the cloud's CRS."
             raise bad_file(name, "crs.cloud_missing", sentence, unit=unit)
         who = "the file" if source is None else "the cloud"
-        assume("crs.assumed", f"{who} names no CRS; {known.name if known else ''} is assumed.")
+        warn(name, "crs.assumed", f"{who} names no CRS; {known.name if known else ''} is assumed.")
         return None
     if is_local(cloud) or is_local(source):
         sentence = f"is in {source.name}, the cloud in {cloud.name}, of which one is local. Use one"
@@ -383,8 +379,8 @@ def to_cloud_crs(
     if kinds == ("ellipsoidal", "unstated"):
         missing = f"the cloud's CRS ({cloud.name})"
     if heights and missing:
-        words = f"{missing} names no vertical datum; that of the other is assumed."
-        assume("crs.heights_assumed", words)
+        sentence = f"{missing} names no vertical datum; that of the other is assumed."
+        warn(name, "crs.heights_assumed", sentence)
     if agree and is_same_numbers(source, cloud, heights=heights):
         return None
     plan = shortened(crs_text(parts(source)[0]))

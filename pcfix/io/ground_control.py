@@ -27,14 +27,13 @@ Reference: "Ground Control Points" in the manual of OpenDroneMap, https://docs.o
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pcfix.errors import InputError, PcfixWarning, bad_file
+from pcfix.errors import InputError, bad_file, warn
 from pcfix.io.cameras import metashape, read_cameras
 from pcfix.io.cameras import table as camera_tables
 from pcfix.io.cameras.checks import Source, recognises
@@ -54,7 +53,6 @@ SIGMA_M, SIGMA_PX = 0.01, 0.5
 """Standard deviations if the file states none."""
 FARTHEST_M = 50e3
 """Horizontal distance to the block that indicates another zone or swapped axes."""
-_NAMED = 5
 
 SPELLINGS: dict[str, tuple[str, ...]] = {
     **{role: POSITIONS[role] for role in ("x", "y", "z", "longitude", "latitude")},
@@ -133,27 +131,22 @@ def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None)
     own = np.array([row_of[name] for name in names])
     rows = np.unique(own[posed])  # the first mark of each point that is used
     moved = _to_cameras(table, xyz[rows], rows, cameras, crs or stated_crs)
-    sigma_px = np.sqrt((sigma[posed, 3:5] ** 2).mean(axis=1))
-    sigma_m, sigma_on, sigma_px = (
-        np.where(np.isnan(values), default, values)
-        for values, default in (
-            (sigma[rows, :3], SIGMA_M), (sigma[rows, 5], SIGMA_M), (sigma_px, SIGMA_PX)
-        )
-    )  # fmt: skip
     has_surfaces = any(on)
+    sigma_px = np.sqrt((sigma[posed, 3:5] ** 2).mean(axis=1))
+    sigma = np.nan_to_num(sigma[rows], nan=SIGMA_M)
     return GroundControl(
         names=tuple(names[i] for i in rows),
         xyz=moved,
-        sigma_m=np.where(np.isnan(moved), np.inf, sigma_m),
+        sigma_m=np.where(np.isnan(moved), np.inf, sigma[:, :3]),
         is_check=is_check[rows],
         under_water=under_water[rows],
         point=np.searchsorted(rows, own[posed]),
         camera=camera[posed],
         image_xy=table.of(("u", "v"))[posed],
-        sigma_px=sigma_px,
+        sigma_px=np.nan_to_num(sigma_px, nan=SIGMA_PX),
         crs=cameras.crs,
         on=tuple(on[i] for i in rows) if has_surfaces else (),
-        on_sigma_m=sigma_on if has_surfaces else np.zeros(0),
+        on_sigma_m=sigma[:, 5] if has_surfaces else np.zeros(0),
     )
 
 
@@ -167,11 +160,6 @@ def _error(table: Table, row: int, code: str, words: str, **values: Any) -> Inpu
     """Return an error about a mark: file, line, image, point and what is wrong."""
     point = table.column("point")[row]
     return table.error(row, code, f"point {point}: {words}", point=point, **values)
-
-
-def _few(names: list[str]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more
 
 
 def _cameras_of(table: Table, cameras: Cameras) -> IntArray:
@@ -189,8 +177,8 @@ def _cameras_of(table: Table, cameras: Cameras) -> IntArray:
         raise table.error(images.index(ambiguous[0]), "images.ambiguous", words, image=ambiguous[0])
     unknown = list(unnamed(lost, cameras.unposed))
     if unknown:
-        words = f"{_few(unknown)} are not among the {len(cameras)} images of the model"
-        words += f" (first {cameras.labels[0]}). Give the points of this block."
+        words = f"{', '.join(unknown[:5])} (of {len(unknown)}) are not among the {len(cameras)}"
+        words += f" images of the model (first {cameras.labels[0]}). Give the points of this block."
         row = images.index(unknown[0])
         raise _error(table, row, "gcps.unknown_image", words, images=unknown)
     if len(lost) == len(names):
@@ -210,10 +198,9 @@ def _cameras_of(table: Table, cameras: Cameras) -> IntArray:
             words += " Count pixels from its upper left corner, to the right and down."
             raise _error(table, row, "gcps.outside", words, uv=[u, v])
     if lost:
-        words = f"{table.path}: {(camera < 0).sum()} of {len(camera)} marks are in images without a"
-        words += f" pose ({_few(lost)}) and were skipped."
-        note = PcfixWarning("gcps.unposed", words, path=table.path, images=lost)
-        warnings.warn(note, stacklevel=3)
+        words = f"{(camera < 0).sum()} of {len(camera)} marks are in images without a pose, such as"
+        words += f" {lost[0]}, and were skipped."
+        warn(table.path, "gcps.unposed", words, path=table.path, images=lost)
     return camera
 
 
@@ -280,14 +267,8 @@ def _odm_table(path: Path, rows: list[tuple[int, list[str]]]) -> Table:
             raise bad_file(path, "gcps.fields", sentence, line=i)
         name = places.setdefault(tuple(map(number, fields[:3])), f"GCP {len(places) + 1}")
         texts.append([*fields, name][: len(ODM)])
-    table = _table_of(path, ODM, texts)
-    return replace(table, line=[i for i, _ in rows], crs=named_crs(path))
-
-
-def _table_of(path: Path, roles: tuple[str, ...], rows: list[list[str]]) -> Table:
-    """Return rows as a table whose columns are called by their roles."""
-    place = {role: i for i, role in enumerate(roles)}
-    return Table(path, [*roles], rows, [*range(1, len(rows) + 1)], place, [""] * len(roles))
+    place, lines = {role: i for i, role in enumerate(ODM)}, [i for i, _ in rows]
+    return Table(path, [*ODM], texts, lines, place, crs=named_crs(path))
 
 
 METASHAPE = (
@@ -327,7 +308,8 @@ def _metashape_table(path: Path) -> tuple[Table, str]:
         raise bad_file(path, "gcps.none", sentence)
     own = (chunk.root.findtext("marker_reference") or "").strip()
     crs = own or (chunk.root.findtext("reference") or "").strip() or LOCAL
-    table = _table_of(path, METASHAPE, rows)
+    place, lines = {role: i for i, role in enumerate(METASHAPE)}, [*range(1, len(rows) + 1)]
+    table = Table(path, [*METASHAPE], rows, lines, place)
     return table, LOCAL if is_local(parse_crs(crs, str(chunk.path))) else crs
 
 
@@ -407,9 +389,8 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
             sentence = f"its positions are {away_m / 1e3:,.0f} km from the block. Check their CRS."
             raise bad_file(source, "gnss.far", sentence, away_m=away_m)
     if known < len(cameras):
-        words = f"{source}: {known} of {len(cameras)} images have a GNSS position."
-        note = PcfixWarning("gnss.images_without", words, path=source, images=known)
-        warnings.warn(note, stacklevel=2)
+        sentence = f"{known} of {len(cameras)} images have a GNSS position."
+        warn(source, "gnss.images_without", sentence, path=source, images=known)
     return cameras
 
 
@@ -427,9 +408,9 @@ def gnss_in_frame_of(cameras: Cameras, name: str = "cameras") -> tuple[GnssPosit
     reason : str
         Why heights or all positions are missing; empty if they are not.
     """
-    nothing = np.full((len(cameras), 3), np.nan)
+    nothing = GnssPositions(*np.full((2, len(cameras), 3), np.nan), crs=None)
     if cameras.gnss is None:
-        return GnssPositions(nothing, nothing, None), f"{name}: has no GNSS positions."
+        return nothing, f"{name}: has no GNSS positions."
     crs, is_frame = cameras.crs or "", True  # whether the differences are of coordinates in it
     if is_topocentric(crs):
         is_frame = cameras.gnss.crs in (None, crs)
@@ -437,8 +418,7 @@ def gnss_in_frame_of(cameras: Cameras, name: str = "cameras") -> tuple[GnssPosit
         found = parse_crs(crs, name)
         is_frame = found.is_projected and {a.unit_name for a in found.axis_info}.issubset(METRES)
     if not is_frame:
-        reason = f"{name}: {cameras.crs} is no map in metres, so the GNSS cannot be compared."
-        return GnssPositions(nothing, nothing, None), reason
+        return nothing, f"{name}: {crs} is no map in metres, so the GNSS cannot be compared."
     enu_m, reason = adjusted_minus_gnss(cameras, name)
     xyz = cameras.centres - enu_m
     sigma = np.where(np.isnan(xyz), np.nan, cameras.gnss.sigma_m)

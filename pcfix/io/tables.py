@@ -51,8 +51,8 @@ class Table:
     """The columns of a table and its rows, all text.
 
     The `header` has the names of the columns, lower case, without units, and `line` each row's line
-    number. `place` leads from the role of a column to its number; `unit` is that of each column,
-    `crs` what a comment states, and the header is a comment where `after_hash`.
+    number. `place` leads from the role of a column to its number; `unit` is that of each column, if
+    any is stated, `crs` what a comment states, and the header is a comment where `after_hash`.
     """
 
     path: Path
@@ -60,7 +60,7 @@ class Table:
     rows: list[list[str]]
     line: list[int]
     place: Mapping[str, int]
-    unit: Sequence[str]
+    unit: Sequence[str] = ()
     after_hash: bool = False
     crs: str | None = None
 
@@ -118,7 +118,7 @@ class Table:
                 sentence = f"column {name}: '{texts[i]}' is {why}. Correct it."
                 where = {"line": self.line[i], "column": name, "value": texts[i]}
                 raise self.error(int(i), "table.number", sentence, **where)
-        unit = self.unit[self.place[role]]
+        unit = self.unit[self.place[role]] if self.unit else ""
         wanted, known = UNITS.get(role, ("", {unit: 1.0}))
         if unit not in known:
             sentence = f"column {name} is in '{unit}'. Give {wanted}."

@@ -10,7 +10,6 @@ The heights above the take-off place are those that drones recorded in their ima
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -19,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcfix.errors import PcfixWarning, bad_file
+from pcfix.errors import bad_file, warn
 from pcfix.io.files import check_input, refusing
 from pcfix.io.tables import match_labels, read_table
 from pcfix.model import FloatArray
@@ -31,7 +30,6 @@ _DATE_TIME_ORIGINAL, _OFFSET_ORIGINAL, _SUBSECONDS, _EXIF = 0x9003, 0x9011, 0x92
 LONG_GAP_S = 3600.0
 """Between rows. Half a tide lasts 6.2 h; with an amplitude A of 2 m the chord over one hour is up
 to A (2 pi 1 h / 12.4 h)^2 / 8 = 6 cm off, that over two hours 26 cm."""
-_USE_TABLE = "Give a CSV table label,time instead."
 
 
 class Times(NamedTuple):
@@ -76,7 +74,7 @@ def _from_exif(folder: Path, labels: Sequence[str]) -> Times:
         codes = (_DATE_TIME_ORIGINAL, _SUBSECONDS, _OFFSET_ORIGINAL)
         text, fraction, zone = (str(tags.get(code, "")).strip("\0 ") for code in codes)
         if not text:
-            sentence = f"its EXIF data has no DateTimeOriginal. {_USE_TABLE}"
+            sentence = "its EXIF data has no DateTimeOriginal. Give a CSV table label,time instead."
             raise bad_file(file, "image_times.missing", sentence)
         texts.append(text + (f".{fraction}" if fraction.isdecimal() else "") + zone)
     return _times(folder, [f"image {file.name}" for file in chosen], texts)
@@ -98,13 +96,10 @@ def _times(source: Path, where: Sequence[str], texts: Sequence[str]) -> Times:
     for at, text in zip(where, texts, strict=True):
         iso = _EXIF_DATE.sub(r"\1-\2-\3", text.strip())
         try:
-            moment = datetime.fromisoformat(iso)
+            moments.append(datetime.fromisoformat(iso if len(iso) > len("2026-05-01") else ""))
         except ValueError:
-            moment = None
-        if moment is None or len(iso) <= len("2026-05-01"):
             sentence = f"{at}: '{text}' is not a date and time. Write 2026-05-01T12:00:00Z."
-            raise bad_file(source, "time.format", sentence, value=text)
-        moments.append(moment)
+            raise bad_file(source, "time.format", sentence, value=text) from None
     zoned = [moment.tzinfo is not None for moment in moments]
     if any(zoned) != all(zoned):
         odd = zoned.index(not zoned[0])
@@ -138,7 +133,7 @@ def level_offsets(
     The level is linear between the rows of the table. The average over the images is the level that
     the user gives.
     """
-    clock, name = tide.time_s, tide.name
+    clock = tide.time_s
     if tide.zoned != times.zoned:
         without = times if tide.zoned else tide
         sentence = "its times have no zone, those of the other file have. Add +02:00, or Z for UTC."
@@ -149,19 +144,19 @@ def level_offsets(
         taken = datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M:%S")
         sentence = f"does not cover image {image}, taken at {taken} ({outside.size} of"
         sentence += f" {len(labels)} images are outside). Add rows, or check the zones."
-        raise bad_file(name, "tide.not_covered", sentence, image=image, count=int(outside.size))
+        raise bad_file(
+            tide.name, "tide.not_covered", sentence, image=image, count=int(outside.size)
+        )
     level = np.interp(times.time_s, clock, level_m)
     row = np.clip(np.searchsorted(clock, times.time_s) - 1, 0, len(clock) - 2)
     longest_s = float(np.diff(clock)[row].max())
     if longest_s > LONG_GAP_S:
         hours = longest_s / 3600.0
-        sentence = f"{name}: its rows are up to {hours:.1f} h apart; give one each hour."
-        warnings.warn(PcfixWarning("tide.sparse", sentence, hours=hours), stacklevel=2)
+        sentence = f"its rows are up to {hours:.1f} h apart; give one each hour."
+        warn(tide.name, "tide.sparse", sentence, hours=hours)
     return np.asarray(level - level.mean())
 
 
-FOLDERS = ("", "images")
-"""Where images lie, relative to the folder of the camera file."""
 MOST_IMAGES, HEAD_BYTES = 30, 2**17
 _ABOVE = re.compile(rb"RelativeAltitude(?:=[\"']|>)\s*([+-]?\d+(?:\.\d*)?)")
 
@@ -171,15 +166,14 @@ def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
 
     NaN where it is not recorded. At most `MOST_IMAGES` images near the camera file are read.
     """
-    altitudes, path, found = np.full(len(labels), np.nan), Path(cameras), {}
+    path, found = Path(cameras), dict[str, float]()
     root = path if path.is_dir() else path.parent
     with suppress(OSError):  # no correction needs them
-        inside = [one for name in FOLDERS for one in sorted(root.joinpath(name).glob("*"))]
+        inside = [*sorted(root.glob("*")), *sorted(root.glob("images/*"))]
         images = [one for one in inside if one.suffix.lower() in IMAGES and one.is_file()]
         for image in images[:: 1 + len(images) // MOST_IMAGES]:
             with image.open("rb") as stream:
                 if above := _ABOVE.search(stream.read(HEAD_BYTES)):
                     found[image.name] = float(above[1])
-    row = match_labels(list(found), labels, one_to_one=False)[0]
-    altitudes[row[row >= 0]] = np.array(list(found.values()))[row >= 0]
-    return altitudes
+    altitudes = np.array([*found.values(), np.nan])
+    return np.asarray(altitudes[match_labels(labels, list(found))[0]])  # -1 for those without

@@ -8,7 +8,6 @@ point.
 from __future__ import annotations
 
 import glob
-import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ import numpy as np
 import shapely
 from laspy.vlrs.vlr import VLR
 
-from pcfix.errors import PcfixWarning, SettingError, bad_file
+from pcfix.errors import SettingError, bad_file, warn
 from pcfix.grid.lattice import Window
 from pcfix.io.crs import metres_up
 from pcfix.io.files import path_of, read_json, refusing
@@ -218,9 +217,11 @@ def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
     pairs = shapely.STRtree(boxes).query(boxes, predicate="intersects").T.tolist()
     found = [(tiles.paths[i].name, tiles.paths[j].name) for i, j in pairs if i < j]
     if found:
-        sentence = f"{tiles}: {' and '.join(found[0])} overlap, as do {len(found)} pairs. Points in"
-        sentence += " both count twice; cut off the buffers of the tiles."
-        warnings.warn(PcfixWarning("cloud.overlap", sentence, pairs=found), stacklevel=3)
+        sentence = (
+            f"{' and '.join(found[0])} overlap, as do {len(found)} pairs. Points in both count"
+        )
+        sentence += " twice; cut off the buffers of the tiles."
+        warn(tiles, "cloud.overlap", sentence, pairs=found)
     return tiles
 
 

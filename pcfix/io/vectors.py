@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from pcfix.errors import PcfixWarning, bad_file
+from pcfix.errors import bad_file, warn
 from pcfix.io import tables
 from pcfix.io.atomic import cannot_write, temporary_output
 from pcfix.io.crs import parse_crs, plan_unit, to_cloud_crs
@@ -228,8 +228,8 @@ def read_shoreline(
     known = xyz[np.isfinite(xyz[:, 2]), 2]
     if len(known) >= FEW and not known.any():  # a flat drawing
         xyz[:, 2] = np.nan
-        sentence = f"{vectors.name}: all {len(known)} heights are exactly 0; they are ignored."
-        warnings.warn(PcfixWarning("water.zero_heights", sentence, count=len(known)), stacklevel=2)
+        sentence = f"all {len(known)} heights are exactly 0; they are ignored."
+        warn(vectors.name, "water.zero_heights", sentence, count=len(known))
     return Shoreline(xyz, vectors.name, np.concatenate(counts))
 
 
@@ -262,10 +262,9 @@ def read_water_polygons(path: File, cloud_crs: str | CRS | None = None) -> Vecto
             polygons[crossed], method="structure", keep_collapsed=False
         )
         count, area_m2 = int(crossed.sum()), float(shapely.area(polygons[crossed]).sum())
-        sentence = f"{vectors.name}: {count} of {len(polygons)} polygons crossed themselves."
-        sentence += f" Repaired, they cover {area_m2:.1f} m2."
-        note = PcfixWarning("mask.repaired", sentence, count=count, area_m2=area_m2)
-        warnings.warn(note, stacklevel=2)
+        sentence = f"{count} of {len(polygons)} polygons crossed themselves. Repaired, they cover"
+        sentence += f" {area_m2:.1f} m2."
+        warn(vectors.name, "mask.repaired", sentence, count=count, area_m2=area_m2)
     area = shapely.union_all(polygons)
     if not area.area > 0.0:
         kinds = sorted({geometry.geom_type for geometry in vectors.geometries})

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pcfix.errors import GeometryError, PcfixWarning, SettingError, bad_file
+from pcfix.errors import GeometryError, SettingError, bad_file, warn
 from pcfix.io import crs as systems
 from pcfix.io.files import check_input
 from pcfix.io.ply import positions, read_columns, read_header
@@ -204,9 +203,10 @@ def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRa
     noise_m = 1.48 * float(np.nanmedian(noise)) if np.isfinite(noise).any() else 0.0
     slope_deg = math.degrees(math.atan(noise_m / math.sqrt(abs(t.determinant))))
     if slope_deg > ROUGH_DEG:
-        sentence = f"{name}: the water surface is rough ({noise_m:.2f} m, slopes of {slope_deg:.0f}"
-        sentence += " degrees). Smooth it, or fit a level to it."
-        warnings.warn(PcfixWarning("water.rough", sentence, noise_m=noise_m), stacklevel=3)
+        sentence = (
+            f"the water surface is rough ({noise_m:.2f} m, slopes of {slope_deg:.0f} degrees)."
+        )
+        warn(name, "water.rough", f"{sentence} Smooth it, or fit a level to it.", noise_m=noise_m)
     short = name.replace("\\", "/").rpartition("/")[2]
     return WaterRaster(heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), short)
 
@@ -225,10 +225,8 @@ def _heights(source: DatasetReader, crs: CRS | None, name: str) -> FloatArray:
         heights[~(np.abs(heights) <= IMPOSSIBLE_M)] = np.nan
         unknown = int(np.isnan(heights).sum())
         if unknown:
-            sentence = f"{name}: has no nodata value. {unknown:,} impossible heights are ignored."
-            warnings.warn(
-                PcfixWarning("water.raster_nodata", sentence, count=unknown), stacklevel=4
-            )
+            sentence = f"has no nodata value. {unknown:,} impossible heights are ignored."
+            warn(name, "water.raster_nodata", sentence, count=unknown)
     heights[np.isinf(heights)] = np.nan
     return heights
 
@@ -245,8 +243,7 @@ def rasters_of_images(folder: File, names: Sequence[str]) -> dict[int, Path]:
         sentence = f"has no raster named after an image, such as {Path(names[0]).stem}.tif."
         raise bad_file(folder, "water.no_image_rasters", sentence)
     if lost := len(names) - len(found):
-        sentence = f"{lost} images have no water raster in {folder}."
-        warnings.warn(PcfixWarning("water.images_missing", sentence), stacklevel=3)
+        warn(folder, "water.images_missing", f"{lost} images have no water raster in it.")
     return found
 
 
