@@ -180,12 +180,13 @@ def write_map(path: Path, run: RunFolder, corrected: Plain, compared: Plain) -> 
 
 def _contours(folder: Path) -> Layer:
     """Return the depth contours, no finer than the depth is known."""
-    depth, bounds = rasters.preview(folder / DEPTH, MOST_CELLS)
+    depth, transform = rasters.preview(folder / DEPTH, MOST_CELLS)
     path = folder / UNCERTAINTY
     sigma = rasters.preview(path)[0] if path.exists() else np.zeros(0)
     interval = depth_interval(depth, sigma)
     found = contours(depth, interval)
-    lines = [shapely.linestrings(rasters.centres(place, depth, bounds)) for _, place in found]
+    places = [rasters.place_of(transform, *(place.T + 0.5)) for _, place in found]
+    lines = [shapely.linestrings(*xy) for xy in places]
     level = np.array([level for level, _ in found])
     values = {"depth_m": level, "interval_m": np.full(len(found), interval)}
     style = vector_style({"line": Symbol("line", DARK, 0.25)}, label='"depth_m"')

@@ -308,15 +308,11 @@ def find_members(cameras: File) -> tuple[Path, Members] | None:
         values |= {name: tuple(values[name].tolist()) for name in ("labels", "lens_names")}
         members = Members(**values)
         m, k, p = len(members), len(members.labels), len(members.lens_names)
-        named = ("focal", "turn", "shift_m", "lens", "water")
-        shapes = [getattr(members, name).shape for name in named]
-        if shapes != [(k,), (m, k, 3), (m, k, 3), (m, k, p), (m, 7)]:
-            raise ValueError(shapes)
+        shapes = {"focal": (k,), "turn": (m, k, 3), "shift_m": (m, k, 3), "lens": (m, k, p)}
+        for name, shape in (shapes | {"water": (m, 7)}).items():
+            if getattr(members, name).shape != shape:
+                raise ValueError(f"the shape of {name} does not fit")
     return found, members
-
-
-_WHEN = (1980, 1, 1, 0, 0, 0)
-"""Time of all files in an archive, so that the same input gives the same bytes."""
 
 
 def packed_plugin(table: str, version: str) -> bytes:
@@ -330,6 +326,6 @@ def packed_plugin(table: str, version: str) -> bytes:
     own["metadata.txt"] = own["metadata.txt"].replace("version=0.0", f"version={version}")
     own["commands.json"] = table
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as file:
-        for name in sorted(own):
-            file.writestr(zipfile.ZipInfo(f"pcfix/{name}", _WHEN), own[name].encode())
+        for name in sorted(own):  # all of 1980, so that the same input gives the same bytes
+            file.writestr(zipfile.ZipInfo(f"pcfix/{name}"), own[name].encode())
     return stream.getvalue()

@@ -308,8 +308,8 @@ def _metashape_table(path: Path) -> tuple[Table, str]:
         raise bad_file(path, "gcps.none", sentence)
     own = (chunk.root.findtext("marker_reference") or "").strip()
     crs = own or (chunk.root.findtext("reference") or "").strip() or LOCAL
-    place, lines = {role: i for i, role in enumerate(METASHAPE)}, [*range(1, len(rows) + 1)]
-    table = Table(path, [*METASHAPE], rows, lines, place)
+    columns, lines = {role: i for i, role in enumerate(METASHAPE)}, [*range(1, len(rows) + 1)]
+    table = Table(path, [*METASHAPE], rows, lines, columns)
     return table, LOCAL if is_local(parse_crs(crs, str(chunk.path))) else crs
 
 
@@ -408,7 +408,8 @@ def gnss_in_frame_of(cameras: Cameras, name: str = "cameras") -> tuple[GnssPosit
     reason : str
         Why heights or all positions are missing; empty if they are not.
     """
-    nothing = GnssPositions(*np.full((2, len(cameras), 3), np.nan), crs=None)
+    unknown = np.full((len(cameras), 3), np.nan)
+    nothing = GnssPositions(unknown, unknown, None)
     if cameras.gnss is None:
         return nothing, f"{name}: has no GNSS positions."
     crs, is_frame = cameras.crs or "", True  # whether the differences are of coordinates in it

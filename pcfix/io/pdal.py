@@ -58,11 +58,9 @@ class PdalCloud:
             if self._class_flags is None:
                 raise _missing(*CLASS_FLAGS.split("="))
             if len(self.classes) and self.classes.max() >= _PACKED_FLAGS:
-                sentence = (
-                    f"{NAME}: has flags in Classification, where PDAL before 2.5 leaves those"
-                )
-                sentence += " of point formats 0 to 5. Convert the cloud to format 6 first."
-                raise SettingError("cloud.packed", sentence)
+                words = "has flags in Classification, where PDAL before 2.5 leaves those of point"
+                words += " formats 0 to 5. Convert the cloud to format 6 first."
+                raise SettingError("cloud.packed", f"{NAME}: {words}")
         if "Withheld" in ins:
             self.withheld = ins["Withheld"] != 0
         elif self._class_flags is not None:

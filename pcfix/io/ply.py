@@ -99,8 +99,9 @@ def read_header(path: Path, element: str = "vertex") -> Element:
 
 def read_columns(path: Path, element: Element, *names: str) -> dict[str, Column]:
     """Return properties of all records by name; refuse a file that lacks records."""
-    units = np.memmap(path, np.uint8, "r")[element.first :]
-    # neighbouring numbers are one field, as is a list: bytes of its items, and of a list's length
+    data = np.memmap(path, np.uint8, "r")[element.first :]
+    # Neighbouring numbers are one field, whose count is 1; a list is a field too. Of each field the
+    # bytes of an item and of the list's length, of each property its field and the offset in it.
     fields, place = list[tuple[int, int]](), dict[str, tuple[int, int]]()
     for name, (kind, length) in element.properties.items():
         if length or not fields or fields[-1][1]:
@@ -116,17 +117,18 @@ def read_columns(path: Path, element: Element, *names: str) -> dict[str, Column]
     at = 0
     for first in range(0, element.records, _ROWS_AT_ONCE):
         rows = slice(min(element.records - first, _ROWS_AT_ONCE))
-        at = _list_starts(units, at, sizes, element.order == ">", begin[rows], count[rows])
+        at = _list_starts(data, at, sizes, element.order == ">", begin[rows], count[rows])
         if at < 0:
             sentence = f"is cut short: not all of its {element.records:,} {element.kind} are there."
             raise bad_file(element.name, "ply.cut_short", sentence, records=element.records)
         for name, (counts, parts) in found.items():
-            (field, offset), kind = place[name], parts[0].dtype
-            # the bytes as the item of this type that begins at each of them
-            items = np.ndarray(max(len(units) - kind.itemsize + 1, 0), kind, units, strides=(1,))
-            many = count[rows, field].copy()
-            near = begin[rows, field] + offset - sizes[field, 0] * (np.cumsum(many) - many)
-            parts.append(items[np.repeat(near, many) + sizes[field, 0] * np.arange(many.sum())])
+            (field, offset), number = place[name], parts[0].dtype
+            # a view whose item i is the number of this type that begins at byte i
+            items = np.ndarray(max(len(data) - number.itemsize + 1, 0), number, data, strides=(1,))
+            many, step = count[rows, field].copy(), sizes[field, 0]
+            # item k of all lists is at the start of its own, plus the steps since that one's first
+            first_of_all = begin[rows, field] + offset - step * (np.cumsum(many) - many)
+            parts.append(items[np.repeat(first_of_all, many) + step * np.arange(many.sum())])
             counts.append(many)
     return {
         name: Column(np.cumsum(np.concatenate(counts)), np.concatenate(parts))
@@ -142,11 +144,11 @@ def positions(path: Path, vertices: Element) -> FloatArray:
 
 @kernel
 def _list_starts(
-    units: npt.NDArray[Any], at: int, sizes: IntArray, big: bool, start: IntArray, count: IntArray
+    data: npt.NDArray[Any], at: int, sizes: IntArray, big: bool, start: IntArray, count: IntArray
 ) -> int:
     """Walk over records, and fill in where each of their fields starts and how many items it has.
 
-    The first record begins at the byte `at` of `units`. Field f of a record has items of
+    The first record begins at the byte `at` of `data`. Field f of a record has items of
     ``sizes[f, 0]`` bytes; it is a list if ``sizes[f, 1]``, the bytes of its length, is not zero.
     `start` and `count` have a row per record and a column per field. Return the byte where the
     records end, -1 if the last ones are not complete.
@@ -156,14 +158,14 @@ def _list_starts(
             item, prefix = sizes[f]
             length = 1
             if prefix:
-                if prefix > units.size - at:
+                if prefix > data.size - at:
                     return -1
                 length = 0  # its bytes, the highest first
                 for j in range(prefix):
-                    length = length * 256 + int(units[at + (j if big else prefix - 1 - j)])
+                    length = length * 256 + int(data[at + (j if big else prefix - 1 - j)])
                 at += prefix
             # divided, not multiplied: a damaged length times the item would overflow
-            if length < 0 or length > (units.size - at) // item:
+            if length < 0 or length > (data.size - at) // item:
                 return -1
             start[i, f] = at
             count[i, f] = length

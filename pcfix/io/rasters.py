@@ -157,8 +157,8 @@ def new_raster(
     from rasterio.enums import ColorInterp
     from rasterio.shutil import copy
 
-    packed = {"compress": "deflate", "predictor": 3 if dtype.startswith("float") else 2}
-    packed["bigtiff"] = "IF_SAFER"
+    predictor = 3 if dtype.startswith("float") else 2
+    packed = {"compress": "deflate", "predictor": predictor, "bigtiff": "IF_SAFER"}
     profile = {
         "driver": "GTiff", "width": cells.width, "height": cells.height, "count": len(bands),
         "dtype": dtype, "nodata": nodata, "interleave": "band", "tiled": True,
@@ -238,38 +238,29 @@ def write_dod(dsm: Path, reference: Path, output: Path) -> None:
                 raise GeometryError("raster.no_overlap", sentence, dsm=dsm, reference=reference)
 
 
-Bounds = tuple[float, float, float, float]
 PREVIEW_CELLS = 360_000
 
 
-def preview(path: Path, cells: int = PREVIEW_CELLS) -> tuple[FloatArray, Bounds]:
-    """Return a raster of at most `cells`, NaN for no data, and west, east, south, north."""
+def preview(path: Path, cells: int = PREVIEW_CELLS) -> tuple[FloatArray, Affine]:
+    """Return a raster of at most `cells`, NaN for no data, and its geotransform."""
+    from rasterio.transform import from_bounds
+
     with open_raster(path) as source:
         scale = max(1.0, math.sqrt(source.height * source.width / cells))
-        shape = max(1, int(source.height / scale)), max(1, int(source.width / scale))
-        west, south, east, north = source.bounds
-        return read_masked(source, out_shape=shape), (west, east, south, north)
-
-
-def centres(place: FloatArray, values: FloatArray, bounds: Bounds) -> FloatArray:
-    """Return x and y of columns and rows, shape (n, 2), of a `preview`; integers are centres."""
-    west, east, south, north = bounds
-    size = (east - west) / values.shape[1], (south - north) / values.shape[0]
-    return np.asarray((west, north) + (place + 0.5) * size)
+        rows, columns = (max(1, int(size / scale)) for size in source.shape)
+        values = read_masked(source, out_shape=(rows, columns))
+        return values, from_bounds(*source.bounds, columns, rows)
 
 
 def outlines(path: Path, cells: int) -> list[Any]:
     """Return the polygons around the known cells of a `preview`; gaps of a cell are closed."""
     import shapely
     from rasterio.features import shapes
-    from rasterio.transform import from_bounds
     from scipy.ndimage import binary_closing
 
-    values, (west, east, south, north) = preview(path, cells)
-    rows, columns = values.shape
+    values, transform = preview(path, cells)
     known = np.pad(np.isfinite(values), 2)
     known = binary_closing(known, np.ones((3, 3), bool))[2:-2, 2:-2]
-    transform = from_bounds(west, south, east, north, columns, rows)
     found = shapes(known.astype(np.uint8), mask=known, transform=transform)
     return [shapely.geometry.shape(polygon) for polygon, _ in found]
 

@@ -341,11 +341,12 @@ KEYS: tuple[Callable[[str], str], ...] = (str, _file_name, _stem)
 POINT_SPELLINGS = {
     "x": ("x", "easting", "east"),
     "y": ("y", "northing", "north"),
-    "z": ("z", "height", "elevation", "elev", "altitude"),
+    "z": ("z", "height", "elevation", "elev", "altitude", "h", "alt", "level"),
+    "longitude": ("longitude", "lon", "long"),
+    "latitude": ("latitude", "lat"),
+    "depth": ("depth", "true_depth", "water_depth", "measured_depth"),
 }
-DEPTH_SPELLINGS = POINT_SPELLINGS | {
-    "depth": ("depth", "true_depth", "water_depth", "measured_depth")
-}
+"""Names of the columns of points; the first that the header has is used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,7 +376,7 @@ def read_check_depths(path: File) -> CheckDepths:
     ignored, a standard error too: all check depths have the same weight.
     """
     source = check_input(path)
-    table = read_table(source, ("x", "y", "depth"), ("x", "y", "z"), spellings=DEPTH_SPELLINGS)
+    table = read_table(source, ("x", "y", "depth"), ("x", "y", "z"), spellings=POINT_SPELLINGS)
     what = "depth" if table.has("depth") else "z"
     values = table.of(("x", "y", what))
     found = CheckDepths(str(source), values[:, :2], values[:, 2], what == "z", table.line)

@@ -31,12 +31,6 @@ load_pyogrio = partial(optional_library, "pyogrio", "vector", "Read and write ve
 TABLES = (".csv", ".txt")
 GDAL_SUFFIXES = (".gpkg", ".shp", ".geojson", ".json", ".kml", ".gpx")
 KINDS = "GeoPackage (.gpkg), Shapefile (.shp), GeoJSON, KML, GPX or a table of points (.csv)"
-COLUMNS = tables.POINT_SPELLINGS | {
-    "longitude": ("longitude", "lon", "long"),
-    "latitude": ("latitude", "lat"),
-    "z": (*tables.POINT_SPELLINGS["z"], "h", "alt", "level"),
-}
-"""Names of a column; the first that the header has is used."""
 LAYER_MARK = "|"
 WGS84, WGS84_3D = "EPSG:4326", "EPSG:4979"
 SPACING_M = 1.0
@@ -166,9 +160,10 @@ def _read_points(path: Path) -> tuple[Geometries, str | None]:
     A comment ``# crs: EPSG:25830`` above the header names it; for longitude and latitude it is
     WGS 84.
     """
-    table = tables.read_table(path, ("x", "y"), ("longitude", "latitude"), spellings=COLUMNS)
+    kinds = ("x", "y"), ("longitude", "latitude")
+    table = tables.read_table(path, *kinds, spellings=tables.POINT_SPELLINGS)
     in_map = table.has("x", "y")
-    axes = ("x", "y") if in_map else ("longitude", "latitude")
+    axes = kinds[0 if in_map else 1]
     # degrees of x and y are those of the CRS
     table = replace(table, unit=["" if u in tables.DEGREES else u for u in table.unit])
     xyz = np.column_stack([table.of(axes), table.where_there(("z",))])

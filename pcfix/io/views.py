@@ -296,7 +296,8 @@ class ViewMatch:
 
     @cached_property
     def _tree(self) -> Any:
-        return cKDTree(self.view_list.xyz, balanced_tree=False, compact_nodes=False)
+        xyz: Any = self.view_list.xyz
+        return cKDTree(xyz, balanced_tree=False, compact_nodes=False)
 
     def with_image_order(self, xyz: FloatArray) -> ViewMatch:
         """Return the match with the order of the images that the cloud's first points show.

@@ -48,19 +48,19 @@ def write_vis(path, lists):
     return path
 
 
-def write_ply(path, xyz, lists=None, weights=None, order="<", count="uint8", position="float"):
+def write_ply(path, xyz, lists=None, weights=None, order="<", count="uint8"):
     """Write a PLY file point by point, with a second element before the vertices."""
     names = {"<": "binary_little_endian", ">": "binary_big_endian"}
     head = [
         *("ply", f"format {names[order]} 1.0", "comment by a test", "element camera 2"),
         *("property double focal", f"element vertex {len(xyz)}"),
-        *(f"property {position} {axis}" for axis in "xyz"),
+        *(f"property float {axis}" for axis in "xyz"),
         "property uchar red",
     ]
     head += [] if lists is None else [f"property list {count} uint32 view_indices"]
     head += ["property short label"]
     head += [] if weights is None else [f"property list {count} float32 view_weights"]
-    letter = {"uint8": "B", "ushort": "H", "uint32": "I", "float": "f", "double": "d"}
+    letter = {"uint8": "B", "ushort": "H", "uint32": "I"}
     body = b""
 
     def put(code, *values):
@@ -69,7 +69,7 @@ def write_ply(path, xyz, lists=None, weights=None, order="<", count="uint8", pos
 
     put("d", 1.0, 2.0)
     for i, point in enumerate(xyz.tolist()):
-        put(letter[position], *point)
+        put("f", *point)
         put("B", 7)
         if lists is not None:
             put(letter[count], len(lists[i]))
@@ -153,7 +153,8 @@ def test_real_vis_and_ply():
 
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("count", ["uint8", "ushort", "uint32"])
-def test_ply_layouts(tmp_path, cameras, scene, order, count):
+def test_ply_layouts(tmp_path, cameras, scene, order, count, monkeypatch):
+    monkeypatch.setattr("pcfix.io.ply._ROWS_AT_ONCE", 150)
     xyz, lists = scene
     weights = [[0.25 * (k + 1) for k in one] for one in lists]
     match = match_of(write_ply(tmp_path / "d.ply", xyz, lists, weights, order, count), cameras)
