@@ -6,20 +6,16 @@ import laspy
 import pytest
 
 import pcfix
-from tests.utils.shared import SCENE
 
 # Places in the header (LAS 1.4 R15, table 3).
 VERSION, POINTS_START, SCALE_X, OFFSET_X, EVLRS, COUNT = 24, 96, 131, 155, 235, 247
 
 
 @pytest.fixture(scope="module")
-def clouds(tmp_path_factory):
+def clouds(inputs):
     """The bytes of a cloud, packed and not."""
-    cloud, folder = laspy.read(SCENE / "cloud.laz"), tmp_path_factory.mktemp("plain")
-    cloud.points = cloud.points[::8].copy()
-    for suffix in (".laz", ".las"):
-        cloud.write(folder / f"cloud{suffix}")
-    return {path.suffix: path.read_bytes() for path in folder.iterdir()}
+    laspy.read(inputs / "cloud.laz").write(inputs / "cloud.las")
+    return {suffix: (inputs / f"cloud{suffix}").read_bytes() for suffix in (".laz", ".las")}
 
 
 def chunks_of(data):

@@ -16,7 +16,6 @@ import rasterio
 
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
-from tests.utils.shared import SCENE
 
 PAGE = 4096
 
@@ -37,17 +36,11 @@ def disk(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def inputs(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("inputs")
-    for name in ("cloud.laz", "lidar.laz"):
-        cloud = laspy.read(SCENE / name)
-        cloud.points = cloud.points[::8].copy()
-        cloud.write(folder / name)
-    for name in ("cameras.csv", "sensor.csv"):
-        shutil.copy(SCENE / name, folder)
-    done = run_pcfix(*CORRECT, "corrected.laz", "--quiet", folder=folder)
+def survey(inputs):
+    """The folder of inputs, with the corrected cloud."""
+    done = run_pcfix(*CORRECT, "corrected.laz", "--quiet", folder=inputs)
     assert done.returncode == 0, done.stderr
-    return folder
+    return inputs
 
 
 CAMERAS = ("--cameras", "cameras.csv", "--water", "0.37", "--method", "snell")
@@ -63,7 +56,7 @@ COMMANDS = {
             "DISK/k.tif", "--style", "--summary", "DISK/d.json"),
     "compare": (*COMPARE, "--out-dir", "DISK/of", "--plot", "DISK/p.png", "--summary", "DISK/s"),
 }  # fmt: skip
-"""By what does not find its place, sizes of the disk, kB."""
+"""Arguments by name; DISK is the folder that fills up."""
 
 
 def resize(disk, pages):
@@ -100,11 +93,11 @@ def check_whole(path):
             assert path.read_bytes().rstrip(b"\n").endswith(end)
 
 
-def on_a_disk_of(pages, words, disk, inputs):
+def on_a_disk_of(pages, words, disk, survey):
     """Run a command; return what did not find its place, None when all did."""
     resize(disk, pages)
     words = [word.replace("DISK", str(disk)) for word in words]
-    done = run_pcfix(*words, "--quiet", folder=inputs)
+    done = run_pcfix(*words, "--quiet", folder=survey)
     files = [path for path in disk.rglob("*") if path.is_file()]
     assert not [path for path in disk.rglob("*") if path.name.startswith(".")]
     for path in files:
@@ -120,10 +113,10 @@ def on_a_disk_of(pages, words, disk, inputs):
 
 @pytest.mark.parametrize("growth", [1.5, pytest.param(1.07, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("name", mostly_nightly(COMMANDS, "correct"))
-def test_full_at_any_stage(name, growth, disk, inputs):
+def test_full_at_any_stage(name, growth, disk, survey):
     """The disk grows until the command goes through."""
-    before, pages, blamed = state(inputs), 1, []
-    while (file := on_a_disk_of(pages, COMMANDS[name], disk, inputs)) is not None:
+    before, pages, blamed = state(survey), 1, []
+    while (file := on_a_disk_of(pages, COMMANDS[name], disk, survey)) is not None:
         blamed.append(file)
         pages = math.ceil(pages * growth)
         assert pages * PAGE < 4e6
@@ -131,4 +124,4 @@ def test_full_at_any_stage(name, growth, disk, inputs):
     named = {Path(word).name for word in COMMANDS[name] if word.startswith("DISK")}
     assert written >= named - {"of"}
     assert len(blamed) >= 3
-    assert state(inputs) == before
+    assert state(survey) == before

@@ -6,27 +6,14 @@ import subprocess
 import sys
 import time
 
-import laspy
 import pytest
 
 import pcfix
 from pcfix.io.atomic import temporary_output
 from tests.utils.codes import refused
-from tests.utils.shared import SCENE
 
 LONGEST_S = 0.1
 """After its first file a command gets a signal at the latest; it has ended by then, or nearly."""
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("inputs")
-    cloud = laspy.read(SCENE / "cloud.laz")
-    cloud.points = cloud.points[::8].copy()
-    cloud.write(folder / "cloud.laz")
-    for name in ("cameras.csv", "sensor.csv"):
-        (folder / name).write_bytes((SCENE / name).read_bytes())
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -202,14 +202,8 @@ def markers(folder: Path) -> Path:
     return metashape.write(folder, metashape.chunk(cameras=named, rest=rest))
 
 
-def list_scene() -> tuple[Any, Any]:
-    xyz = np.random.default_rng(5).uniform([0, -25, -1], [280, 25, 1], (40, 3)).astype("f4")
-    away = np.abs(xyz[:, :1] - views_cameras().centres[:, 0])
-    return xyz, [np.flatnonzero(row < 0.4 * 99).tolist() for row in away]
-
-
 def vis(folder: Path) -> Path:
-    xyz, lists = list_scene()
+    xyz, lists = views.points_in_sight(40)
     views.write_model(folder / "sparse", [(i + 1, name) for i, name in enumerate(views.NAMES)])
     views.write_ply(folder / "fused.ply", xyz)
     return views.write_vis(folder / "fused.ply.vis", lists)
@@ -217,7 +211,7 @@ def vis(folder: Path) -> Path:
 
 def openmvs(order: str, weights: bool = True) -> Seed:
     def write(folder: Path) -> Path:
-        xyz, lists = list_scene()
+        xyz, lists = views.points_in_sight(40)
         shares = [[0.5] * len(one) for one in lists]
         return views.write_ply(folder / "dense.ply", xyz, lists, shares if weights else None, order)
 

@@ -1,19 +1,16 @@
 """Tide tables, the times of images, the water level of each, and recorded flying heights."""
 
-import math
 import warnings
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 
-from pcfix.io.tides import Times, level_offsets, read_image_times, read_tide
+from pcfix.io.tides import level_offsets, read_image_times, read_tide
 from tests.utils.codes import refused
 from tests.utils.shared import needs
 
-pytestmark = pytest.mark.quick_but("test_any_gauge_zero", "test_exif")
+pytestmark = pytest.mark.quick_but("test_exif")
 
 CAMERAS, real = needs("cameras")
 
@@ -64,20 +61,6 @@ def test_offsets(tmp_path, text, times, level, codes):
         offset = level_offsets(tide, heights, found, labels)
     assert offset == pytest.approx(np.array(level) - np.mean(level), abs=1e-9)
     assert [note.message.code for note in notes] == codes
-
-
-@given(shift=st.floats(-5, 5), share=st.lists(st.floats(0, 1), min_size=2, max_size=9))
-def test_any_gauge_zero(shift, share):
-    at, labels = np.linspace(0.0, 44_712.0, 60), [str(i) for i in range(len(share))]
-    level = np.sin(at / 44_712.0 * 2.0 * math.pi)
-    times = Times(np.array(share) * at[-1], True, "images")
-    tide = Times(at, True, "tide")
-    one = level_offsets(tide, level, times, labels)
-    other = level_offsets(tide, level + shift, times, labels)
-    assert one == pytest.approx(other, abs=1e-12)
-    # of a sine over steps of 12.6 min the chord is at most (2 pi / 59)^2 / 8 = 1.4 mm off
-    true = np.sin(times.time_s / 44_712.0 * 2.0 * math.pi)
-    assert one == pytest.approx(true - true.mean(), abs=0.003)
 
 
 def test_table_that_does_not_fit(tmp_path):

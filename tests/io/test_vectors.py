@@ -63,19 +63,11 @@ def test_formats(tmp_path, suffix):
     assert found.name == str(path)
 
 
-@pytest.mark.parametrize(
-    ("lines", "crs"),
-    [
-        (("x,y,z", "725448,4369128,2.25", "725460,4369140,2.31"), None),
-        (("Id;Easting;Northing;Height", "a;725448;4369128;2.25", "b;725460;4369140;2.31"), None),
-        (("x [m]\ty [m]\tz [m]", "725448\t4369128\t2.25", "725460\t4369140\t2.31"), None),
-        (("# crs: EPSG:25830", "x y z", "725448 4369128 2.25", "725460 4369140 2.31"), UTM30),
-    ],
-)  # fmt: skip
-def test_text(tmp_path, lines, crs):
+def test_text(tmp_path):
+    lines = "# crs: EPSG:25830", "x y z", "725448 4369128 2.25", "725460 4369140 2.31"
     found = read_vectors(write_text(tmp_path / "shore.csv", *lines))
     assert found.coordinates == pytest.approx(SHORE)
-    assert found.crs == crs
+    assert found.crs == UTM30
 
 
 def test_features_without_coordinates(tmp_path):
@@ -197,14 +189,6 @@ def test_heights_need_a_grid(tmp_path):
     polygon = shapely.Polygon([(0, 39, 1), (1, 39, 1), (1, 40, 1)])
     mask = write(tmp_path / "b.gpkg", [polygon], crs="EPSG:4979", kind="Polygon Z")
     read_water_polygons(mask, "EPSG:25831+5782")  # a mask has no heights
-
-
-def test_feet(tmp_path):
-    found = read_vectors(
-        write_text(tmp_path / "a.csv", "x,y,z", "1000000,500000,10"), crs="EPSG:2992"
-    )
-    moved = in_cloud_crs(found, "EPSG:26910", heights=True)
-    assert moved.coordinates[0, 2] == pytest.approx(3.048)
 
 
 def test_shoreline(tmp_path, monkeypatch):

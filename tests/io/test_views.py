@@ -33,10 +33,14 @@ def cameras():
 
 
 @pytest.fixture
-def scene(cameras):
-    """Return 400 points and, for each, the cameras that see it."""
-    xyz = np.random.default_rng(5).uniform([0, -25, -1], [280, 25, 1], (400, 3)).astype("f4")
-    away = np.abs(xyz[:, :1] - cameras.centres[:, 0])
+def scene():
+    return points_in_sight(400)
+
+
+def points_in_sight(count):
+    """Return points and, for each, the cameras that see it."""
+    xyz = np.random.default_rng(5).uniform([0, -25, -1], [280, 25, 1], (count, 3)).astype("f4")
+    away = np.abs(xyz[:, :1] - 40.0 * np.arange(K))
     return xyz.astype(float), [np.flatnonzero(row < 0.4 * 99).tolist() for row in away]
 
 
@@ -116,15 +120,13 @@ def write_model(folder, images):
 # --- real lists ----------------------------------------------------------------------------
 
 
-def cloud(folder):
-    las = laspy.read(folder / "cloud.las")
-    return np.column_stack([las.x, las.y, las.z])
-
-
 @rendered
 def test_real_vis_and_ply():
     """Both kinds of list hold the same; the PLY has every third row and a local frame."""
-    cameras, xyz = pcfix.read_cameras(RENDERED / "cameras.csv"), cloud(RENDERED)
+    cameras, xyz = (
+        pcfix.read_cameras(RENDERED / "cameras.csv"),
+        laspy.read(RENDERED / "cloud.las").xyz,
+    )
     vis = match_of(RENDERED / "dense.vis", cameras, len(xyz))
     expected, weights, report = given(vis, xyz, 100_000)
     assert (report.by_row, report.unmatched, report.share_seen) == (250_000, 0, 1.0)
@@ -186,21 +188,11 @@ def test_vis_with_positions(tmp_path, cameras, scene, name):
     write_vis(tmp_path / "fused.ply.vis", lists)
     write_ply(tmp_path / "fused.ply", xyz)
     some = np.random.default_rng(1).permutation(400)[:250]
-    match = match_of(tmp_path / name, cameras)
-    found, _, report = given(match, xyz[some])
+    match = ViewMatch(read_views(tmp_path / name, cameras), cameras, step_m=0.01)
+    found, _, report = given(match, xyz[some].round(2))
     assert found == [lists[i] for i in some]
     assert report.by_position + report.by_row == 250
     assert report.by_position > 240 and report.unmatched == 0
-
-
-def test_thinned_shuffled_and_rounded(tmp_path, cameras, scene):
-    xyz, lists = scene
-    path = write_ply(tmp_path / "d.ply", xyz, lists)
-    some = np.random.default_rng(2).permutation(400)[:300]
-    match = ViewMatch(read_views(path, cameras), cameras, step_m=0.01)
-    found, _, report = given(match, xyz[some].round(2))
-    assert found == [lists[i] for i in some]
-    assert report.unmatched == 0
 
 
 def test_tolerance(tmp_path, cameras, scene):

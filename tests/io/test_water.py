@@ -109,33 +109,31 @@ def write(path, heights, transform=None, crs=UTM33, nodata=np.nan, bands=1, **mo
     return path
 
 
-def cells(transform, rows=150, columns=200):
-    column, row = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
-    x = transform.a * column + transform.b * row + transform.c
-    return x, transform.d * column + transform.e * row + transform.f
+def sloping():
+    """Return the heights of cells of 2 m."""
+    column, row = np.meshgrid(np.arange(200) + 0.5, np.arange(150) + 0.5)
+    return tilted(LEFT + 2.0 * column, TOP - 2.0 * row)
 
 
-def places(n=500, inside=20.0):
-    rng = np.random.default_rng(2)
-    x = rng.uniform(LEFT + inside, LEFT + 400 - inside, n)
-    return np.column_stack([x, rng.uniform(TOP - 300 + inside, TOP - inside, n), np.zeros(n)])
+PLACES = np.random.default_rng(2).uniform(
+    [LEFT + 20.0, TOP - 280.0, 0.0], [LEFT + 380.0, TOP - 20.0, 0.0], (500, 3)
+)
 
 
-def expect_plane(water, at=None):
-    at = places() if at is None else at
+def expect_plane(water, at=PLACES):
     surface = surface_above(water, at)
     assert surface.height_m == pytest.approx(tilted(*at[:, :2].T), abs=1e-6)
     assert surface.slope == pytest.approx(np.tile([0.003, -0.002], (len(at), 1)), abs=1e-5)
 
 
 def test_north_up(tmp_path):
-    heights = tilted(*cells(from_origin(LEFT, TOP, 2.0, 2.0)))
+    heights = sloping()
     heights[3:5, 7] = np.nan
     water = pcfix.read_water(write(tmp_path / "water.tif", heights), UTM33)
     assert np.array_equal(water.height_m, heights, equal_nan=True)
     assert (water.left_m, water.top_m, water.cell_m) == (LEFT, TOP, (2.0, 2.0))
     assert str(water) == "raster water.tif, 200 x 150 cells of 2 m"
-    expect_plane(water, places()[np.isfinite(surface_above(water, places()).height_m)])
+    expect_plane(water, PLACES[np.isfinite(surface_above(water, PLACES).height_m)])
 
 
 def test_other_places(tmp_path):
@@ -148,7 +146,7 @@ def test_other_places(tmp_path):
 
 
 def test_nodata(tmp_path):
-    heights = tilted(*cells(from_origin(LEFT, TOP, 2.0, 2.0))).astype(np.float32)
+    heights = sloping().astype(np.float32)
     heights[0, 0] = -9999.0
     stated = pcfix.read_water(write(tmp_path / "a.tif", heights, nodata=-9999.0), UTM33)
     with warned("water.raster_nodata", count=1):
@@ -161,7 +159,7 @@ def test_nodata(tmp_path):
 
 
 def test_units(tmp_path):
-    heights = tilted(*cells(from_origin(LEFT, TOP, 2.0, 2.0)))
+    heights = sloping()
     expect_plane(pcfix.read_water(write(tmp_path / "w.tif", heights, unit="m"), UTM33))
     for more, cloud in (
         ({"unit": "ft"}, UTM33),
@@ -242,27 +240,19 @@ def scene(tmp_path_factory):
     return folder, simulated
 
 
-def corrected(scene, output, water, **more):
+def corrected(scene, output, water):
     folder, _ = scene
-    return pcfix.correct_file(
-        folder / "cloud.laz", output, cameras=folder / "cameras.csv", water=water, **more
-    )
-
-
-def level_raster(path, simulated, cover, level=None):
-    """Write the level of a scene over part of its length, west of the rest."""
-    west, south = simulated.true_xyz[:, :2].min(axis=0) - 20.0
-    east, north = simulated.true_xyz[:, :2].max(axis=0) + 20.0
-    heights = np.full(
-        (int(north - south), int((east - west) * cover)), level or simulated.water_level_m
-    )
-    return write(path, heights, from_origin(west, north, 1.0, 1.0), f"EPSG:{simulated.epsg}")
+    pcfix.correct_file(folder / "cloud.laz", output, cameras=folder / "cameras.csv", water=water)
 
 
 def test_raster_of_a_level(scene, tmp_path):
-    path = level_raster(tmp_path / "water.tif", scene[1], 1.0)
+    simulated, path = scene[1], tmp_path / "water.tif"
+    west, south = simulated.true_xyz[:, :2].min(axis=0) - 20.0
+    east, north = simulated.true_xyz[:, :2].max(axis=0) + 20.0
+    heights = np.full((int(north - south), int(east - west)), simulated.water_level_m)
+    write(path, heights, from_origin(west, north, 1.0, 1.0), f"EPSG:{simulated.epsg}")
     corrected(scene, tmp_path / "a.las", path)
-    corrected(scene, tmp_path / "b.las", scene[1].water_level_m)
+    corrected(scene, tmp_path / "b.las", simulated.water_level_m)
     one, other = laspy.read(tmp_path / "a.las"), laspy.read(tmp_path / "b.las")
     assert np.array_equal(one.classification, other.classification)
     for axis in "XYZ":  # a step of the file, where the last bit decides the rounding
