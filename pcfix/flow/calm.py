@@ -17,9 +17,8 @@ from pcfix.flow.inputs import Inputs
 from pcfix.flow.photos import check_kind, finished, photo_of, read_heights
 from pcfix.flow.runner import Progress, check_summary
 from pcfix.grid.lattice import Lattice
-from pcfix.io.atomic import temporary_output
 from pcfix.io.crs import parse_crs
-from pcfix.io.files import scratch_arrays
+from pcfix.io.files import scratch_arrays, temporary_output
 from pcfix.io.photographs import Frames, check_calm, read_frames, write_photograph, write_spread
 from pcfix.io.rasters import new_raster, write_bands
 from pcfix.model import FloatArray, Lens, WaterRaster

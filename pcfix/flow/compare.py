@@ -13,9 +13,8 @@ from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.compare.match import Match, SurveyCloud, match
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
-from pcfix.io.atomic import all_or_none
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
-from pcfix.io.files import check_output, scratch_arrays, write_text
+from pcfix.io.files import all_or_none, check_output, scratch_arrays, write_text
 from pcfix.io.tiles import Clouds, band_of, cloud_of, inputs_of
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions

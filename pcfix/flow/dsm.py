@@ -24,9 +24,8 @@ from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.heights import fill_holes, grid_window, margin_cells
 from pcfix.grid.lattice import Lattice, lattice_over, round_resolution
 from pcfix.io import rasters
-from pcfix.io.atomic import all_or_none
 from pcfix.io.crs import crs_words, parts
-from pcfix.io.files import check_output, scratch_arrays, write_text
+from pcfix.io.files import all_or_none, check_output, scratch_arrays, write_text
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
 from pcfix.io.las.writing import is_ours
 from pcfix.io.rasters import METRE, TO_95

@@ -15,8 +15,8 @@ from pcfix.flow.photos import PhotoBlock, block_of, check_kind, finished
 from pcfix.flow.runner import Progress, check_summary
 from pcfix.grid.lattice import Lattice, lattice_over
 from pcfix.io import rasters
-from pcfix.io.atomic import scratch_folder
 from pcfix.io.clouds import is_cloud
+from pcfix.io.files import scratch_folder
 from pcfix.io.photographs import photographs_in, read_colours
 from pcfix.model import WaterPlane
 from pcfix.options.declare import File, taken

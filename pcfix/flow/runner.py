@@ -32,8 +32,7 @@ from pcfix import version
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.raster import raster_outputs, raster_writer
 from pcfix.io import files
-from pcfix.io.atomic import all_or_none
-from pcfix.io.files import write_bytes, write_text
+from pcfix.io.files import all_or_none, write_bytes, write_text
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix, corrected_identity, las_writer
 from pcfix.io.rasters import check_tif
@@ -121,7 +120,7 @@ class FileTask:
     def save(self, tally: Any) -> None:
         """Write the statistics; an older output must not be taken for the one that follows."""
         self.target.unlink(missing_ok=True)
-        files.write_tally(self.record, self.key, tally)
+        write_bytes(self.record, pickle.dumps((self.key, tally)), overwrite=True)
 
 
 def run_command(

@@ -242,7 +242,7 @@ Notes = tuple[PcfixWarning, ...]
 
 SILENT_ACCURACY_M = 1.0
 """A transformation that is worse than this gets a note."""
-_AREA_MARGIN_DEG = 0.01
+_AREA_MARGIN_DEG = np.array([-0.01, -0.01, 0.01, 0.01])  # west, south, east, north
 
 
 class HeightsError(InputError):
@@ -273,12 +273,9 @@ def transformation(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a missing grid is named in the error or note
             to_degrees = Transformer.from_crs(parts(source)[0], "EPSG:4326", always_xy=True)
-            degrees = np.column_stack(to_degrees.transform(at[:, 0], at[:, 1]))
-            west, south = degrees.min(axis=0) - _AREA_MARGIN_DEG
-            east, north = degrees.max(axis=0) + _AREA_MARGIN_DEG
-            # no area if the points are too far out or cross the antimeridian
-            known = np.isfinite(degrees).all() and east - west <= 180.0 + 2 * _AREA_MARGIN_DEG
-            area = AreaOfInterest(west, south, east, north) if known else None
+            corners = *at[:, :2].min(axis=0), *at[:, :2].max(axis=0)
+            degrees = np.array(to_degrees.transform_bounds(*corners)) + _AREA_MARGIN_DEG
+            area = AreaOfInterest(*degrees) if np.isfinite(degrees).all() else None
             group = TransformerGroup(source, target, always_xy=True, area_of_interest=area)
     except (ProjError, IndexError) as error:  # the latter if PROJ finds no operation at all
         sentence = f"PROJ cannot transform {source.name} to {target.name}. Give another CRS."

@@ -1,10 +1,13 @@
-"""Rules for every file that pcfix writes, and files that one command leaves for another.
+"""Rules for every file that pcfix reads or writes, and files that one command leaves for another.
 
-A file is written completely or not at all, and replaces another only if the user asks for it.
+A file replaces another only if the user asks for it, and is written completely or not at all: under
+a hidden name next to its target, flushed to the disk, and renamed. What a killed process leaves is
+that hidden file; the next command that writes the same target removes it.
 """
 
 from __future__ import annotations
 
+import errno
 import glob
 import hashlib
 import io
@@ -13,12 +16,15 @@ import mmap
 import os
 import pickle
 import re
+import secrets
+import shutil
 import stat
 import subprocess
 import weakref
 import zipfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import fields
 from importlib.resources import files
 from pathlib import Path
@@ -29,16 +35,12 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import InputError, PcfixError, SettingError, bad_file, refusal
-from pcfix.io.atomic import temporary_output
 from pcfix.options.declare import File
 from pcfix.running import Empty, running
 from pcfix.sums import Sums
 
 if TYPE_CHECKING:
     from pcfix.adjust.precision import Members
-
-LAST_LINES = 3
-"""Lines of the messages of another program that are shown when it fails."""
 
 
 def path_of(path: Any) -> Path:
@@ -53,9 +55,8 @@ def check_input(path: File) -> Path:
     """Return the path of a file; one that cannot be read is an `InputError`."""
     found = path_of(path)
     try:
-        why = kind_of(found.stat().st_mode)
-        if why:
-            raise bad_file(found, "input.unreadable", f"is {why}; give a file.")
+        if not stat.S_ISREG(found.stat().st_mode):
+            raise bad_file(found, "input.unreadable", "is a folder, pipe or device; give a file.")
         with found.open("rb") as stream:
             head = stream.read(64).lstrip().lower()
     except OSError as error:
@@ -72,12 +73,6 @@ _NOT_THE_FILE = {
     b"<html": "is a web page, not the file. Download it again.",
 }
 """First bytes of what people have in place of a file."""
-
-
-def kind_of(mode: int) -> str:
-    """Return what something is that is no file; nothing of a file."""
-    kinds = {stat.S_IFREG: "", stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe"}
-    return kinds.get(stat.S_IFMT(mode), "a device or a socket")
 
 
 def is_same(one: File, other: File) -> bool:
@@ -135,7 +130,7 @@ def check_output(
         if is_same(target, source):
             raise refused("is_input", f"is also the input {source}. Give the output another name.")
     try:
-        kind = kind_of(target.stat().st_mode)
+        is_file = stat.S_ISREG(target.stat().st_mode)
     except (FileNotFoundError, NotADirectoryError):
         if not target.parent.is_dir():
             sentence = f"the folder {target.parent} does not exist. Create it first."
@@ -143,11 +138,151 @@ def check_output(
         return target
     except OSError as error:
         raise refused("cannot_write", f"{refusal(error)}.") from error
-    if kind:
-        raise refused("not_a_file", f"the output is {kind}. Give a file name.")
+    if not is_file:
+        raise refused("not_a_file", "the output is a folder, pipe or device. Give a file name.")
     if not overwrite:
         raise refused("exists", "the output exists. Add --overwrite to replace it.")
     return target
+
+
+# Outputs that appear when they are complete
+
+LEAST_FREE_BYTES = 65_536
+"""With less free space than this, a library that fails without a reason found the disk full."""
+
+_group: ContextVar[tuple[ExitStack, dict[Path, Path]] | None] = ContextVar("_group", default=None)
+"""What `all_or_none` tidies up, and the temporary file of each target."""
+
+
+@contextmanager
+def temporary_path(target: Path) -> Iterator[Path]:
+    """Give a hidden path next to a target; whatever is there when the block ends is removed."""
+    folder, name = target.absolute().parent, target.name
+    for path in folder.glob(f".{glob.escape(name)}.{8 * '[0-9a-f]'}.part*"):
+        _remove(path)  # a killed process left it
+    path = folder / f".{name}.{secrets.token_hex(4)}.part{target.suffix}"
+    try:
+        yield path
+    finally:
+        _remove(path)
+
+
+@contextmanager
+def temporary_output(target: Path, *, is_folder: bool = False) -> Iterator[Path]:
+    """Give a path to write to, and rename what is there to the target when the block ends well.
+
+    The new file has the permissions of the one that it replaces. Within `all_or_none` it is renamed
+    when that block ends. A folder is made, and replaces the one that is there.
+    """
+    group = _group.get()
+    with ExitStack() as own:
+        path = (group[0] if group else own).enter_context(temporary_path(target))
+        with _write_errors(target, path):
+            if is_folder:
+                path.mkdir()
+            yield path
+            if target.is_file():
+                path.chmod(stat.S_IMODE(target.stat().st_mode))
+            for one in (path, *path.rglob("*")):
+                _flush(one)
+        if group:
+            group[1][target] = path
+        else:
+            _rename(path, target)
+
+
+@contextmanager
+def all_or_none(folder: Path | None = None) -> Iterator[None]:
+    """Let the files that are written in the block appear when it ends well, or none of them.
+
+    A folder is made for them, and removed again if it is new and the block fails.
+    """
+    complete: dict[Path, Path] = {}
+    with ExitStack() as stack:
+        if folder is not None and not folder.exists():
+            with _write_errors(folder, folder):
+                folder.mkdir(parents=True)
+            stack.callback(_remove_empty, folder)
+        token = _group.set((stack, complete))
+        try:
+            yield
+        finally:
+            _group.reset(token)
+        for target, path in complete.items():
+            _rename(path, target)
+
+
+@contextmanager
+def scratch_folder(target: Path) -> Iterator[Path]:
+    """Give a folder next to a target for intermediate files; it is removed when the block ends."""
+    with temporary_path(target.with_name(f"{target.name}.scratch")) as path:
+        with _write_errors(target, path):
+            path.mkdir()
+        yield path
+
+
+def cannot_write(target: Path, error: Exception, written: Path | None = None) -> InputError:
+    """Return the error for a file that cannot be written; `written` is its temporary path."""
+    if is_full_disk(target.absolute().parent, error):
+        sentence = "no space left on the disk. Free some space, or write to another disk."
+        return bad_file(target, "output.disk_full", sentence)
+    reason = getattr(error, "strerror", None) or str(error).strip().rstrip(".")
+    reason = reason.replace(str(written), target.name)
+    return bad_file(target, "output.cannot_write", f"cannot be written ({reason}).")
+
+
+def is_full_disk(folder: Path, error: Exception) -> bool:
+    """Whether something failed because the disk is full, which libraries may not say."""
+    if isinstance(error, OSError) and error.errno is not None:
+        return error.errno in (errno.ENOSPC, errno.EDQUOT)
+    if any(words in str(error) for words in ("No space left", "disk is full")):
+        return True
+    with suppress(OSError):
+        return shutil.disk_usage(folder).free < LEAST_FREE_BYTES
+    return False
+
+
+@contextmanager
+def _write_errors(target: Path, path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise cannot_write(target, error, path) from error
+
+
+def _rename(path: Path, target: Path) -> None:
+    with _write_errors(target, path), ExitStack() as stack:
+        if path.is_dir() and target.exists():  # a folder that is not empty cannot be replaced
+            aside = target.with_name(f"{target.name}.old")
+            target.rename(stack.enter_context(temporary_path(aside)))
+        path.replace(target)
+    _flush(target.parent)
+
+
+def _flush(path: Path) -> None:
+    """Let what was written reach the disk, where the file system can say so."""
+    with suppress(OSError):
+        opened = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
+
+
+def _remove_empty(folder: Path) -> None:
+    with suppress(OSError):  # it holds the files of the block, or of somebody else
+        folder.rmdir()
+
+
+# Contents of files
 
 
 def sha256(path: Path) -> str:
@@ -156,13 +291,8 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def write_tally(path: Path, key: str, tally: Any) -> None:
-    """Write the statistics of a file under a key, completely or not at all."""
-    write_bytes(path, pickle.dumps((key, tally)), overwrite=True)
-
-
 def read_tally(path: Path) -> tuple[str, Any]:
-    """Return the key and the statistics of `write_tally`; an empty key if there are none."""
+    """Return the pickled key and statistics of a file; an empty key if there are none."""
     try:
         with path.open("rb") as stream:
             key, tally = _Statistics(stream).load()
@@ -176,13 +306,11 @@ class _Statistics(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         found = super().find_class(module, name) if module.startswith(("pcfix.", "numpy")) else None
+        of_arrays = ("_reconstruct", "_frombuffer", "ndarray", "dtype", "scalar")
         is_sums = isinstance(found, type) and issubclass(found, Sums)
-        if is_sums or (module.startswith("numpy") and name in _OF_ARRAYS):
+        if is_sums or (module.startswith("numpy") and name in of_arrays):
             return found
         raise pickle.UnpicklingError(f"{module}.{name}")
-
-
-_OF_ARRAYS = ("_reconstruct", "_frombuffer", "ndarray", "dtype", "scalar")
 
 
 def file_state(path: Path) -> dict[str, Any]:
@@ -233,7 +361,7 @@ def write_text(path: File, text: str, *, overwrite: bool) -> None:
 
 
 def run_logged(words: list[str], log: Path) -> tuple[int, list[str]]:
-    """Run a program without a shell, and return its exit code and the last lines that it wrote.
+    """Run a program without a shell, and return its exit code and the last 3 lines that it wrote.
 
     All that it writes goes to a file. An `InputError` if it cannot be started.
     """
@@ -244,7 +372,7 @@ def run_logged(words: list[str], log: Path) -> tuple[int, list[str]]:
         sentence = f"{words[0]}: cannot be run ({error.strerror or error})."
         raise InputError("photos.command", sentence, command=words[0]) from error
     lines = log.read_text("utf-8", errors="replace").splitlines()
-    return done.returncode, [line.strip() for line in lines if line.strip()][-LAST_LINES:]
+    return done.returncode, [line.strip() for line in lines if line.strip()][-3:]
 
 
 @contextmanager

@@ -320,11 +320,7 @@ def _positive(sigma: float) -> str:
 
 # GNSS positions
 
-SIGMAS = {
-    "sigma_x": ("sx", "sxy", "sxyz", "sigma"),
-    "sigma_y": ("sy", "sxy", "sxyz", "sigma"),
-    "sigma_z": ("sz", "sxyz", "sigma"),
-}
+SIGMAS = {role: SPELLINGS[role] for role in ("sigma_x", "sigma_y", "sigma_z")}
 """Further names of columns with standard deviations, unambiguous in a list of positions."""
 _WITHOUT_NAMES = {".mrk": "a list of DJI's exposure times", ".pos": "a solution of RTKLIB"}
 

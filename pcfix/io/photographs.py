@@ -18,8 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import SettingError, bad_file
-from pcfix.io.atomic import temporary_output
-from pcfix.io.files import check_output, refusing
+from pcfix.io.files import check_output, refusing, temporary_output
 from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray
 from pcfix.options.declare import File

@@ -16,8 +16,14 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError, bad_file
 from pcfix.grid.lattice import Lattice, Window
-from pcfix.io.atomic import is_full_disk, temporary_output, temporary_path
-from pcfix.io.files import check_input, check_output, refusing
+from pcfix.io.files import (
+    check_input,
+    check_output,
+    is_full_disk,
+    refusing,
+    temporary_output,
+    temporary_path,
+)
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 

@@ -15,9 +15,8 @@ import shapely
 
 from pcfix.errors import bad_file, warn
 from pcfix.io import tables
-from pcfix.io.atomic import cannot_write, temporary_output
 from pcfix.io.crs import parse_crs, plan_unit, to_cloud_crs
-from pcfix.io.files import check_input, check_output
+from pcfix.io.files import cannot_write, check_input, check_output, temporary_output
 from pcfix.libraries import optional_library
 from pcfix.model import FloatArray
 from pcfix.options.declare import File

@@ -9,7 +9,7 @@ import time
 import pytest
 
 import pcfix
-from pcfix.io.atomic import temporary_output
+from pcfix.io.files import temporary_output
 from tests.utils.codes import refused
 
 LONGEST_S = 0.1

@@ -8,11 +8,8 @@ from PIL import Image
 
 from pcfix.io.tides import level_offsets, read_image_times, read_tide
 from tests.utils.codes import refused
-from tests.utils.shared import needs
 
 pytestmark = pytest.mark.quick_but("test_exif")
-
-CAMERAS, real = needs("cameras")
 
 TIDE = """time,level_m
 2026-05-01T10:00:00Z,1.00

@@ -24,8 +24,7 @@ from laspy.vlrs.vlr import VLR
 from pyproj import CRS
 
 from pcfix.errors import SettingError, bad_file
-from pcfix.io.atomic import cannot_write, temporary_output
-from pcfix.io.files import parse_json, refusing
+from pcfix.io.files import cannot_write, parse_json, refusing, temporary_output
 from pcfix.io.las.columns import UPGRADE, Column, column_scale
 from pcfix.io.las.source import (
     IDENTITY_PLACE,
