@@ -19,7 +19,7 @@ from pcfix.flow.runner import Progress, check_summary
 from pcfix.grid.lattice import Lattice
 from pcfix.io.crs import parse_crs
 from pcfix.io.files import scratch_arrays, temporary_output
-from pcfix.io.photographs import Frames, check_calm, read_frames, write_photograph, write_spread
+from pcfix.io.photographs import Burst, check_calm, read_frames, write_photograph, write_spread
 from pcfix.io.rasters import new_raster, write_bands
 from pcfix.model import FloatArray, Lens, WaterRaster
 from pcfix.options.declare import File, taken
@@ -135,7 +135,7 @@ def calm_frames(
     )
 
 
-def _registered(frames: Frames, images: Iterable[Any]) -> tuple[FloatArray, FloatArray]:
+def _registered(frames: Burst, images: Iterable[Any]) -> tuple[FloatArray, FloatArray]:
     """Register all frames to the first as `register`, or refuse them."""
     homographies, scatter = register(np.stack(list(corners_in(images))))
     lost = np.flatnonzero(~np.isfinite(homographies).all(axis=(1, 2)))
@@ -150,7 +150,7 @@ def _registered(frames: Frames, images: Iterable[Any]) -> tuple[FloatArray, Floa
 
 
 def _median(
-    frames: Frames, homographies: FloatArray, empty: Callable[..., Any], images: Iterable[Any]
+    frames: Burst, homographies: FloatArray, empty: Callable[..., Any], images: Iterable[Any]
 ) -> tuple[npt.NDArray[Any], FloatArray, Any]:
     """Return the median, its spread, and the registered frames, which are on disk."""
     stack: Any = None
@@ -172,7 +172,7 @@ def _median(
     return median, spread, stack
 
 
-def _view(given: CalmOptions, frames: Frames) -> tuple[View, str | None]:
+def _view(given: CalmOptions, frames: Burst) -> tuple[View, str | None]:
     """Return camera, water and bed as given, and the CRS."""
     bed, crs = _bed(given)
     index, level = index_of(given.index, given.index_formula)[0], given.level

@@ -134,6 +134,7 @@ def read_cloud(
             else:
                 above = np.full(len(points.xyz), np.nan)
             bathymetric = subset(used, points.classes) == BATHYMETRIC_POINT
+            # rows of the large arrays, which are made for all points when the first are known
             parts = [subset(used, points.xyz), subset(used, above), bathymetric]
             if known.keys() >= set(SHIFTS):
                 parts.append(np.column_stack([known[name] for name in SHIFTS])[used])
@@ -147,6 +148,7 @@ def read_cloud(
         skipped = ", ".join(map(str, skip_classes))
         sentence = f"every point is withheld or in a class that is skipped ({skipped})."
         raise bad_file(path, "cloud.nothing_left", sentence)
+    # the plane in the record is exact only if no dimension has the water above each point
     exact = water is not None or not mapped(np.isfinite, water_m).any()
     return SurveyCloud(
         str(path),

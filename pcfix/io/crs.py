@@ -237,7 +237,8 @@ class Topocentric:
         return np.column_stack(step.transform(x, y, z, direction=direction))
 
 
-Points = Callable[[FloatArray], FloatArray]
+Move = Callable[[FloatArray], FloatArray]
+"""Takes points, shape (n, 3), from one CRS to another."""
 Notes = tuple[PcfixWarning, ...]
 
 SILENT_ACCURACY_M = 1.0
@@ -251,7 +252,7 @@ class HeightsError(InputError):
 
 def transformation(
     source: CRS, target: CRS, at: FloatArray, name: str, *, heights: bool, instead: str = ""
-) -> tuple[Points, Notes]:
+) -> tuple[Move, Notes]:
     """Return PROJ's best transformation that is not a ballpark where that matters, and notes.
 
     With `heights` it transforms these too; else it is one in plan, and heights only change their
@@ -342,7 +343,7 @@ def is_same_numbers(source: CRS, target: CRS, *, heights: bool = True) -> bool:
 
 def to_cloud_crs(
     crs: str | CRS | None, cloud_crs: str | CRS | None, at: FloatArray, name: str, *, heights: bool
-) -> Points | None:
+) -> Move | None:
     """Return the transformation from a file's CRS to the cloud's, None for none; warn of guesses.
 
     A CRS that is None is not stated; that of the file is ``local`` to use its numbers unchanged.

@@ -105,6 +105,7 @@ def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None)
     sigma = table.where_there(roles_of_sigma)
     is_check = np.array([role in CHECK for role in roles])
     under_water = np.array([word in YES for word in wet])
+    # what all marks of a point must state alike
     described = np.column_stack([xyz, sigma[:, :3], is_check, under_water])
     row_of: dict[str, int] = {}
     for row, name in enumerate(names):

@@ -118,11 +118,12 @@ def _write_jpeg(source: Path, path: Path, pixels: Pixels, touched: BoolArray) ->
     for name, factor in zip(("Y", "Cb", "Cr"), stored.samp_factor, strict=False):
         blocks = getattr(stored, name)
         if blocks is not None:
-            side = 8 * most // factor
+            side = 8 * most // factor  # pixels of a block, more if the component is subsampled
             high, wide = blocks.shape[0] * side[0], blocks.shape[1] * side[1]
             grid = np.zeros((high, wide), bool)  # the last blocks may reach beyond the image
             part = touched[:high, :wide]
             grid[: part.shape[0], : part.shape[1]] = part
+            # rows and columns of blocks, with their pixels: any changed one changes its block
             changed = grid.reshape(-1, side[0], blocks.shape[1], side[1]).any(axis=(1, 3))
             blocks[changed] = getattr(new, name)[changed]
     stored.write_dct(str(path))
@@ -157,8 +158,8 @@ _COPIED_TAGS = {270, 271, 272, 274, 282, 283, 296, 305, 306, 315, 700, 33432, 33
 
 
 @dataclass(frozen=True)
-class Frames:
-    """The photographs of a sequence in a folder, all of one size."""
+class Burst:
+    """A burst: the photographs of a sequence in a folder, all of one size."""
 
     path: Path
     photographs: tuple[Path, ...]
@@ -175,7 +176,7 @@ class Frames:
         return map(read_photograph, self.photographs)
 
 
-def read_frames(path: File, every: int = 1) -> Frames:
+def read_frames(path: File, every: int = 1) -> Burst:
     """Return the frames of a folder, one in `every`; none is decoded yet."""
     place = Path(path)
     paths = tuple(photographs_in(place)[::every])
@@ -187,10 +188,10 @@ def read_frames(path: File, every: int = 1) -> Frames:
     if len(paths) < LEAST_FRAMES:
         sentence = f"gives {len(paths)} frames, of {LEAST_FRAMES} at least. Give more, or lower"
         raise bad_file(place, "frames.too_few", f"{sentence} --every.", frames=len(paths))
-    return Frames(place, paths, *sizes[0])
+    return Burst(place, paths, *sizes[0])
 
 
-def check_calm(path: File, frames: Frames, *, overwrite: bool) -> tuple[Path, Path]:
+def check_calm(path: File, frames: Burst, *, overwrite: bool) -> tuple[Path, Path]:
     """Return the paths of the median and of its spread; refuse names that cannot be used."""
     first = frames.photographs[0]
     how: dict[str, Any] = {"overwrite": overwrite, "inputs": frames.photographs}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -72,22 +71,18 @@ def colmap_vis(views: Views) -> bytes:
 
 def _sensor_csv(scene: Scene) -> bytes:
     lens = None if scene.cameras.lenses is None else scene.cameras.lenses[0]
-    if lens is None or not lens.radial:
-        return _csv(["focal", "sensor_x", "sensor_y"], [map(str, scene.sensor_mm)])
-    p1, p2 = lens.tangential
-    values = {"focal_px": lens.focal, "width_px": lens.width, "height_px": lens.height}
-    values |= dict(zip(("k1", "k2", "k3"), lens.radial, strict=True))
-    values |= {"p1": p2, "p2": p1}  # OpenCV counts them the other way round
-    return _csv(values, [map(repr, values.values())])
+    values = dict(zip(("focal", "sensor_x", "sensor_y"), scene.sensor_mm, strict=True))
+    if lens is not None and lens.radial:
+        values = {"focal_px": lens.focal, "width_px": lens.width, "height_px": lens.height}
+        values |= dict(zip(("k1", "k2", "k3"), lens.radial, strict=True))
+        p1, p2 = lens.tangential
+        values |= {"p1": p2, "p2": p1}  # OpenCV counts them the other way round
+    return f"{','.join(values)}\n{','.join(map(repr, values.values()))}\n".encode()
 
 
 def _cameras_csv(cameras: Cameras, yaw_pitch_roll_deg: FloatArray) -> bytes:
-    rows = zip(cameras.labels, cameras.centres, yaw_pitch_roll_deg, strict=True)
-    return _csv(
-        ["label", "x", "y", "z", "yaw", "pitch", "roll"],
-        ([one, *(f"{v:.4f}" for v in xyz), *(f"{v:.6f}" for v in turn)] for one, xyz, turn in rows),
-    )
-
-
-def _csv(head: Iterable[str], rows: Iterable[Iterable[str]]) -> bytes:
-    return "".join(",".join(row) + "\n" for row in (head, *rows)).encode()
+    text = "label,x,y,z,yaw,pitch,roll\n"
+    for label, xyz, turn in zip(cameras.labels, cameras.centres, yaw_pitch_roll_deg, strict=True):
+        numbers = [*(f"{v:.4f}" for v in xyz), *(f"{v:.6f}" for v in turn)]
+        text += ",".join([label, *numbers]) + "\n"
+    return text.encode()

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -175,30 +175,24 @@ def decoded(data: bytes) -> str:
         return data.removeprefix(codecs.BOM_UTF8).decode("latin-1")
 
 
-class Header(NamedTuple):
-    """The line that names the columns, from 0: their names without units, lower case."""
+def find_header(
+    lines: Sequence[str], spellings: Spellings
+) -> tuple[int, list[str], list[str], bool]:
+    """Return the line from 0 that names the columns, their names and units, and if it is a comment.
 
-    line: int
-    names: list[str]
-    units: list[str]
-    is_comment: bool
-
-
-def find_header(lines: Sequence[str], spellings: Spellings) -> Header | None:
-    """Return the header: the last comment above the rows that names two columns, or the first line.
-
-    None where a text has no line that is not a comment, and no such comment.
+    It is the last comment above the rows that names two columns, or the first line that is no
+    comment. The names are lower case, without units; there are none in a text without lines.
     """
     plain = {spelling for names in spellings.values() for spelling in names}
-    found = None
+    found = 0, list[str](), list[str](), False
     for i, line in enumerate(lines):
         is_comment = line.lstrip("\"' ").startswith("#")
         text = line.strip().lstrip("#").strip() if is_comment else line.strip()
         if text and not CRS_COMMENT.match(line):
             fields = text.split(_delimiter(text))
             names, units = zip(*(_split_unit(one, plain) for one in fields), strict=True)
-            if len(places(names, spellings)) >= 2 or not (is_comment or found):
-                found = Header(i, [*names], [*units], is_comment)
+            if len(places(names, spellings)) >= 2 or not (is_comment or found[1]):
+                found = i, [*names], [*units], is_comment
             if not is_comment:
                 break
     return found
@@ -248,7 +242,7 @@ def read_table(path: Path, *needed: Sequence[str], spellings: Spellings | None =
     """
     spellings = spellings or {role: (role,) for role in needed[0]}
     lines = read_lines(path)
-    at, header, units, is_comment = find_header(lines, spellings) or Header(0, [], [], False)
+    at, header, units, is_comment = find_header(lines, spellings)
     place = places(header, spellings)
     if header and not np.isnan([number(_with_point(name)) for name in header[:4]]).any():
         sentence = "line 1 has numbers only. Add a line above it that names the columns, such as"

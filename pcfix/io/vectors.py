@@ -306,6 +306,7 @@ def write_layers(
         warnings.simplefilter("ignore")  # a cloud may have no CRS
         try:
             for number, one in enumerate(layers):
+                # with None, which is removed again, the array is one of objects, even if empty
                 geometry = shapely.to_wkb(np.array([*one.geometries, None], object)[:-1])
                 write(
                     temporary, geometry, [np.asarray(v) for v in one.values.values()],

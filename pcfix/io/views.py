@@ -36,7 +36,7 @@ from scipy.spatial import cKDTree
 
 from pcfix.errors import InputError, PcfixWarning, bad_file
 from pcfix.io.cameras.colmap import read_images
-from pcfix.io.crs import Points
+from pcfix.io.crs import Move
 from pcfix.io.files import check_input
 from pcfix.io.ply import Column, Element, positions, read_columns, read_header
 from pcfix.io.tables import match_labels
@@ -98,7 +98,7 @@ class ViewList:
         return float(np.median(distance[:, 1]))
 
 
-def read_views(path: File, cameras: Cameras, *, to_cloud: Points | None = None) -> ViewList:
+def read_views(path: File, cameras: Cameras, *, to_cloud: Move | None = None) -> ViewList:
     """Read the view list of a dense cloud.
 
     Parameters
@@ -123,7 +123,7 @@ def read_views(path: File, cameras: Cameras, *, to_cloud: Points | None = None) 
 
 
 def track_views(
-    path: Path, tie_points: TiePoints, cameras: Cameras, *, to_cloud: Points | None = None
+    path: Path, tie_points: TiePoints, cameras: Cameras, *, to_cloud: Move | None = None
 ) -> ViewList:
     """Make a view list of the tracks of a sparse model that was read from `path`.
 
@@ -146,7 +146,7 @@ def track_views(
     return _placed(views, cameras, to_cloud)
 
 
-def _placed(views: ViewList, cameras: Cameras, to_cloud: Points | None) -> ViewList:
+def _placed(views: ViewList, cameras: Cameras, to_cloud: Move | None) -> ViewList:
     """Return a list with positions in the cloud's frame, whose cameras see its points."""
     if views.xyz is None:
         return views

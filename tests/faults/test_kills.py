@@ -19,20 +19,14 @@ LONGEST_S = 0.1
 @pytest.fixture(scope="module")
 def commands(inputs):
     """Arguments but for the output folder, and the files that are written there."""
-    cameras = ["--cameras", f"{inputs}/cameras.csv", "--sensor", f"{inputs}/sensor.csv"]
-    more = ["--water", "0.37", "--overwrite", "--jobs", "1", "--quiet"]
-    corrected = ["correct", f"{inputs}/cloud.laz", "OUT/corrected.laz", *cameras, *more]
-    return {
-        "correct": ([*corrected, "--method", "snell"], ["corrected.laz"]),
-        "correct with summary": (
-            [*corrected[:2], "OUT/other.las", *corrected[3:], "--summary", "OUT/other.json"],
-            ["other.las", "other.json"],
-        ),
-        "label": (
-            ["label", f"{inputs}/cloud.laz", "OUT/labelled.laz", *more, "--summary", "OUT/l.json"],
-            ["labelled.laz", "l.json"],
-        ),
+    cloud, cameras = f"{inputs}/cloud.laz", f"--cameras {inputs}/cameras.csv"
+    more = "--water 0.37 --overwrite --jobs 1 --quiet"
+    words = {
+        f"correct {cloud} OUT/a.laz {cameras} {more} --method snell": ["a.laz"],
+        f"correct {cloud} OUT/b.las {cameras} {more} --summary OUT/b.json": ["b.las", "b.json"],
+        f"label {cloud} OUT/c.laz {more} --summary OUT/c.json": ["c.laz", "c.json"],
     }
+    return [(line.split(), files) for line, files in words.items()]
 
 
 def start(arguments, out):
@@ -46,7 +40,7 @@ def start(arguments, out):
 def whole(commands, tmp_path_factory):
     """What the commands leave when nothing happens, by the name of the file."""
     out = tmp_path_factory.mktemp("whole")
-    for arguments, _ in commands.values():
+    for arguments, _ in commands:
         _, printed = (process := start(arguments, out)).communicate()
         assert process.returncode == 0, printed
     return {path.name: path.read_bytes() for path in out.iterdir()}
@@ -83,12 +77,11 @@ def test_kills(seed, inputs, commands, whole, tmp_path):
     random_moment = random.Random(seed)
     before, ended, hidden = state(inputs), [], set()
     for number in range(12):
-        name = random_moment.choice(list(commands))
-        arguments, files = commands[name]
+        arguments, files = random_moment.choice(commands)
         signal_sent = random_moment.choice([signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
         delay_s = LONGEST_S * random_moment.uniform(0.0, 1.0) ** 2
         code, printed = killed(arguments, tmp_path, signal_sent, delay_s)
-        case = f"kill {number}: {name}, {signal_sent.name} after {delay_s:.3f} s, code {code}"
+        case = f"kill {number}: {files[0]}, {signal_sent.name} after {delay_s:.3f} s, code {code}"
         ended.append(code)
         assert code in (0, -signal_sent, 128 + signal_sent), f"{case}: {printed}"
         earlier, hidden = hidden, hidden_in(tmp_path)
@@ -105,10 +98,10 @@ def test_kills(seed, inputs, commands, whole, tmp_path):
 
 
 def test_leftover_goes_with_the_next_run(commands, tmp_path):
-    arguments, files = commands["correct"]
+    arguments, files = commands[0]
     while killed(arguments, tmp_path, signal.SIGKILL, 0.0)[0] != -signal.SIGKILL:
         pass
-    assert [path.name.startswith(".corrected.laz.") for path in tmp_path.iterdir()] == [True]
+    assert [path.name.startswith(".a.laz.") for path in tmp_path.iterdir()] == [True]
     assert start(arguments, tmp_path).wait() == 0
     assert [path.name for path in tmp_path.iterdir()] == files
 

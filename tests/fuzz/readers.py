@@ -29,6 +29,7 @@ from pcfix.io.views import ViewMatch, read_views
 from pcfix.model import Cameras, Lens
 from tests.flow.test_pose_errors import members_of
 from tests.io import test_ground_control as control
+from tests.io import test_vectors as vectors
 from tests.io import test_views as views
 from tests.io import test_water as water
 from tests.io.cameras import test_blocksexchange as blocksexchange
@@ -285,13 +286,7 @@ RING = [[500000, 5200000, 1], [500050, 5200000, 1], [500050, 5200050, 1.5], [500
 SHAPE = {
     "type": "FeatureCollection",
     "crs": {"type": "name", "properties": {"name": "EPSG:32632"}},
-    "features": [
-        {
-            "type": "Feature",
-            "properties": {},
-            "geometry": {"type": "Polygon", "coordinates": [RING]},
-        }
-    ],
+    "features": [vectors.feature({"type": "Polygon", "coordinates": [RING]})],
 }
 ODM_MARKS = (
     "EPSG:32636\n500010 4000010 2.5 100 200 a.jpg G1\n500030 4000020 -1.75 0.5 1199 b.jpg G2\n"

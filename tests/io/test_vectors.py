@@ -28,9 +28,12 @@ def write(path, geometries, *, crs=UTM30, kind="Unknown", layer=None):
     return path
 
 
+def feature(geometry):
+    return {"type": "Feature", "properties": {}, "geometry": geometry}
+
+
 def write_geojson(path, *geometries, crs=None):
-    features = [{"type": "Feature", "properties": {}, "geometry": one} for one in geometries]
-    content = {"type": "FeatureCollection", "features": features}
+    content = {"type": "FeatureCollection", "features": [*map(feature, geometries)]}
     if crs:
         content["crs"] = {"type": "name", "properties": {"name": crs}}
     path.write_text(json.dumps(content))

@@ -96,7 +96,7 @@ class Georeference:
     crs: str | None  # of the result, as in `Cameras.crs`
     notes: tuple[PcfixWarning, ...] = ()
     frame: Frame | None = None  # of the file; None if the numbers do not change
-    forward: systems.Points = lambda xyz: xyz
+    forward: systems.Move = lambda xyz: xyz
 
     def cameras(self, cameras: Cameras) -> Cameras:
         """Return the cameras in the target; `gnss` stays in its own CRS."""

@@ -97,8 +97,8 @@ def recognises(source: Source) -> bool:
 
 def has_header(lines: list[str]) -> bool:
     """Whether a line names at least two of the columns that every table of cameras has."""
-    found = tables.find_header(lines, SPELLINGS)
-    return found is not None and len(POSITION & tables.places(found.names, SPELLINGS).keys()) >= 2
+    names = tables.find_header(lines, SPELLINGS)[1]
+    return len(POSITION & tables.places(names, SPELLINGS).keys()) >= 2
 
 
 def read(source: Source) -> Cameras:
