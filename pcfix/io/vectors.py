@@ -267,8 +267,6 @@ def read_water_polygons(path: File, cloud_crs: str | CRS | None = None) -> Vecto
     return replace(vectors, geometries=np.array([area]))
 
 
-OLDER = {"VERSION": "1.2"}
-"""Of GeoPackage: GDAL before 3.7 warns of newer ones."""
 STYLES = "layer_styles"
 """The table in which QGIS looks for styles, and keeps its own."""
 
@@ -312,7 +310,6 @@ def write_layers(
                     temporary, geometry, [np.asarray(v) for v in one.values.values()],
                     list(one.values), layer=one.name, crs=wkt, driver="GPKG",
                     geometry_type=one.kind, append=number > 0,
-                    **({} if number else {"dataset_options": OLDER}),
                 )  # fmt: skip
             if styled:
                 write(

@@ -6,6 +6,7 @@ import laspy
 import pytest
 
 import pcfix
+from tests.fuzz.mutations import put
 
 # Places in the header (LAS 1.4 R15, table 3).
 VERSION, POINTS_START, SCALE_X, OFFSET_X, EVLRS, COUNT = 24, 96, 131, 155, 235, 247
@@ -23,12 +24,6 @@ def chunks_of(data):
     (start,) = struct.unpack_from("<I", data, POINTS_START)
     (table,) = struct.unpack_from("<q", data, start)
     return start, table, data.find(b"laszip encoded") - 2 + 54 + 12
-
-
-def put(data, place, layout, *values):
-    changed = bytearray(data)
-    struct.pack_into(layout, changed, place, *values)
-    return bytes(changed)
 
 
 def of_chunks(name, layout, value):

@@ -24,6 +24,13 @@ WORD = re.compile(rb"[A-Za-z_][\w.:-]*")
 PIECE = re.compile(rb"<[^<>]*>|\"[^\"]*\"\s*:?|[\[{][^\[\]{}]*[\]}]")
 
 
+def put(data: bytes, place: int, layout: str, *values: float) -> bytes:
+    """Put numbers in a place."""
+    changed = bytearray(data)
+    struct.pack_into(layout, changed, place, *values)
+    return bytes(changed)
+
+
 def bytes_changed(data: bytes, random: Random) -> bytes:
     """Change, cut, repeat or overwrite some bytes."""
     start = random.randrange(len(data) + 1)

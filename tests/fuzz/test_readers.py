@@ -6,7 +6,7 @@ import struct
 import pytest
 
 from tests.fuzz.judge import Bench
-from tests.fuzz.mutations import mutated
+from tests.fuzz.mutations import mutated, put
 from tests.fuzz.readers import READERS
 
 SEEDS = [1, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in range(2, 12))]
@@ -31,17 +31,6 @@ def test_mutations(bench, seed):
         bench.read(part, mutated(part.data, chance))
 
 
-def put(place, layout, *values):
-    """Return what puts numbers in a place."""
-
-    def damage(data):
-        changed = bytearray(data)
-        struct.pack_into(layout, changed, place, *values)
-        return bytes(changed)
-
-    return damage
-
-
 def instead(old, new):
     """Return what puts something else where `old` is."""
 
@@ -54,8 +43,7 @@ def instead(old, new):
 
 def extra_dimension(data):
     """A dimension of no type that takes no bytes."""
-    place = data.index(b"Quality") - 4
-    return put(place, "<2xBB", 0, 0)(data)
+    return put(data, data.index(b"Quality") - 4, "<2xBB", 0, 0)
 
 
 PLACE = struct.pack("<2d", 5e5, 5.2e6)
@@ -63,8 +51,9 @@ PLACE = struct.pack("<2d", 5e5, 5.2e6)
 
 # Faults that fuzzing found: reader, seed, file (and entry of an archive), and the damage.
 FOUND = {
-    "points behind the end": ("las", "1.4", "cloud.las", put(96, "<I", 2**31)),
-    "records of many bytes": ("las", "1.2", "cloud.las", put(105, "<HI", 60_000, 2**31)),
+    "points behind the end": ("las", "1.4", "cloud.las", lambda data: put(data, 96, "<I", 2**31)),
+    "records of many bytes": ("las", "1.2", "cloud.las",
+        lambda data: put(data, 105, "<HI", 60_000, 2**31)),
     "dimension of no bytes": ("las", "1.4", "cloud.las", extra_dimension),
     "infinite place": ("metashape", "chunk", "cameras.xml",
         instead(b"<scale>10", b"<scale>9e307")),
