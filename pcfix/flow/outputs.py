@@ -141,9 +141,9 @@ def _write_shaded(folder: Path) -> None:
         with rasters.new_raster(target, lattice, plan, bands, dtype="uint8", nodata=None) as out:
             for window in lattice.window.parts(BLOCK_CELLS):
                 wide = window.grown(edge)
-                height = rasters.read_within(surface, wide)
-                moved = Window(*np.add(wide, (down, down, right, right)).tolist())
-                deep = rasters.read_within(depth, moved)
+                height = rasters.read_masked(surface, window=rasters.slices(wide), boundless=True)
+                moved = rasters.slices(Window(*np.add(wide, (down, down, right, right)).tolist()))
+                deep = rasters.read_masked(depth, window=moved, boundless=True)
                 level = minimum_filter(np.nan_to_num(height + deep, nan=np.inf), 2 * edge + 1)
                 is_wet = np.isnan(deep) & (height < level) & np.isfinite(level)
                 deep = np.where(is_wet, level - height, deep)[edge:-edge, edge:-edge]

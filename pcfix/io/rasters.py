@@ -71,11 +71,6 @@ def place_of(transform: Affine, column: Any, row: Any) -> tuple[Any, Any]:
     return t.a * column + t.b * row + t.c, t.d * column + t.e * row + t.f
 
 
-def read_within(source: DatasetReader, window: Window) -> FloatArray:
-    """Return part of the first band, shape (rows, columns), NaN for no value and beyond it."""
-    return read_masked(source, window=slices(window), boundless=True)
-
-
 def lattice_of(source: DatasetReader) -> Lattice:
     """Return the cells of a raster that pcfix wrote."""
     size, t = source.res[0], source.transform

@@ -294,9 +294,10 @@ def match_labels(
     ambiguous : tuple of str
         Names that could be several labels, or share one with another name.
     """
+    keys: tuple[Callable[[str], str], ...] = str, _file_name, _stem
     row = np.full(len(names), -1, np.int64)
     unclear: set[int] = set()
-    for key in KEYS:
+    for key in keys:
         here, there = _rows_by(key, names), _rows_by(key, labels)
         for word, rows in here.items():
             found = there.get(word, [])
@@ -329,13 +330,10 @@ def _stem(name: str) -> str:
     return PurePosixPath(_file_name(name)).stem.lower()
 
 
-KEYS: tuple[Callable[[str], str], ...] = (str, _file_name, _stem)
-
-
 POINT_SPELLINGS = {
     "x": ("x", "easting", "east"),
     "y": ("y", "northing", "north"),
-    "z": ("z", "height", "elevation", "elev", "altitude", "h", "alt", "level"),
+    "z": ("z", "height", "elevation", "elev", "altitude", "h", "alt"),
     "longitude": ("longitude", "lon", "long"),
     "latitude": ("latitude", "lat"),
     "depth": ("depth", "true_depth", "water_depth", "measured_depth"),

@@ -160,7 +160,9 @@ def _read_points(path: Path) -> tuple[Geometries, str | None]:
     WGS 84.
     """
     kinds = ("x", "y"), ("longitude", "latitude")
-    table = tables.read_table(path, *kinds, spellings=tables.POINT_SPELLINGS)
+    names = tables.POINT_SPELLINGS  # of a shoreline, a level is its height
+    names = names | {"z": (*names["z"], "level")}
+    table = tables.read_table(path, *kinds, spellings=names)
     in_map = table.has("x", "y")
     axes = kinds[0 if in_map else 1]
     # degrees of x and y are those of the CRS
