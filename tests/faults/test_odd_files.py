@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 
 from pcfix.errors import InputError
 from pcfix.io.files import check_input, check_output
@@ -35,7 +36,6 @@ def odd(tmp_path_factory):
 @pytest.fixture(scope="module")
 def raster(odd):
     """A raster of heights over the cloud, and its bytes."""
-    rasterio = pytest.importorskip("rasterio")
     place = rasterio.transform.from_origin(455_950.0, 5_432_150.0, 1.0, 1.0)
     how = {"driver": "GTiff", "width": 200, "height": 200, "count": 1, "dtype": "float32"}
     with rasterio.open(odd / "whole.tif", "w", transform=place, **how) as target:

@@ -65,8 +65,9 @@ def test_gnss_without_images(tmp_path, name):
         read_gnss(tmp_path / name, block())
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "latin-1"])
-@pytest.mark.parametrize("comment", ["", "# "])
+@pytest.mark.parametrize(
+    ("encoding", "comment"), [("utf-8", "# "), ("utf-16", ""), ("latin-1", "")]
+)
 def test_decimal_commas(tmp_path, encoding, comment):
     rows = f"{comment}Easting;Northing;Höhe;Depth\n500001,5;4600002,25;-1,5;1,5\n"
     (tmp_path / "a.csv").write_text(rows, encoding)

@@ -1,4 +1,4 @@
-"""Tide tables, the times of images, the water level of each, and recorded flying heights."""
+"""Tide tables, the times of images, and the water level of each."""
 
 import warnings
 

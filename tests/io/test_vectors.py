@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+import shapely
 from pyproj import Transformer
 
 from pcfix.io import vectors
@@ -15,7 +16,6 @@ from tests.utils.codes import refused, warned
 
 pytestmark = pytest.mark.quick_but("test_crs_that_do_not_fit", "test_heights_need_a_grid")
 
-shapely = pytest.importorskip("shapely")
 raw = pytest.importorskip("pyogrio.raw")
 
 UTM30 = "EPSG:25830"
