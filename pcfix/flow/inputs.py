@@ -24,9 +24,9 @@ from pcfix.io.cameras.georeference import Georeference, georeference
 from pcfix.io.tables import match_labels
 from pcfix.io.tides import level_offsets, read_image_times, read_tide
 from pcfix.io.vectors import LAYER_MARK, read_water_polygons
-from pcfix.io.views import ViewList, read_views, track_views
+from pcfix.io.views import ViewList, ViewMatch, read_views, track_views
 from pcfix.label.labelling import Labelling, WaterMask
-from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints
+from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints, Views
 from pcfix.options.declare import File, OptionSet, options_of
 from pcfix.options.shared import InputOptions, LandRules, MaskOption
 from pcfix.port.shapes import port_of
@@ -146,25 +146,31 @@ class Inputs(MaskOption, InputOptions):
 
 
 class CameraInputs(NamedTuple):
-    """The cameras of a correction, in the cloud's CRS."""
+    """The k cameras of a correction, in the cloud's CRS, and what refers to them."""
 
     cameras: Cameras  # for the correction; `NO_CAMERAS` if there are none
-    views: ViewList | None  # of the cloud
-    listed: Cameras  # the original cameras, to which the row numbers of the view list refer
-    transfer: CloudTransfer | None  # from the original to the adjusted cameras
+    views: Views | None = None  # the view list, with rows of the original cameras
+    match: ViewMatch | None = None  # gives the view list of a file to the points of the cloud
+    transfer: CloudTransfer | None = None  # from the original to the adjusted cameras
+    level_offset_m: FloatArray | None = None  # (k,), how much higher the water stood per image
 
 
-def read_blocks(inputs: Inputs, cloud_crs: str | CRS | None) -> CameraInputs:
+def read_blocks(inputs: Inputs, view: CloudView) -> CameraInputs:
     """Return cameras in the cloud's CRS and the view list, matched with the original cameras."""
     if not inputs.cameras:
-        return CameraInputs(NO_CAMERAS, None, NO_CAMERAS, None)
+        return CameraInputs(NO_CAMERAS)
     if inputs.adjusted_from is None:
-        cameras, views = inputs.block(cloud_crs)
-        return CameraInputs(cameras, views, cameras, None)
-    original, adjusted = both_models(inputs)
-    cameras, _ = adjusted.block(cloud_crs)
-    listed, views = original.block(cloud_crs)
-    return CameraInputs(cameras, views, listed, transfer_between(listed, cameras))
+        cameras, listed = inputs.block(view.crs)
+        original, transfer = cameras, None
+    else:
+        of_original, of_adjusted = both_models(inputs)
+        cameras, _ = of_adjusted.block(view.crs)
+        original, listed = of_original.block(view.crs)
+        transfer = _transfer_between(original, cameras)
+    if listed is None:
+        return CameraInputs(cameras, transfer=transfer)
+    match = ViewMatch(listed, original, points=view.points, step_m=view.step_m)
+    return CameraInputs(cameras, listed.listed, match, transfer)
 
 
 def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:
@@ -233,7 +239,7 @@ def original_ties(
     return replace(ties, views=views, image_xy=ties.image_xy[entry])
 
 
-def transfer_between(original: Cameras, adjusted: Cameras) -> CloudTransfer:
+def _transfer_between(original: Cameras, adjusted: Cameras) -> CloudTransfer:
     """Match the images of two models in the cloud's CRS by their names."""
     for cameras, which in ((original, "adjusted-from"), (adjusted, "cameras")):
         if cameras.rotations is None or cameras.lenses is None:

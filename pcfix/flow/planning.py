@@ -18,10 +18,9 @@ from pcfix.flow.inputs import CameraInputs, Inputs, labelling_of, original_ties,
 from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
 from pcfix.io.las.source import CHUNK_POINTS
 from pcfix.io.tables import read_check_depths
-from pcfix.io.views import ViewMatch
 from pcfix.label.labelling import Labelling, Part
-from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, Views, WaterPlane
-from pcfix.options.correct import CorrectOptions
+from pcfix.model import NOISE_CLASSES, Cameras, WaterPlane
+from pcfix.options.correct import CorrectOptions, ScienceOptions
 from pcfix.options.declare import File
 from pcfix.refract import learning
 from pcfix.refract.batch import Batch, Learned, Survey, require_orientation, stacked
@@ -53,53 +52,46 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
         _check_port(options)
     elif not options.cameras:
         options.check_no_cameras()
-    blocks, match, listed = read_blocks(inputs, view.crs), None, None
-    if blocks.views is not None:
-        match = ViewMatch(blocks.views, blocks.listed, points=view.points, step_m=view.step_m)
-        listed = blocks.views.listed
+    blocks = read_blocks(inputs, view)
     if inputs.port is not None:
-        cameras = blocks.cameras
-        require_orientation(cameras, "A port")
-        survey = Survey(WaterPlane(np.inf), cameras, replace(options, method="consistent"))
-        return Plan(
-            options, inputs, view, survey, FoundSurface(survey.water), labelling_of(options, view),
-            match, None if listed is None else listed.kind, input_notes=cameras.notes,
-        )  # fmt: skip
-    found = inputs.surface(view)
-    if match is None and not isinstance(options.cameras, Cameras):
-        _check_frames(blocks.cameras, options)
-    offset = inputs.level_offset_m(blocks.cameras)
-    plan = plan_of(
-        options, inputs, view, blocks, found, offset, listed, labelling_of(options, view)
-    )
+        require_orientation(blocks.cameras, "A port")
+        found = FoundSurface(WaterPlane(np.inf))  # all points are below it
+    else:
+        found = inputs.surface(view)
+        if blocks.match is None and not isinstance(options.cameras, Cameras):
+            _check_frames(blocks.cameras, options)
+        blocks = blocks._replace(level_offset_m=inputs.level_offset_m(blocks.cameras))
+    plan = plan_of(options, view, blocks, found, labelling_of(options, view))
     check_tilt(found.surface)
     if plan.survey.settings.method == "regression" and inputs.check_depths is None:
         sentence = "Method regression needs check-depths, a CSV of measured depths. Give it."
         raise SettingError("option.together", sentence, options=[])
-    return replace(plan, match=match, input_notes=(*blocks.cameras.notes, *plan.input_notes))
+    return replace(plan, input_notes=(*blocks.cameras.notes, *plan.input_notes))
 
 
 def plan_of(
-    options: CorrectOptions, inputs: Inputs, view: CloudView, blocks: CameraInputs,
-    found: FoundSurface, offset: FloatArray | None, listed: Views | None, labelling: Labelling,
-    line: DepthRegression | None = None,
+    options: CorrectOptions, view: CloudView, blocks: CameraInputs, found: FoundSurface,
+    labelling: Labelling, line: DepthRegression | None = None,
 ) -> Plan:  # fmt: skip
-    """Return the plan of a correction through a water surface, with nothing estimated yet.
+    """Return the plan of a correction with nothing estimated yet.
 
-    `offset`, shape (k,), is how much higher the water stood when each image was taken, `listed` are
-    the view lists, and `line` is that of a regression if it is known.
+    The options have a number as refractive index; `line` is that of a regression if it is known.
     """
-    cameras, kind, some_unlisted = blocks.cameras, None, False
-    if listed is not None:
-        kind, start = listed.kind, listed.start
+    cameras, views, match, transfer, offset = blocks
+    kind, some_unlisted, inputs = None, False, options.part(Inputs)
+    if views is not None:
+        kind, start = views.kind, views.start
         some_unlisted = len(start) <= view.points or not bool((np.diff(start) > 0).all())
-    check_above_water(cameras, found.surface, offset)
-    folder = options.water_per_image
-    settings = learning.resolved(options, cameras, kind, own_water=folder is not None)
-    own = own_water_of(folder, cameras, found.surface, view, offset)
+    if inputs.port is not None:
+        settings: ScienceOptions = replace(options, method="consistent")
+    else:
+        check_above_water(cameras, found.surface, offset)
+        is_own = options.water_per_image is not None
+        settings = learning.resolved(options, cameras, kind, own_water=is_own)
+    own = own_water_of(options.water_per_image, cameras, found.surface, view, offset)
     survey = Survey(found.surface, cameras, settings, offset, Learned(line), own_water=own)
     return Plan(
-        options, inputs, view, survey, found, labelling, None, kind, some_unlisted, blocks.transfer,
+        options, inputs, view, survey, found, labelling, match, kind, some_unlisted, transfer,
         input_notes=tuple(coded("water.surface", found.notes)),
     )  # fmt: skip
 
