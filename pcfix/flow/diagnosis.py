@@ -63,17 +63,20 @@ def diagnose_in_passing(
     The ties are `quick_ties`. Returns for the summary whether the poses absorbed it (None if
     unknown), that as a line, and the signs; and the warning.
     """
-    inputs, cameras = plan.inputs, plan.cameras
+    inputs, cameras, n = plan.inputs, plan.cameras, plan.options.refractive_index
     found: dict[str, Any] = {"absorbed": None, "words": "", "signs": []}
     if not len(cameras):
         return found | {"words": "not applicable: no cameras were given"}, None
     if inputs.adjusted_from is not None:
         words = "adjusted with refraction (--adjusted-from)"
         return found | {"absorbed": False, "words": words}, None
-    seen = [(one.straight, one.is_fused) for one in plan.verdicts if one.straight is not None]
-    name = "cameras" if isinstance(inputs.cameras, Cameras) else str(inputs.cameras)
-    n = plan.options.refractive_index
-    neighbours = neighbours_sign(*seen[-1][0], is_fused=seen[-1][1]) if seen else None
+    name, neighbours = (
+        "cameras" if isinstance(inputs.cameras, Cameras) else str(inputs.cameras),
+        None,
+    )
+    for verdict in plan.verdicts:  # the last one that was found with straight rays too
+        if verdict.straight is not None:
+            neighbours = neighbours_sign(*verdict.straight, is_fused=verdict.is_fused)
     try:
         diagnosis = diagnosed(
             cameras, plan.found.surface, n, ties=ties, gnss=_gnss_of(cameras, name),
@@ -81,26 +84,26 @@ def diagnose_in_passing(
         )  # fmt: skip
     except (PcfixError, OSError) as error:  # this check stops no correction
         return found | {"words": f"not checked for absorbed refraction: {error}"}, None
+    found |= {"absorbed": diagnosis.absorbed, "signs": diagnosis.as_dict()["signs"]}
+    if diagnosis.decided_by is None:
+        words = (
+            "not checked for absorbed refraction: no tie points or GNSS positions of the file show"
+            f" it quickly; {EXPORT}"
+        )
+        return found | {"words": words}, None
+    have = "have" if diagnosis.absorbed else "have not"
+    words = f"{have} absorbed the refraction, as {diagnosis.decided_by.name} show"
+    if not diagnosis.absorbed:
+        return found | {"words": words}, None
     command = adjust_words(
         inputs, plan.view.name, has_datum=has_datum(cameras, name),
         index=None if n == DEFAULT_REFRACTIVE_INDEX else n,
     )  # fmt: skip
-    sentence, decided, warning = diagnosis.sentence(command), diagnosis.decided_by, None
-    if sentence:
-        likely = diagnosis.likely_error_m
-        values = {} if likely is None else {"likely_error_m": likely}
-        warning = PcfixWarning("poses.absorbed", sentence, command=command, **values)
-        warnings.warn(warning, stacklevel=3)
-    words = (
-        "not checked for absorbed refraction: no tie points or GNSS positions of the file show it"
-        f" quickly; {EXPORT}"
-    )
-    if decided is not None:
-        have = "have" if diagnosis.absorbed else "have not"
-        words = f"{have} absorbed the refraction, as {decided.name} show"
-        words += "; see the warning" if sentence else ""
-    signs = diagnosis.as_dict()["signs"]
-    return {"absorbed": diagnosis.absorbed, "words": words, "signs": signs}, warning
+    likely = diagnosis.likely_error_m
+    values = {} if likely is None else {"likely_error_m": likely}
+    warning = PcfixWarning("poses.absorbed", diagnosis.sentence(command), command=command, **values)
+    warnings.warn(warning, stacklevel=3)
+    return found | {"words": f"{words}; see the warning"}, warning
 
 
 def quick_ties(inputs: Inputs, crs: Any) -> TiePoints | None:
