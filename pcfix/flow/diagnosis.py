@@ -12,7 +12,7 @@ import numpy as np
 
 from pcfix.adjust.diagnosis import EXPORT, MOST_STATED_M, Diagnosis, diagnosed, neighbours_sign
 from pcfix.errors import InputError, PcfixError, PcfixWarning
-from pcfix.flow.inputs import Inputs, ties_of
+from pcfix.flow.inputs import Inputs
 from pcfix.flow.surfaces import CloudView
 from pcfix.io.ground_control import gnss_in_frame_of, read_ground_control
 from pcfix.model import Cameras, GnssPositions, TiePoints, WaterSurface
@@ -42,7 +42,7 @@ def diagnose_inputs(
     """Look for signs in a cloud, its cameras with their tie points, and surveys, if given."""
     control = None if gcps is None else read_ground_control(gcps, cameras).surveyed
     return diagnosed(
-        cameras, water, index, ties=ties_of(inputs, view.crs), view=view, control=control,
+        cameras, water, index, ties=inputs.tie_points(view.crs), view=view, control=control,
         gnss=_gnss_of(cameras, str(inputs.cameras)), reference=reference, in_passing=in_passing,
     )  # fmt: skip
 
@@ -107,7 +107,7 @@ def diagnose_in_passing(
 
 
 def quick_ties(inputs: Inputs, crs: Any) -> TiePoints | None:
-    """Return the tie points of `ties_of` if reading them takes no more than a second or two."""
+    """Return the tie points of the camera file if they are read within a second or two."""
     if isinstance(inputs.cameras, Cameras) or inputs.cameras is None:
         return None
     path = Path(inputs.cameras)
@@ -115,7 +115,7 @@ def quick_ties(inputs: Inputs, crs: Any) -> TiePoints | None:
     try:
         files = [one for one in folder.rglob("*") if one.is_file()] if folder.is_dir() else [path]
         is_quick = sum(one.stat().st_size for one in files) <= QUICK_BYTES
-        return ties_of(inputs, crs) if is_quick else None
+        return inputs.tie_points(crs) if is_quick else None
     except (PcfixError, OSError):  # this check stops no correction
         return None
 

@@ -127,7 +127,8 @@ class Inputs(MaskOption, InputOptions):
         """
         if isinstance(self.cameras, Cameras):
             return None
-        read = self.read()
+        with warnings.catch_warnings(action="ignore", category=PcfixWarning):
+            read = self.read()  # again: its warnings were shown
         try:
             ties = read_tie_points(self.cameras, read)
         except NoTiePointsError:
@@ -139,9 +140,8 @@ class Inputs(MaskOption, InputOptions):
         known = np.isfinite(ties.xyz).all(axis=1)
         if placed and not known.any():
             return None
-        placement = self._georeferenced(read, cloud_crs)
         xyz = np.full((len(ties.xyz), 3), np.nan)
-        xyz[known] = placement.points(ties.xyz[known])
+        xyz[known] = self._georeferenced(read, cloud_crs).points(ties.xyz[known])
         return replace(ties, xyz=xyz)
 
 
@@ -231,7 +231,7 @@ def original_ties(
 ) -> TiePoints | None:
     """Return the tie points of the original model, numbered as the cameras of a transfer."""
     if transfer is None:
-        return ties_of(inputs, cloud_crs)
+        return inputs.tie_points(cloud_crs)
     ties = both_models(inputs)[0].tie_points(cloud_crs)
     if ties is None:
         return None
@@ -244,10 +244,8 @@ def _transfer_between(original: Cameras, adjusted: Cameras) -> CloudTransfer:
     for cameras, which in ((original, "adjusted-from"), (adjusted, "cameras")):
         if cameras.rotations is None or cameras.lenses is None:
             missing = "angles" if cameras.rotations is None else "lens"
-            words = (
-                f"--{which}: has no {missing}, without which points have no image. Give the model"
-                " itself, or --sensor."
-            )
+            words = f"--{which}: has no {missing}, without which points have no image. Give the"
+            words += " model itself, or --sensor."
             raise SettingError(f"cameras.no_{missing}", words, option=which)
     return transfer_of(original, adjusted, _rows(original.labels, adjusted.labels))
 
@@ -273,13 +271,6 @@ def _rows(original: tuple[str, ...], adjusted: tuple[str, ...]) -> IntArray:
         )
         raise GeometryError("adjusted_from.no_image", words, image=unknown[0], missing=len(unknown))
     return row
-
-
-def ties_of(inputs: Inputs, crs: Any) -> TiePoints | None:
-    """Return the tie points of the camera file in the cloud's CRS, if it has any."""
-    with warnings.catch_warnings():  # the warnings were shown when the cameras were read
-        warnings.simplefilter("ignore", PcfixWarning)
-        return inputs.tie_points(crs)
 
 
 def mask_of(path: File | None, cloud_crs: str | CRS | None) -> WaterMask | None:

@@ -167,15 +167,13 @@ def test_separate_pools(tmp_path):
     assert every.labelling is None and every.submerged == ((x < 30) | pit).sum()
 
 
-@pytest.mark.parametrize(
-    ("area", "code"),
-    [
-        (shapely.Point(EAST_M, NORTH_M), "mask.no_area"),
-        (shapely.box(10, 20, 30, 40), "mask.no_points"),
-    ],
-)
-def test_masks_refused(path, tmp_path, area, code):
-    bad = write_area(tmp_path / "mask.geojson", area)
-    with refused(code):
-        label_file(path, tmp_path / "out.las", water=WATER_M, water_mask=bad)
+def test_masks_refused(path, tmp_path):
+    elsewhere = {"bounds": (10.0, 20.0, 30.0, 40.0)}
+    for area, code, values in (
+        (shapely.Point(EAST_M, NORTH_M), "mask.no_area", {}),
+        (shapely.box(10, 20, 30, 40), "mask.no_points", elsewhere),
+    ):
+        bad = write_area(tmp_path / "mask.geojson", area)
+        with refused(code, **values):
+            label_file(path, tmp_path / "out.las", water=WATER_M, water_mask=bad)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.las", "mask.geojson"]
