@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -73,8 +73,7 @@ class Inputs(MaskOption, InputOptions):
         """Return the water level at each image minus the mean level, shape (k,)."""
         if self.tide is None:
             return None
-        own = self.cameras if self.adjusted_from is None else self.adjusted_from
-        given = own if self.image_times is None else self.image_times
+        given = self.image_times or self.adjusted_from or self.cameras
         if isinstance(given, Cameras):
             sentence = "tide needs image-times, the time of each image."
             raise SettingError("option.needs", sentence, options=["tide", "image_times"])
@@ -179,32 +178,33 @@ def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:
     The options for CRS and offset apply to the file that states no CRS, or to both if both do. If
     neither does, the offset is applied so that the two files agree best.
     """
-    given = (inputs.views, inputs.cameras, inputs.adjusted_from)
-    listed, path, old = (None if isinstance(one, Cameras) else one for one in given)
-    if listed is not None and path is not None and Path(listed) == Path(path) != Path(old or ""):
+    listed, path, old = (
+        None if one is None or isinstance(one, Cameras) else Path(one)
+        for one in (inputs.views, inputs.cameras, inputs.adjusted_from)
+    )
+    if listed is not None and listed == path != old:
         words = (
             f"--views: the tie points of {path} are adjusted ones, not those of the cloud. Give"
             " the model of --adjusted-from, or the view list of the cloud."
         )
         raise SettingError("views.adjusted", words, path=path)
-    source = inputs.cameras if inputs.adjusted_from is None else inputs.adjusted_from
     both = [
-        replace(inputs, cameras=source, adjusted_from=None),
+        replace(inputs, cameras=inputs.adjusted_from, adjusted_from=None),
         replace(inputs, views=None, adjusted_from=None),
     ]
     tables = [not isinstance(one.cameras, Cameras) and takes_sensor(one.cameras) for one in both]
     if inputs.sensor is not None and any(tables):  # a model contains its lens
-        both = _without(both, tables, sensor=None)
+        both = _for_some(both, tables, "sensor")
     if inputs.cameras_crs is None and inputs.cameras_offset is None:
         return both[0], both[1]
     original, adjusted = read = [one.read() for one in both]
-    tied = [
-        isinstance(given.cameras, Cameras) or cameras.crs not in (None, LOCAL)
-        for given, cameras in zip(both, read, strict=True)
+    is_local = [
+        not isinstance(one.cameras, Cameras) and cameras.crs in (None, LOCAL)
+        for one, cameras in zip(both, read, strict=True)
     ]
-    if any(tied) and not all(tied):
-        both = _without(both, [not one for one in tied], cameras_crs=None, cameras_offset=None)
-    elif inputs.cameras_offset is not None and not any(tied):
+    if any(is_local) and not all(is_local):
+        both = _for_some(both, is_local, "cameras_crs", "cameras_offset")
+    elif inputs.cameras_offset is not None and all(is_local):
         # It is unknown which of the two files is shifted: try the offset on both, and on either.
         difference = adjusted.centres - original.centres[_rows(original.labels, adjusted.labels)]
         offset = np.array(inputs.cameras_offset)
@@ -214,16 +214,14 @@ def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:
             (False, True): difference + offset,
         }
         best = min(moves, key=lambda one: np.median(np.linalg.norm(moves[one], axis=1)))
-        both = _without(both, best, cameras_offset=None)
+        both = _for_some(both, best, "cameras_offset")
     return both[0], both[1]
 
 
-def _without(both: list[Inputs], unchanged: Sequence[bool], **changes: Any) -> list[Inputs]:
-    """Return the inputs, with changes where `unchanged` is false."""
-    return [
-        one if is_unchanged else replace(one, **changes)
-        for one, is_unchanged in zip(both, unchanged, strict=True)
-    ]
+def _for_some(both: list[Inputs], which: Iterable[bool], *names: str) -> list[Inputs]:
+    """Return the inputs, with the options of these names only for some of the two."""
+    nothing: dict[str, Any] = dict.fromkeys(names)
+    return [one if it else replace(one, **nothing) for one, it in zip(both, which, strict=True)]
 
 
 def original_ties(

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
-from itertools import compress
 
 import numpy as np
 
@@ -113,18 +112,14 @@ def _check_frames(cameras: Cameras, options: CorrectOptions) -> None:
 
 def _check_port(options: CorrectOptions) -> None:
     """Refuse values that need a water surface."""
-    excluded = {
-        "camera_set": options.camera_set == "mvs",
-        "occlusion": options.occlusion == "on",
-        "method": options.method not in ("auto", "consistent"),
-    }
-    for name in compress(excluded, excluded.values()):
-        raise SettingError(
-            "port.excludes",
-            f"{name.replace('_', '-')} {getattr(options, name)} has no effect with a port."
-            " Omit it; the method is consistent.",
-            option=name,
-        )
+    for name, allowed in (
+        ("camera_set", ("auto", "all")), ("occlusion", ("auto", "off")),
+        ("method", ("auto", "consistent")),
+    ):  # fmt: skip
+        if (value := getattr(options, name)) not in allowed:
+            sentence = f"{name.replace('_', '-')} {value} has no effect with a port. Omit it; the"
+            sentence += " method is consistent."
+            raise SettingError("port.excludes", sentence, option=name)
 
 
 def plan_correction(plan: Plan) -> Plan:
@@ -190,23 +185,22 @@ def fit_check_depths(path: File, parts: Iterable[Part]) -> DepthRegression:
         )
         if covered.sum() < LEAST_COUNT:
             raise GeometryError("check_depths.no_bed", notes[0], covered=int(covered.sum()))
-    rows = np.flatnonzero(covered)
-    true = np.asarray(checks.value_m[rows])
-    if checks.are_heights:  # they are subtracted from the water above them
-        true = level[rows] - true
-        above = np.flatnonzero(true < 0.0)
-        if len(above):
-            first = int(rows[above[0]])
-            raise GeometryError(
-                "check_depths.above_water",
-                f"{checks.where(first)}: the height {checks.value_m[first]:.2f} m is above the"
-                f" water, {level[first]:.2f} m there ({len(above)} of {len(rows)} are). Give"
-                " heights of the bed in the cloud's vertical datum, or depths in a column depth.",
-                height_m=float(checks.value_m[first]),
-                count=len(above),
-            )
+    # heights are subtracted from the water above them
+    true = level - checks.value_m if checks.are_heights else checks.value_m
+    above = np.flatnonzero(covered & (true < 0.0))
+    if len(above):  # of depths the reader has refused it
+        first = int(above[0])
+        height_m = float(checks.value_m[first])
+        raise GeometryError(
+            "check_depths.above_water",
+            f"{checks.where(first)}: the height {height_m:.2f} m is above the water,"
+            f" {level[first]:.2f} m there ({len(above)} of {int(covered.sum())} are). Give heights"
+            " of the bed in the cloud's vertical datum, or depths in a column depth.",
+            height_m=height_m,
+            count=len(above),
+        )
     try:
-        found = fit_depths(apparent[rows], true)
+        found = fit_depths(apparent[covered], true[covered])
     except GeometryError as error:
         raise GeometryError(error.code, f"{checks.name}: {error}", **error.values) from error
     if found.r2 < LEAST_R2:
@@ -217,8 +211,7 @@ def fit_check_depths(path: File, parts: Iterable[Part]) -> DepthRegression:
             r2=found.r2,
             least=LEAST_R2,
         )
-    notes += found.notes
-    return replace(found, notes=tuple(notes))
+    return replace(found, notes=(*notes, *found.notes))
 
 
 def _with_pose_errors(plan: Plan) -> Plan:
@@ -247,8 +240,9 @@ def _with_type_of_list(plan: Plan, first: Points) -> Plan:
     """Return the plan with the type of its view list, as the first points show it."""
     points = transferred(plan, first, 0)[0]
     batch = replace(batch_of(points, plan.survey, plan.original), views=points.views)
-    is_open = plan.inputs.views_are == "auto" and plan.kind == "depth-maps"
-    is_open = is_open and plan.match is not None
+    # a file of view lists does not state what its images are
+    is_open = plan.match is not None and plan.inputs.views_are == "auto"
+    is_open = is_open and plan.kind == "depth-maps"
     verdict = learning.weigh_lists(learning.submerged_of(batch), is_open=is_open)
     if verdict is None:
         return plan
@@ -309,9 +303,7 @@ def _scanned(
     if not sample and builder is None:
         return None, None, None
     # the bed of depth maps needs about 5 points per square metre, wherever the cloud is denser
-    area_m2 = np.prod(np.maximum(np.subtract(view.high, view.low)[:2], 1.0))
-    dense = BED_POINTS_A_M2 * float(area_m2)
-    dense = dense if np.isfinite(dense) else MOST_BED_POINTS  # unknown bounds
+    dense = BED_POINTS_A_M2 * float(np.prod(np.fmax(view.high - view.low, 1.0)))
     step = max(1, view.points // int(np.clip(dense, FEWEST_BED_POINTS, MOST_BED_POINTS)))
     near_step = max(1, view.points // int(max(dense, FEWEST_BED_POINTS)))
     squares = None
@@ -324,10 +316,9 @@ def _scanned(
         squares = Squares(PATCH_WIDTH * (float(np.median(above)) if len(above) else HEIGHT_M))
 
     def every(step: int, row: int, points: Points) -> Batch:
+        """Return each point of a chunk whose row in the cloud is a multiple of the step."""
         some = points._replace(views=None).take(slice(-row % step, None, step))
-        noise = np.isin(some.classes, NOISE_CLASSES)
-        if noise.any():
-            some = some.take(np.flatnonzero(~noise))
+        some = some.take(np.flatnonzero(~np.isin(some.classes, NOISE_CLASSES)))
         return batch_of(some, survey, plan.original)
 
     taken, row = list[Batch](), 0

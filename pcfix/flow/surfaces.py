@@ -108,7 +108,7 @@ def sample_of(
     if lists:
         start = np.cumsum(np.concatenate([[0], *(np.diff(one.start) for one in lists)]))
         views = Views(start, np.concatenate([one.camera for one in lists]), kind=lists[0].kind)
-    return Points(*joined, views=views)
+    return Points(*joined)._replace(views=views)
 
 
 def parts_of(chunks: Iterable[Points], water: WaterSurface) -> Iterable[Part]:
