@@ -188,7 +188,7 @@ def fit_check_depths(path: File, parts: Iterable[Part]) -> DepthRegression:
     # heights are subtracted from the water above them
     true = level - checks.value_m if checks.are_heights else checks.value_m
     above = np.flatnonzero(covered & (true < 0.0))
-    if len(above):  # of depths the reader has refused it
+    if len(above):  # heights only: the reader has refused negative depths
         first = int(above[0])
         height_m = float(checks.value_m[first])
         raise GeometryError(

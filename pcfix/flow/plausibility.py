@@ -31,15 +31,17 @@ SAMPLE_POINTS, IN_FRAMES = 30_000, 4_000
 MOST_UNSEEN = 0.01
 """Share of a cloud that may lie in fewer than two frames: noise, and the borders of lenses."""
 MOST_RESIDUAL, MOST_HEIGHT = 0.01, 0.02
-"""Of tie points in the images (of the frame), and from the cloud (of the flying height)."""
+"""Largest residual of tie points, as a share of the frame's width, and their largest distance from
+the heights of the cloud, as a share of the flying height; medians."""
 LEAST_TIES, TIES = 10, 3_000
 """The fewest tie points that are compared, in an image or with the cloud, and the most."""
 LEAST_STEPS, STEADY, MOST_TURN_DEG = 10, 0.9, 45.0
 """Steps along flight lines, the consistency of their angle to the images, and its maximum."""
 STEEP_COSINE = 0.9
-"""Of the tilt of images whose top has a clear direction in plan, about 25 degrees."""
+"""Cosine of the largest tilt, about 25 degrees, at which the upper edge of an image has a clear
+direction in plan."""
 MOST_OFF_M = 15.0
-"""In plan, or in height, from positions of the GNSS, in the median; these are often 5 m off."""
+"""Largest median distance from GNSS positions, in plan or in height; these are often 5 m off."""
 TAKE_OFF_M, MOST_SHARE = (-15.0, 25.0), 0.1
 """How high above the water drones take off, and the share of their height that barometers err."""
 

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from pcfix.adjust.precision import Members
 
 SAMPLE_POINTS, BED_POINTS = 20_000, 1000
-"""Of the cloud, and of its points under water; a thousand is enough, as the errors are smooth."""
+"""Points that are sampled from the cloud, and points under water that are corrected with each
+member; a thousand is enough, as the errors are smooth."""
 
 
 def members_of(path: File | Cameras, cameras: Cameras) -> tuple[Members | None, str]:

@@ -34,7 +34,7 @@ from pcfix.running import current
 OUTPUTS = ("height", "depth", "shift", "uncertainty", "outcome", "class")
 """A labelling has the last, a correction the others."""
 BANDS = {"shift": SHIFTS, "uncertainty": ("uncertainty", "SigmaZ")}
-"""Of outputs with several; the band of the others has their name."""
+"""The bands of outputs that have several; the band of the others has their name."""
 NO_CODE = 255
 """Value of cells without a height in outcome and class, which have whole numbers."""
 WINDOW_CELLS = 512

@@ -71,8 +71,8 @@ class LabelCounts(Sums):
     """Counts of points by their new classes, and of those that the rules exclude."""
 
     points: int = 0
-    submerged: int = 0  # of class 40 now because they are submerged
-    stale: int = 0  # of class 40 in the input although they are not submerged
+    submerged: int = 0  # they have class 40 now
+    stale: int = 0  # class 40 in the input, although they are not submerged
     water_unknown: int = 0  # without a known height of the water
     # depth of the point that is nearest to the water surface, negative above it, metres
     least_m: float = field(default=np.inf, metadata=LEAST)
