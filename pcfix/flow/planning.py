@@ -5,9 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -39,8 +38,6 @@ FEWEST_BED_POINTS, MOST_BED_POINTS = 125_000, 1_000_000
 """Size of the sample of the cloud that the bed of the surroundings is estimated from."""
 LEAST_R2 = 0.5
 """Smallest coefficient of determination of a regression that is used."""
-Chunks = Callable[[], Iterable[Points]]
-"""The whole cloud, chunk by chunk, transferred to the adjusted cameras if there are any."""
 
 
 def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
@@ -139,20 +136,16 @@ def plan_correction(plan: Plan) -> Plan:
             transfer.check_models(first.xyz)
     if inputs.port is not None:  # no water surface, and no reconstruction type to detect
         return plan
-    chunks = partial(_all_chunks, plan)
-    labelling = plan.labelling.scanned(parts_of(chunks(), water), view.low, view.high)
-    plan = replace(plan, labelling=labelling)
+    parts = parts_of(_all_chunks(plan), water)
+    plan = replace(plan, labelling=plan.labelling.scanned(parts, view.low, view.high))
     if inputs.check_depths is not None:
-        line = fit_check_depths(inputs.check_depths, parts_of(chunks(), water))
+        line = fit_check_depths(inputs.check_depths, parts_of(_all_chunks(plan), water))
         survey = replace(plan.survey, learned=plan.survey.learned._replace(regression=line))
         notes = coded("regression.fit", (line.words, *line.notes))
         plan = replace(plan, survey=survey, notes=tuple(notes))
-    plan = _estimated_from_cloud(plan, chunks)
-    if (
-        plan.options.dimensions == "all"
-        and plan.survey.learned.regression is None
-        and len(plan.cameras)
-    ):
+    plan = _estimated_from_cloud(plan)
+    has_line = plan.survey.learned.regression is not None
+    if plan.options.dimensions == "all" and len(plan.cameras) and not has_line:
         plan = _with_pose_errors(plan)
     if first is not None and plan.kind is not None:
         plan = _with_type_of_list(plan, first)
@@ -250,39 +243,36 @@ def _with_type_of_list(plan: Plan, first: Points) -> Plan:
     return replace(plan, survey=survey, kind=kind, verdicts=(verdict,))
 
 
-def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
+def _estimated_from_cloud(plan: Plan) -> Plan:
     """Resolve every option that is ``auto``, and estimate what the points have in common."""
     survey, view, some_unlisted = plan.survey, plan.view, plan.some_unlisted
-    given = survey.settings if survey.own_water is not None else plan.options
-    # listed cameras saw their points, so that nothing hides them
-    may_hide = plan.kind is None or survey.settings.occlusion != "auto"
+    # listed cameras saw their points, so that nothing occludes them
+    may_occlude = plan.kind is None or survey.settings.occlusion != "auto"
     sample, near, occluder = _scanned(
-        plan, chunks, sample=some_unlisted or learning.wants_sample(survey, plan.kind),
-        occluder=may_hide or some_unlisted,
+        plan, sample=some_unlisted or learning.wants_sample(survey, plan.kind),
+        occluder=may_occlude or some_unlisted,
     )  # fmt: skip
-    if may_hide:
+    if may_occlude:
         survey = replace(survey, learned=survey.learned._replace(occluder=occluder))
-    plan = replace(plan, survey=survey)
     if sample is None:
-        return plan
-    sample = replace(sample, survey=survey)
+        return replace(plan, survey=survey)
     ties = original_ties(plan.inputs, plan.transfer, view.crs)
-    sample, factor = learning.with_factor(sample)
+    sample, factor = learning.with_factor(replace(sample, survey=survey))
     notes = [*plan.notes, *coded("cloud.depth_factor", [] if factor is None else [factor])]
-    if factor is not None:
-        survey, given = sample.survey, replace(given, depth_factor=factor.factor)
     hint = hint_of(plan.options.software or view.software)
     if plan.kind is None:
         survey, verdicts = learning.learn_of_sample(sample, ties, hint, near)
         return replace(plan, survey=survey, verdicts=verdicts, notes=tuple(notes))
     survey = learning.with_matcher(sample, ties)
     if some_unlisted:
-        learned = plan.survey.learned._replace(occluder=occluder)
+        # other points get the reconstruction type that is detected, and may be occluded
+        given = survey.settings if survey.own_water is not None else plan.options
+        if factor is not None:
+            given = replace(given, depth_factor=factor.factor)
         settings = learning.resolved(given, plan.cameras, None)
-        bare = replace(survey, settings=settings, learned=learned)
-        unlisted, verdicts = learning.learn_of_sample(
-            replace(sample, survey=bare), ties, hint, near
-        )
+        learned = survey.learned._replace(occluder=occluder)
+        bare = replace(sample, survey=replace(survey, settings=settings, learned=learned))
+        unlisted, verdicts = learning.learn_of_sample(bare, ties, hint, near)
         survey = replace(survey, unlisted=unlisted)
         words = ["Points missing in the view list are corrected without it.", *map(str, verdicts)]
         notes.append(PcfixWarning("views.unlisted", " ".join(words)))
@@ -290,7 +280,7 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
 
 
 def _scanned(
-    plan: Plan, chunks: Chunks, *, sample: bool, occluder: bool
+    plan: Plan, *, sample: bool, occluder: bool
 ) -> tuple[Batch | None, Batch | None, Occluder | None]:
     """Read the whole cloud once, for a sample of it and for the surface that occludes points.
 
@@ -322,7 +312,7 @@ def _scanned(
         return batch_of(some, survey, plan.original)
 
     taken, row = list[Batch](), 0
-    for points in chunks():
+    for points in _all_chunks(plan):
         if builder is not None:
             builder.add(points.xyz, points.classes)
         if sample:
