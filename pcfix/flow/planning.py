@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pcfix.errors import GeometryError, PcfixWarning, SettingError, coded
+from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError, coded
 from pcfix.flow.correction import Plan, batch_of, transferred
 from pcfix.flow.inputs import CameraInputs, Inputs, labelling_of, original_ties, read_blocks
 from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
@@ -211,10 +211,13 @@ def _with_pose_errors(plan: Plan) -> Plan:
     """Return the plan with the errors of adjusted poses, if the adjustment left its members."""
     from pcfix.flow.pose_errors import SAMPLE_POINTS, members_of, pose_errors, with_poses
 
-    members, problem = members_of(plan.inputs.cameras, plan.cameras)
+    try:
+        members = members_of(plan.inputs.cameras, plan.cameras)
+    except InputError as error:
+        note = PcfixWarning("cameras.poses", error)
+        return replace(plan, input_notes=(*plan.input_notes, note))
     if members is None:
-        notes = coded("cameras.poses", filter(None, [problem]))
-        return replace(plan, input_notes=(*plan.input_notes, *notes))
+        return plan
     rows = np.arange(0, plan.view.points, 1 + plan.view.points // SAMPLE_POINTS)
     sample = sample_of(plan.view, rows, plan.found.surface, plan.match)
     errors = pose_errors(sample, plan.survey, members, plan.transfer)

@@ -71,7 +71,7 @@ def test_connected():
     assert (found[x > 66.0] != 40).all()
     np.testing.assert_array_equal(found[x < 50.0], plain[x < 50.0])
     separate = labelling.report()["separate"]
-    assert separate["points"] == (plain == 40).sum() - (found == 40).sum()
+    assert (separate["pools"], separate["points"]) == (1, (plain == 40).sum() - (found == 40).sum())
 
     channel = (np.abs(xyz[:, 1] - NORTH - 20.0) < 1.0) & (x > 40) & (x < 82)
     xyz[channel, 2] = WATER_M - 0.3
