@@ -21,6 +21,7 @@ from pcfix.errors import GeometryError, InputError, NoTiePointsError, PcfixWarni
 from pcfix.flow.surfaces import CloudView, find_surface
 from pcfix.io.cameras import read_cameras, read_tie_points, takes_sensor
 from pcfix.io.cameras.georeference import Georeference, georeference
+from pcfix.io.crs import LOCAL
 from pcfix.io.tables import match_labels
 from pcfix.io.tides import level_offsets, read_image_times, read_tide
 from pcfix.io.vectors import LAYER_MARK, read_water_polygons
@@ -34,9 +35,6 @@ from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:
     from pyproj import CRS
-
-
-LOCAL = "local"
 
 
 class Inputs(MaskOption, InputOptions):
@@ -165,7 +163,13 @@ def read_blocks(inputs: Inputs, view: CloudView) -> CameraInputs:
         of_original, of_adjusted = both_models(inputs)
         cameras, _ = of_adjusted.block(view.crs)
         original, listed = of_original.block(view.crs)
-        transfer = _transfer_between(original, cameras)
+        for one, option in ((original, "adjusted-from"), (cameras, "cameras")):
+            if one.rotations is None or one.lenses is None:
+                missing = "angles" if one.rotations is None else "lens"
+                words = f"--{option}: has no {missing}, without which points have no image. Give"
+                words += " the model itself, or --sensor."
+                raise SettingError(f"cameras.no_{missing}", words, option=option)
+        transfer = transfer_of(original, cameras, _rows(original.labels, cameras.labels))
     if listed is None:
         return CameraInputs(cameras, transfer=transfer)
     match = ViewMatch(listed, original, points=view.points, step_m=view.step_m)
@@ -235,17 +239,6 @@ def original_ties(
         return None
     views, entry = renumbered(ties.views, transfer.row)
     return replace(ties, views=views, image_xy=ties.image_xy[entry])
-
-
-def _transfer_between(original: Cameras, adjusted: Cameras) -> CloudTransfer:
-    """Match the images of two models in the cloud's CRS by their names."""
-    for cameras, which in ((original, "adjusted-from"), (adjusted, "cameras")):
-        if cameras.rotations is None or cameras.lenses is None:
-            missing = "angles" if cameras.rotations is None else "lens"
-            words = f"--{which}: has no {missing}, without which points have no image. Give the"
-            words += " model itself, or --sensor."
-            raise SettingError(f"cameras.no_{missing}", words, option=which)
-    return transfer_of(original, adjusted, _rows(original.labels, adjusted.labels))
 
 
 def _rows(original: tuple[str, ...], adjusted: tuple[str, ...]) -> IntArray:
