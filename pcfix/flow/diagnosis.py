@@ -64,46 +64,42 @@ def diagnose_in_passing(
     unknown), that as a line, and the signs; and the warning.
     """
     inputs, cameras, n = plan.inputs, plan.cameras, plan.options.refractive_index
-    found: dict[str, Any] = {"absorbed": None, "words": "", "signs": []}
+
+    def poses(words: str, absorbed: bool | None = None, signs: Any = ()) -> dict[str, Any]:
+        return {"absorbed": absorbed, "words": words, "signs": list(signs)}
+
     if not len(cameras):
-        return found | {"words": "not applicable: no cameras were given"}, None
+        return poses("not applicable: no cameras were given"), None
     if inputs.adjusted_from is not None:
-        words = "adjusted with refraction (--adjusted-from)"
-        return found | {"absorbed": False, "words": words}, None
-    name, neighbours = (
-        "cameras" if isinstance(inputs.cameras, Cameras) else str(inputs.cameras),
-        None,
-    )
-    for verdict in plan.verdicts:  # the last one that was found with straight rays too
+        return poses("adjusted with refraction (--adjusted-from)", absorbed=False), None
+    name = "cameras" if isinstance(inputs.cameras, Cameras) else str(inputs.cameras)
+    neighbours = None
+    for verdict in plan.verdicts:  # the last one that was compared with straight rays counts
         if verdict.straight is not None:
             neighbours = neighbours_sign(*verdict.straight, is_fused=verdict.is_fused)
     try:
-        diagnosis = diagnosed(
+        found = diagnosed(
             cameras, plan.found.surface, n, ties=ties, gnss=_gnss_of(cameras, name),
             view=plan.view, neighbours=neighbours, in_passing=True,
         )  # fmt: skip
     except (PcfixError, OSError) as error:  # this check stops no correction
-        return found | {"words": f"not checked for absorbed refraction: {error}"}, None
-    found |= {"absorbed": diagnosis.absorbed, "signs": diagnosis.as_dict()["signs"]}
-    if diagnosis.decided_by is None:
-        words = (
-            "not checked for absorbed refraction: no tie points or GNSS positions of the file show"
-            f" it quickly; {EXPORT}"
-        )
-        return found | {"words": words}, None
-    have = "have" if diagnosis.absorbed else "have not"
-    words = f"{have} absorbed the refraction, as {diagnosis.decided_by.name} show"
-    if not diagnosis.absorbed:
-        return found | {"words": words}, None
+        return poses(f"not checked for absorbed refraction: {error}"), None
+    signs = found.as_dict()["signs"]
+    if found.decided_by is None:
+        words = "not checked for absorbed refraction: no tie points or GNSS positions of the file"
+        return poses(f"{words} show it quickly; {EXPORT}", None, signs), None
+    have = "have" if found.absorbed else "have not"
+    words = f"{have} absorbed the refraction, as {found.decided_by.name} show"
+    if not found.absorbed:
+        return poses(words, found.absorbed, signs), None
     command = adjust_words(
         inputs, plan.view.name, has_datum=has_datum(cameras, name),
         index=None if n == DEFAULT_REFRACTIVE_INDEX else n,
     )  # fmt: skip
-    likely = diagnosis.likely_error_m
-    values = {} if likely is None else {"likely_error_m": likely}
-    warning = PcfixWarning("poses.absorbed", diagnosis.sentence(command), command=command, **values)
+    likely = {} if found.likely_error_m is None else {"likely_error_m": found.likely_error_m}
+    warning = PcfixWarning("poses.absorbed", found.sentence(command), command=command, **likely)
     warnings.warn(warning, stacklevel=3)
-    return found | {"words": f"{words}; see the warning"}, warning
+    return poses(f"{words}; see the warning", found.absorbed, signs), warning
 
 
 def quick_ties(inputs: Inputs, crs: Any) -> TiePoints | None:
