@@ -58,17 +58,17 @@ class Cloud(NamedTuple):
         """Set some rows, and flag the weak intersections among their corrected points.
 
         `above` is the water; without it the points with rays are submerged. `rays` are the
-        dimensions of `WEAK` by name, as far as they are known. Points that were not corrected, or
-        without cameras, have no weak intersection: their count of rays is 0 or 1.
+        dimensions of `WEAK` by name, as far as they are known. Points without rays, which were not
+        corrected, have no weak intersection.
         """
         self.xyz[rows], self.used[rows] = xyz, used
         if "RayCount" in rays:
-            self.submerged[rows] = used & (rays["RayCount"] > 0)
-            intersected = used & (rays["RayCount"] > 1)
+            corrected = used & (rays["RayCount"] > 0)
+            self.submerged[rows] = corrected
             for name, (reason, limit, is_beyond) in WEAK.items():
                 value = getattr(rules, limit)
                 if value is not None and name in rays:
-                    weak = intersected & is_beyond(rays[name], value)
+                    weak = corrected & is_beyond(rays[name], value)
                     self.reasons[rows][weak] |= np.uint8(reason)
         if above is not None:
             self.submerged[rows] = used & is_submerged(xyz[:, 2], above)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from contextlib import suppress
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,8 +16,8 @@ from pcfix.flow.surfaces import CloudView, find_surface, view_of
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
-from pcfix.io.las.writing import output_header
-from pcfix.io.tiles import Clouds
+from pcfix.io.las.writing import output_header, own_settings
+from pcfix.io.tiles import Clouds, open_cloud
 from pcfix.model import LOW_NOISE, BoolArray
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
@@ -63,12 +64,18 @@ def clean_file(
     )  # fmt: skip
 
 
-def find_noise(options: CleanOptions, view: CloudView) -> tuple[BoolArray, dict[str, Any]]:
+def find_noise(
+    options: CleanOptions, view: CloudView, *, has_rays: bool = True
+) -> tuple[BoolArray, dict[str, Any]]:
     """Run the tests on a whole cloud of n points.
 
-    Returns which points are noise, shape (n,), and the summary without files and time.
+    `has_rays` is False if it was corrected without cameras. Returns which points are noise, shape
+    (n,), and the summary without files and time.
     """
     rules, not_run, water = options.part(CleanRules), list[str](), None
+    if rules.weak and not has_rays:
+        rules = replace(rules, weak=False)
+        not_run.append("weak intersections: the cloud was corrected without cameras")
     if options.water is not None:
         water = find_surface(options.water, WaterOptions(), view).surface
     n, has = view.points, {one for one in WEAK if {"RayCount", one} <= set(view.names)}
@@ -125,7 +132,10 @@ class CleanPlan(NamedTuple):
 
 def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask) -> CleanPlan:
     """Find the noise of a whole cloud; large arrays are on the disk of the target."""
-    view = view_of(task.source, options.jobs, in_metres=options.water is not None)
+    view, ours = view_of(task.source, options.jobs, in_metres=options.water is not None), None
+    with open_cloud(task.source) as source, suppress(ValueError):  # a damaged record counts as none
+        ours = own_settings(source.vlrs)
+    has_rays = not (isinstance(ours, dict) and ours.get("cameras") == 0)
     passed = 0.0
 
     def count(points: float) -> None:
@@ -137,7 +147,7 @@ def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask)
     # the folder of many files is made later
     disk = next(one for one in task.target.absolute().parents if one.is_dir())
     with scratch_arrays(disk / task.target.name), running(report=count):
-        noise, found = find_noise(options, view)
+        noise, found = find_noise(options, view, has_rays=has_rays)
     if options.drop and noise.all():
         sentence = "every point is noise by these thresholds. Use wider ones, or omit --drop."
         raise bad_file(task.source, "cloud.all_noise", sentence, points=view.points)

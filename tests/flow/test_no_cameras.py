@@ -91,6 +91,7 @@ def test_cleaning(folder):
     pcfix.correct_file(folder / "cloud.las", folder / "out.las", **NONE, method="factor")
     found = pcfix.clean_file(folder / "out.las", folder / "clean.las")
     assert found.reasons["few_rays"] == 0
+    assert len(found.not_run) == 1
 
 
 def test_run(tmp_path):
