@@ -34,7 +34,7 @@ from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header
 from pcfix.io.tiles import Clouds, is_raster
 from pcfix.label.labelling import Labelling
-from pcfix.lens.frames import count_outside_frames
+from pcfix.lens.frames import count_visible_cameras
 from pcfix.model import (
     BATHYMETRIC_POINT,
     Cameras,
@@ -386,7 +386,7 @@ def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:
         raise SettingError(
             "views.camera", f"views name camera {camera.max()}, but there are {len(cameras)}."
         )
-    counts = count_outside_frames(points, views, cameras)
+    counts = np.diff(views.start) - count_visible_cameras(points, cameras, views)
     if counts.any():
         entries, outside = int(counts.sum()), int(np.count_nonzero(counts))
         sentence = f"views: {entries:,} entries of {outside:,} points are ignored: their cameras"

@@ -17,16 +17,8 @@ import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Vector, dot, minus, row_of, scaled, times
-from pcfix.lens.imaging import (
-    HEIGHT,
-    PLAIN,
-    WIDTH,
-    image_of,
-    lens_table,
-    plain_image,
-    plain_lens,
-    unproject,
-)
+from pcfix.lens.formulas import HEIGHT, PLAIN, WIDTH, lens_table
+from pcfix.lens.imaging import image_of, plain_image, plain_lens, unproject
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, Views
 
 
@@ -241,11 +233,6 @@ def count_visible_cameras(
     points = np.ascontiguousarray(xyz)
     in_tiles(_count, len(xyz), points, start, camera, cameras.centres, frames, counts)
     return counts
-
-
-def count_outside_frames(xyz: FloatArray, views: Views, cameras: Cameras) -> IntArray:
-    """Return the number of cameras in the view list of each point, (n, 3), that cannot image it."""
-    return np.asarray(np.diff(views.start) - count_visible_cameras(xyz, cameras, views))
 
 
 @kernel

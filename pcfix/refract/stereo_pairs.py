@@ -47,7 +47,8 @@ from pcfix.lens.algebra import (
     transposed_times,
     vector,
 )
-from pcfix.lens.imaging import KIND, PERSPECTIVE, PLAIN, Plain, image_and_slopes, plain_lens
+from pcfix.lens.formulas import KIND, PERSPECTIVE, PLAIN
+from pcfix.lens.imaging import Plain, image_and_slopes, plain_lens
 from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, Views
 from pcfix.refract import tiling
 from pcfix.refract.batch import (

@@ -42,6 +42,10 @@ class WaterProposal(FoundSurface):
     evidence: dict[str, float]  # figures by name
     reasons: tuple[str, ...]  # the same in sentences
 
+    def sigma_at(self, xy: FloatArray) -> FloatArray:
+        """Return the standard error (m) of the height at places (m, 2), the same for all."""
+        return np.full(len(xy), self.sigma_level_m)
+
     def as_dict(self) -> dict[str, Any]:
         """Return the figures as plain values."""
         return {
@@ -310,8 +314,8 @@ def gain_of(
         saved = 2.0 * cue.amplitude * cross - cue.amplitude**2 * own
     n = (moments.number * times[:, None]).sum(axis=0)
     gain = 0.5 * n * np.log(sse / np.maximum(sse - saved, 1e-3 * sse))
-    # the variance of `cross`, expected from the residuals, and found in the scores of the tiles (the
-    # derivatives of their sums of squares by the amplitude): larger where the tiles disagree
+    # variance of `cross`, expected from the residuals, and found in the scores of the tiles (the
+    # derivatives of their sums of squares by the amplitude), which is larger if the tiles disagree
     expected = np.maximum(sse - cross**2 / own, 1e-3 * sse) / np.maximum(n, 1.0) * own
     scores = (
         sums[..., 2] - trend * sums[..., 4] - amplitude * sums[..., 5]

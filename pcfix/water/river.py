@@ -43,27 +43,10 @@ class RiverFit(ShoreFit):
     axis: Axis  # downstream
     profile: Profile  # height along the axis, by its station
 
-    def height_at(self, xy: FloatArray) -> FloatArray:
-        """Return the height (m) of the surface at places (m, 2)."""
-        return self.profile.height_at(self.axis.locate(xy)[0])
-
     def sigma_at(self, xy: FloatArray) -> FloatArray:
-        """Return the standard error (m) of that height."""
+        """Return the standard error (m) of the height at places (m, 2)."""
         station, sigma = self.profile.station_m, self.profile.sigma_height_m
         return np.interp(self.axis.locate(xy)[0], station, sigma)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the figures as plain values."""
-        heights = self.profile.height_m
-        return {
-            "model": "river",
-            "length_m": float(np.ptp(self.profile.station_m)),
-            "width_m": self.axis.width_m,
-            "upper_level_m": float(heights[0]),
-            "drop_m": float(heights[0] - heights[-1]),
-            "sigma_level_m": float(self.profile.sigma_height_m.mean()),
-            **super().as_dict(),
-        }
 
 
 def fit_river(
@@ -90,30 +73,37 @@ def fit_river(
     axis = flow_axis(used[:, :2])
     station, _ = axis.locate(used[:, :2])
     upper = station <= np.median(station)
-    if not upper.all() and np.median(used[upper, 2]) < np.median(used[~upper, 2]):
+    if np.median(used[upper, 2]) < np.median(used[~upper, 2]):
         axis = Axis(axis.xy[::-1].copy(), axis.width_m)  # downstream
         station, _ = axis.locate(used[:, :2])
     order = np.lexsort((used[:, 2], station))
     known, station, z = known[order], station[order], used[order, 2]
     worth = np.ones(len(known)) if counts is None else np.asarray(counts, np.float64)[known]
     profile = _fit_profile(station, z, worth)
-    notes = [
-        f"Beyond the outermost points the surface is constant: {profile.height_m[0]:.2f} m upstream"
-        f" and {profile.height_m[-1]:.2f} m downstream."
-    ]
-    if len(known) < len(points):
-        notes.append(f"{len(points) - len(known)} points have no height and are ignored.")
+    upper_m, lower_m = profile.height_m[[0, -1]].tolist()
+    note = (
+        f"Beyond the outermost points the surface is constant: {upper_m:.2f} m upstream and"
+        f" {lower_m:.2f} m downstream."
+    )
     residual, weight = np.full(len(points), np.nan), np.zeros(len(points))
     residual[known], weight[known] = profile.residual_m, profile.weight
     return RiverFit(
         surface=_raster(axis, profile, bounds, name),
         points=points,
-        notes=tuple(notes),
-        axis=axis,
-        profile=profile,
+        notes=(note,),
         residual_m=residual,
         weight=weight,
         sigma_m=profile.sigma_m,
+        axis=axis,
+        profile=profile,
+        figures={
+            "model": "river",
+            "length_m": float(np.ptp(profile.station_m)),
+            "width_m": axis.width_m,
+            "upper_level_m": upper_m,
+            "drop_m": upper_m - lower_m,
+            "sigma_level_m": float(profile.sigma_height_m.mean()),
+        },
     )
 
 

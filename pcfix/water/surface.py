@@ -36,16 +36,11 @@ class FoundSurface:
     """A water surface that was given; its subclasses are fitted, or found in a cloud."""
 
     surface: WaterSurface
-    points: FloatArray | None = None  # (n, 3), shoreline points, metres, the cloud's CRS
     notes: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any] | None:
         """Return the figures of a fit as plain values; None without a fit."""
         return None
-
-    def height_at(self, xy: FloatArray) -> FloatArray:
-        """Return the height (m) of the surface at places (m, 2); NaN where it is unknown."""
-        return surface_above(self.surface, np.column_stack([xy, xy[:, :1]])).height_m
 
     def sigma_at(self, xy: FloatArray) -> FloatArray | None:
         """Return the standard error (m) of the height at places (m, 2), if there is a fit."""

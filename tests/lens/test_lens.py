@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import pcfix
-from pcfix.lens.imaging import coefficients, image_and_gradients, project, unproject
+from pcfix.lens.formulas import coefficients
+from pcfix.lens.imaging import image_and_gradients, project, unproject
 from tests.utils.compiled import compiled
 from tests.utils.twins import brown_slowly, image_slowly
 

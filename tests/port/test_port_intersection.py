@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from pcfix import Cameras
 from pcfix.model import Outcome
 from pcfix.options.correct import BudgetOptions, ScienceOptions
-from pcfix.port.light import coefficients, ray_through, window_of
+from pcfix.port.light import ray_through, window_of
 from pcfix.port.methods import correct_through_port
 from pcfix.port.shapes import DomePort, FlatPort
 from tests.utils.codes import refused
@@ -17,7 +17,7 @@ from tests.utils.compiled import compiled
 from tests.utils.port_scenes import images_of, simulate_port
 from tests.utils.twins import stacked_intersection
 
-ray_through, window_of = compiled(ray_through), compiled(window_of)
+ray_through = compiled(ray_through)
 
 FLAT = FlatPort(0.02, 0.008, 1.49, (0.02, -0.01, 1.0))
 DOME = DomePort(0.05, 0.004, 1.49, (0.001, -0.002, -0.01))
@@ -75,7 +75,7 @@ def test_without_list(scene):
 def test_ray_distance(scene):
     """The rays through the apparent point one by one, about the point that is nearest to them."""
     found = run(scene, CONSISTENT, scene.views)
-    window, start = window_of(coefficients(scene.port)), scene.views.start
+    window, start = window_of(scene.port), scene.views.start
     for i in range(0, len(scene.apparent), 50):
         places, rays, point = [], [], scene.apparent[i]
         for c in scene.views.camera[start[i] : start[i + 1]]:
