@@ -140,18 +140,6 @@ def image_and_gradients(
     )  # fmt: skip
 
 
-@device
-def image_in_world(
-    c: FloatArray, r: FloatArray, direction: Vector
-) -> tuple[float, float, Vector, Vector]:
-    """Return u, v of a direction in the world frame, and the gradients of u and v there.
-
-    The camera has the rotation r.
-    """
-    u, v, g = image_and_gradients(c, *times(r, direction))
-    return u, v, transposed_times(r, g[:3]), transposed_times(r, g[3:])
-
-
 Plain: TypeAlias = tuple[
     float, float, float, float, float, float, float, float, float, float, float, float, float,
     float, float,
@@ -202,8 +190,12 @@ def plain_image(c: Plain, w: Vector) -> tuple[float, float, Gradients]:
 def image_and_slopes(
     lens: FloatArray, plain: Plain | None, r: FloatArray, direction: Vector
 ) -> tuple[float, float, Vector, Vector]:
-    """Do as `image_in_world`, by the numbers of the common lens if there are any."""
+    """Return u, v of a direction in the world frame, and the gradients of u and v there.
+
+    The camera has the rotation r. The numbers of the common lens are used if there are any.
+    """
     if plain is None:
-        return image_in_world(lens, r, direction)
-    u, v, g = plain_image(plain, times(r, direction))
+        u, v, g = image_and_gradients(lens, *times(r, direction))
+    else:
+        u, v, g = plain_image(plain, times(r, direction))
     return u, v, transposed_times(r, g[:3]), transposed_times(r, g[3:])

@@ -58,7 +58,7 @@ from pcfix.lens.algebra import (
 )
 from pcfix.lens.formulas import lens_table
 from pcfix.lens.frames import Frames, frames_of, holds, no_frames
-from pcfix.lens.imaging import image_and_gradients, image_in_world
+from pcfix.lens.imaging import image_and_gradients, image_and_slopes
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Views
 from pcfix.options.correct import ScienceOptions
 from pcfix.port.light import (
@@ -292,7 +292,7 @@ def _search(start: Vector, point: Vector, chosen: IntArray, rig: Rig) -> tuple[V
         g[:], slope[:] = 0.0, 0.0
         for c in chosen:
             a = minus(point, row_of(rig.centres, c))
-            u, v, ju, jv = image_in_world(rig.lenses[rig.row[c]], rig.rotations[c], a)
+            u, v, ju, jv = image_and_slopes(rig.lenses[rig.row[c]], None, rig.rotations[c], a)
             u_true, v_true, lu, lv, _, _ = _image_through(plus(a, q), rig, c, out)
             for k in range(3):
                 g[k] += ju[k] * (u_true - u) + jv[k] * (v_true - v)

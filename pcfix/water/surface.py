@@ -212,19 +212,21 @@ def _index_cells(corners: FloatArray) -> tuple[float, int, int, IntArray, IntArr
     cell = float(max(np.sqrt(extent.prod() / len(corners)), extent.max() / 4096, 1e-6))
     columns, rows = (np.floor(extent / cell).astype(int) + 1).tolist()
     low = np.floor(corners.min(axis=1) / cell).astype(np.int64)
-    high = np.floor(corners.max(axis=1) / cell).astype(np.int64)
-    width, height = (high - low + 1).T
-    facet = np.repeat(np.arange(len(corners)), width * height)
-    # number of each cell within the bounding box of its facet
-    within = np.arange(len(facet)) - np.repeat(
-        np.cumsum(width * height) - width * height, width * height
-    )
-    column = low[facet, 0] + within % width[facet]
-    row = low[facet, 1] + within // width[facet]
-    code = row * columns + column
+    width, height = (np.floor(corners.max(axis=1) / cell).astype(np.int64) - low + 1).T
+    # a row for each cell of each facet's bounding box, and which of these it is
+    size = width * height
+    facet = np.repeat(np.arange(len(corners)), size)
+    within = np.arange(len(facet)) - np.repeat(np.cumsum(size) - size, size)
+    code = (low[facet, 1] + within // width[facet]) * columns
+    code += low[facet, 0] + within % width[facet]
     order = np.argsort(code, kind="stable")
-    start = np.searchsorted(code[order], np.arange(rows * columns + 1))
-    return cell, columns, rows, start.astype(np.int64), facet[order].astype(np.int64)
+    return (
+        cell,
+        columns,
+        rows,
+        np.searchsorted(code[order], np.arange(rows * columns + 1)),
+        facet[order],
+    )
 
 
 @device
@@ -237,21 +239,16 @@ def locate(tin: Tin, x: float, y: float) -> int:
     cell = row * tin.columns + column
     for k in range(tin.cell_start[cell], tin.cell_start[cell + 1]):
         facet = tin.cell_facet[k]
-        if _inside(tin.corners[facet], u, v):
+        corners = tin.corners[facet]
+        ax, ay = corners[1, 0] - corners[0, 0], corners[1, 1] - corners[0, 1]
+        bx, by = corners[2, 0] - corners[0, 0], corners[2, 1] - corners[0, 1]
+        px, py = u - corners[0, 0], v - corners[0, 1]
+        # the place is the first corner + s a + t b
+        area = ax * by - ay * bx
+        s, t = (px * by - py * bx) / area, (ax * py - ay * px) / area
+        if s >= -EDGE_TOLERANCE and t >= -EDGE_TOLERANCE and s + t <= 1.0 + EDGE_TOLERANCE:
             return int(facet)
     return -1
-
-
-@device
-def _inside(corners: FloatArray, u: float, v: float) -> bool:
-    """Whether a plan position is in a triangle, edges included."""
-    ax, ay = corners[1, 0] - corners[0, 0], corners[1, 1] - corners[0, 1]
-    bx, by = corners[2, 0] - corners[0, 0], corners[2, 1] - corners[0, 1]
-    px, py = u - corners[0, 0], v - corners[0, 1]
-    area = ax * by - ay * bx
-    s = (px * by - py * bx) / area
-    t = (ax * py - ay * px) / area
-    return bool(s >= -EDGE_TOLERANCE and t >= -EDGE_TOLERANCE and s + t <= 1.0 + EDGE_TOLERANCE)
 
 
 @device

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from pcfix import Cameras
 from pcfix.model import Outcome
-from pcfix.options.correct import BudgetOptions, ScienceOptions
+from pcfix.options.correct import ScienceOptions
 from pcfix.port.light import ray_through, window_of
 from pcfix.port.methods import correct_through_port
 from pcfix.port.shapes import DomePort, FlatPort
@@ -21,7 +21,6 @@ ray_through = compiled(ray_through)
 
 FLAT = FlatPort(0.02, 0.008, 1.49, (0.02, -0.01, 1.0))
 DOME = DomePort(0.05, 0.004, 1.49, (0.001, -0.002, -0.01))
-CONSISTENT = ScienceOptions(method="consistent")
 NOISE_PX = 0.5
 
 
@@ -44,7 +43,8 @@ def errors_of(scene, found):
     return scene.apparent + found.shift_m - scene.truth
 
 
-def run(scene, settings, views=None):
+def run(scene, views=None, **settings):
+    settings = ScienceOptions(method="consistent", **settings)
     return correct_through_port(scene.apparent, scene.cameras, scene.port, settings, views)
 
 
@@ -53,14 +53,14 @@ def test_consistent(scene):
     # Newton's method stops at 1e-7 m, beyond which a further step would go
     before = rms(scene.apparent - scene.truth)
     assert before[2] > 0.1
-    found = run(scene, CONSISTENT, scene.views)
+    found = run(scene, scene.views)
     assert np.abs(errors_of(scene, found)).max() < 5e-9
     assert found.ray_count.tolist() == np.diff(scene.views.start).tolist()
     assert found.camera_used.all()
 
 
 def test_without_list(scene):
-    found = run(scene, CONSISTENT)
+    found = run(scene)
     right = np.abs(errors_of(scene, found)).max(axis=1) < 5e-9
     assert right.mean() > 0.6
     # several sets of cameras may image the point that they lead to; at the border of an image a
@@ -74,7 +74,7 @@ def test_without_list(scene):
 
 def test_ray_distance(scene):
     """The rays through the apparent point one by one, about the point that is nearest to them."""
-    found = run(scene, CONSISTENT, scene.views)
+    found = run(scene, scene.views)
     window, start = window_of(scene.port), scene.views.start
     for i in range(0, len(scene.apparent), 50):
         places, rays, point = [], [], scene.apparent[i]
@@ -90,9 +90,7 @@ def test_ray_distance(scene):
 
 def test_covariance_of_noise(noisy):
     # three thousand normalised squares have a mean of 1 within 4 sigma = 0.15 (correlations aside)
-    budget = BudgetOptions(sigma_image=NOISE_PX, sigma_index=0.0)
-    settings = ScienceOptions(method="consistent", **vars(budget))
-    found = run(noisy, settings, noisy.views)
+    found = run(noisy, noisy.views, sigma_image=NOISE_PX, sigma_index=0.0)
     errors = errors_of(noisy, found)
     c = found.covariance_m2
     full = np.stack([c[:, [0, 1, 2]], c[:, [1, 3, 4]], c[:, [2, 4, 5]]], axis=1)
@@ -105,16 +103,15 @@ def test_covariance_of_poses():
     # one camera errs at a time: its centre by 0.1 mm, its attitude by 0.1 mrad, in turn
     scene = simulate_port(FLAT, points=25, seed=3)
     for budget, change in (
-        (BudgetOptions(sigma_image=0.0, sigma_index=0.0, sigma_centre=1e-4), shifted),
-        (BudgetOptions(sigma_image=0.0, sigma_index=0.0, sigma_attitude=np.degrees(1e-4)), turned),
+        ({"sigma_centre": 1e-4}, shifted),
+        ({"sigma_attitude": np.degrees(1e-4)}, turned),
     ):
-        settings = dataclasses.replace(CONSISTENT, **vars(budget))
         total = np.zeros(len(scene.truth))
         for camera in range(len(scene.cameras)):
             for axis in range(3):
                 other = adjusted_again(scene, change(scene.cameras, camera, axis, 1e-4))
                 total += (other - scene.truth)[:, 2] ** 2
-        found = run(scene, settings, scene.views)
+        found = run(scene, scene.views, sigma_image=0.0, sigma_index=0.0, **budget)
         # first order: the steps are 1e-4, second order a few thousandths of the result
         assert found.sigma_z_m == pytest.approx(np.sqrt(total), rel=0.01)
 
@@ -161,12 +158,9 @@ def adjusted_again(scene, cameras):
 
 
 def test_limits(scene):
-    def limited(**limits):
-        return run(scene, dataclasses.replace(CONSISTENT, **limits), scene.views)
-
-    widest = limited().incidence_deg.max()
+    widest = run(scene, scene.views).incidence_deg.max()
     limit = 0.3 * widest
-    narrow = limited(max_angle=limit)
+    narrow = run(scene, scene.views, max_angle=limit)
     assert narrow.incidence_deg.max() <= limit < widest
     few = narrow.outcome != Outcome.CORRECTED
     assert few.any()
