@@ -115,6 +115,7 @@ def plane_and_gradients(
     if not (theta <= c[LARGEST_ANGLE] and (q2 > 0.0 or z > 0.0)):
         return np.nan, np.nan, _NOWHERE
     rho, slope = radius(c, theta)
+    # rho / q and its derivative by q over q; on the axis rho = slope q / z, and it does not turn
     scale = rho / np.sqrt(q2) if q2 > 0.0 else slope / z
     turn = (slope * z / r2 - scale) / q2 if q2 > 0.0 else 0.0
     away = -slope / r2
@@ -255,7 +256,7 @@ def _radial(c: FloatArray, r2: float) -> tuple[float, float]:
     k = int(c[RADIALS])
     above, slope = _series(c, TAIL, k, r2)
     below, below_slope = _series(c, TAIL + k, int(c[DENOMINATORS]), r2)
-    g = above / below
+    g = above / below  # quotient rule
     return g, (slope - g * below_slope) / below
 
 
@@ -308,7 +309,7 @@ def undistorted(c: FloatArray, u: float, v: float) -> tuple[float, float]:
     rho = np.sqrt(u * u + v * v)
     if rho == 0.0 or not rho < np.inf:
         return u, v
-    scale = min(1.0, 0.9 * c[DISC] / rho)
+    scale = min(1.0, 0.9 * c[DISC] / rho)  # the start
     x, y = scale * u, scale * v
     fx, fy, (a, b, d, e) = distorted(c, x, y)
     fx, fy = fx - u, fy - v

@@ -91,6 +91,7 @@ def frames_of(cameras: Cameras) -> Frames:
         return no_frames(len(cameras))._replace(planes=front)
     row, lenses = lens_table(cameras.lenses)
     shapes = [frame_shape(lens) for lens in dict.fromkeys(cameras.lenses)]
+    # a camera's planes are those of its lens, turned into the world
     planes, is_distorted = (np.array(one)[row] for one in zip(*shapes, strict=True))
     return Frames(
         planes=np.ascontiguousarray(planes @ rotations),
@@ -210,6 +211,7 @@ def mark(
 def may_hold(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: FloatArray) -> bool:
     """Whether the frame of camera c may hold a point of an upright box; never wrongly False."""
     for p in range(4):
+        # the corner of the box farthest inside this plane; if it is outside, all are
         reach, inward = 0.0, row_of(frames.planes[c], p)
         for axis in range(3):
             corner = high[axis] if inward[axis] > 0.0 else low[axis]

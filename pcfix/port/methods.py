@@ -251,6 +251,7 @@ def _solve(point: Vector, chosen: IntArray, rig: Rig) -> Solution:
         leaves, t = ray_through(rig.window, rig.n, d)
         if np.isnan(leaves[0] + t[0]):
             continue
+        # where the ray leaves the port, from the apparent point
         a = plus(transposed_times(r, leaves), away)
         k, terms = k + 1, line_terms(a, transposed_times(r, t), 1.0)
         for i in range(9):
@@ -293,6 +294,7 @@ def _search(start: Vector, point: Vector, chosen: IntArray, rig: Rig) -> tuple[V
         for c in chosen:
             a = minus(point, row_of(rig.centres, c))
             u, v, ju, jv = image_and_slopes(rig.lenses[rig.row[c]], None, rig.rotations[c], a)
+            # the image of the true point minus that of the apparent one is the residual of g
             u_true, v_true, lu, lv, _, _ = _image_through(plus(a, q), rig, c, out)
             for k in range(3):
                 g[k] += ju[k] * (u_true - u) + jv[k] * (v_true - v)
@@ -333,6 +335,7 @@ def _set_covariance(
             noise = plus_square(noise, scaled(sigmas.attitude, turned))
     # the error of the refractive index is common to all images
     noise = plus_square(noise, scaled(sigmas.refractive_index, by_n))
+    # H^-1 N H^-1, with the cofactors over the determinant for H^-1
     det, (xx, xy, xz, yy, yz, zz) = cofactors(h)
     if det > 0.0:
         x, y, z = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)

@@ -148,11 +148,13 @@ def height_at(field: Field, x: float, y: float) -> tuple[float, float, float]:
     """
     k, shape, frame = field.which, field.shape, field.frame
     first, rows, columns = shape[k, 0], shape[k, 1], shape[k, 2]
+    # columns east and rows south of the upper left centre; the comparison refuses NaN too
     u, v = (x - frame[k, 0]) / frame[k, 2], (frame[k, 1] - y) / frame[k, 3]
     if not (-0.5 <= u <= columns - 0.5 and -0.5 <= v <= rows - 0.5):
         return np.nan, 0.0, 0.0
     column = min(max(int(np.floor(u)), 0), columns - 2)
     row = min(max(int(np.floor(v)), 0), rows - 2)
+    # the patch between the centres `at`, east and south of it, and the place in it
     at, s, t = first + row * columns + column, u - column, v - row
     z = field.heights[at]
     east, south = field.heights[at + 1] - z, field.heights[at + columns] - z
@@ -199,6 +201,7 @@ def build_tin(mesh: WaterMesh) -> Tin:
         text = f"{mesh.name}: the water surface has no facet with an area in plan. Export it again."
         raise GeometryError("water.mesh", text, path=mesh.name)
     xyz, normal = xyz[flat], normal[flat]
+    # normal . (x - corner) = 0, solved for z
     slope = -normal[:, :2] / normal[:, 2:]
     a = xyz[:, 0, 2] - (slope * xyz[:, 0, :2]).sum(axis=1)
     corners = np.ascontiguousarray(xyz[:, :, :2])

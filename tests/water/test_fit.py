@@ -8,7 +8,7 @@ import pytest
 
 from pcfix.io.vectors import read_shoreline
 from pcfix.water.fit import fit_water, heights_from_cloud
-from pcfix.water.river import fit_river
+from pcfix.water.river import fit_river, locate
 from pcfix.water.surface import surface_above
 from tests.utils.codes import refused
 from tests.utils.nightly import mostly_nightly
@@ -180,7 +180,7 @@ def winding(seed, n, *, noise_m=0.025, share=0.15, length_m=500.0, width_m=20.0)
 
 
 def profile_at(fit, places):
-    return fit.profile.height_at(fit.axis.locate(places)[0])
+    return fit.profile.height_at(locate(fit.axis, places)[0])
 
 
 def bounds_of(places, margin=10.0):
@@ -200,7 +200,7 @@ def test_winding_river(n, rms_m, worst_m):
         assert np.sqrt(np.mean(error**2)) < rms_m
         assert np.abs(error).max() < worst_m
         assert fit.sigma_m == pytest.approx(0.025, abs=0.012)
-        assert fit.axis.width_m == pytest.approx(20.0, rel=0.2)
+        assert fit.as_dict()["width_m"] == pytest.approx(20.0, rel=0.2)
         assert (np.diff(fit.profile.height_m) < 1e-3).all()
 
 
