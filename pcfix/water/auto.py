@@ -307,6 +307,7 @@ def gain_of(
     trend = slope - amplitude * share
     # by how much the break reduces the sum of squares
     if cue.amplitude is None:
+        # less for a trend on land that is like the fading, and for a fading that is none of water
         steady = np.clip(2.0 - 2.0 * np.abs(slope / (amplitude + _TINY) - share), 0.0, 1.0)
         likely = np.clip(2.0 - np.abs(amplitude) / MOST_FADING, 0.0, 1.0)
         saved = np.minimum(cross, 0.0) ** 2 / own * steady * likely
