@@ -102,32 +102,26 @@ def test_covariance_of_noise(noisy):
 def test_covariance_of_poses():
     # one camera errs at a time: its centre by 0.1 mm, its attitude by 0.1 mrad, in turn
     scene = simulate_port(FLAT, points=25, seed=3)
-    for budget, change in (
-        ({"sigma_centre": 1e-4}, shifted),
-        ({"sigma_attitude": np.degrees(1e-4)}, turned),
-    ):
+    for budget in ({"sigma_centre": 1e-4}, {"sigma_attitude": np.degrees(1e-4)}):
         total = np.zeros(len(scene.truth))
         for camera in range(len(scene.cameras)):
             for axis in range(3):
-                other = adjusted_again(scene, change(scene.cameras, camera, axis, 1e-4))
+                other = adjusted_again(scene, moved(scene.cameras, camera, axis, *budget))
                 total += (other - scene.truth)[:, 2] ** 2
         found = run(scene, scene.views, sigma_image=0.0, sigma_index=0.0, **budget)
         # first order: the steps are 1e-4, second order a few thousandths of the result
         assert found.sigma_z_m == pytest.approx(np.sqrt(total), rel=0.01)
 
 
-def shifted(cameras, camera, axis, step):
-    centres = cameras.centres.copy()
-    centres[camera, axis] += step
-    return dataclasses.replace(cameras, centres=centres)
-
-
-def turned(cameras, camera, axis, step):
-    turn = np.zeros(3)
-    turn[axis] = step
-    rotations = cameras.rotations.copy()
-    rotations[camera] = Rotation.from_rotvec(turn).as_matrix() @ rotations[camera]
-    return dataclasses.replace(cameras, rotations=rotations)
+def moved(cameras, camera, axis, what):
+    """Return cameras of which one is shifted or turned along an axis."""
+    centres, rotations, step = cameras.centres.copy(), cameras.rotations.copy(), np.zeros(3)
+    step[axis] = 1e-4
+    if what == "sigma_centre":
+        centres[camera] += step
+    else:
+        rotations[camera] = Rotation.from_rotvec(step).as_matrix() @ rotations[camera]
+    return dataclasses.replace(cameras, centres=centres, rotations=rotations)
 
 
 def adjusted_again(scene, cameras):

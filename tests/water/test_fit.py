@@ -56,9 +56,6 @@ def test_as_good_as_without_outliers(noise_m):
         known.append(np.abs(least_squares(points[good], corners) - true).max())
     assert masks >= 59  # 0.3 m is ten sigma and more
     assert np.mean(error) < 1.05 * np.mean(known)
-    within = np.mean(np.array(error) < 0.02)
-    assert within >= np.mean(np.array(known) < 0.02) - 0.05
-    assert within > (0.8 if noise_m == 0.02 else 0.5)  # what 24 good points of such noise can give
 
 
 def test_standard_errors():
@@ -85,8 +82,8 @@ def test_tilt():
     found = fit_water(np.column_stack([xy, 5.0 - 0.01 * xy[:, 0]]), model="plane").as_dict()
     assert (found["tilt_percent"], found["downhill_deg"]) == pytest.approx((1.0, 90.0))
     assert found["accepted"] == 100
-    level = fit_water(np.column_stack([xy, xy[:, 0] * 0]), model="level")
-    assert level.as_dict()["downhill_deg"] is None
+    level = fit_water(np.column_stack([xy, xy[:, 0] * 0]), model="level").as_dict()
+    assert level["downhill_deg"] is None
 
 
 def model_of(points, **options):
