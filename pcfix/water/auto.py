@@ -395,6 +395,8 @@ def cue_moments(samples: Samples, cue: Cue, heights_m: FloatArray) -> Moments | 
             u, v = (place / max(float(np.ptp(xy[rows])), 1e-9)).T
             smooth = np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v])
             y = samples.xyz[rows, 2]
+            if y.min() > heights_m[-1] or y.max() < heights_m[0]:
+                continue
             # the smooth ground passes the height of the break: with the heights themselves, noise
             # would be on both sides of the equation and hide the break
             at = smooth @ np.linalg.lstsq(smooth, y, rcond=None)[0]

@@ -121,6 +121,7 @@ def with_index(options: Options) -> Options:
         )
     water = Water(**given) if given else None
     number, origin = index_of(options.index, options.index_formula, water)
+    # the number replaces the properties
     given.update(dict.fromkeys(given), index=number, index_from=origin or options.index_from)
     return replace(options, **given)
 
