@@ -140,15 +140,15 @@ def largest_angle(lens: Lens) -> float:
             return RIGHT_ANGLE * min(2.0, first_root(slope))
         case "dual" if s0 == 0.0:
             return np.pi
-        case "dual" if s0 < 0.0:
+        case "dual" if s0 < 0.0:  # slope 1 + s0 tan^2 = 0
             return float(np.arctan(np.sqrt(-1.0 / s0)))
         case "division" if s0 < 0.0:
             return np.pi
-        case "division" if s0 > 0.0:
+        case "division" if s0 > 0.0:  # rho / (1 + s0 rho^2) is largest at s0 rho^2 = 1
             return float(np.arctan(0.5 / np.sqrt(s0)))
         case "fov" if abs(s0) >= np.pi:
             return 0.0
-        case "eucm" if s0 > 0.0:
+        case "eucm" if s0 > 0.0:  # z > -w sqrt(s1 (x^2 + y^2) + z^2) (Usenko et al. 2018)
             w = s0 / (1.0 - s0) if s0 <= 0.5 else (1.0 - s0) / s0
             return float(np.pi - np.arctan2(np.sqrt((1.0 - w * w) / s1), w))
         case _:
