@@ -83,7 +83,7 @@ def raster_files(folder: Path, *, errors: bool, cells: bool) -> list[Path]:
     return [*files, *((folder / name).with_suffix(".qml") for name in maps)]
 
 
-def write_rasters(run: RunFolder, *, errors: bool, progress: Progress | None = None) -> Plain:
+def write_rasters(run: RunFolder, errors: bool, progress: Progress | None = None) -> Plain:
     """Write all rasters of a corrected cloud as cloud optimised GeoTIFF, with styles for QGIS.
 
     By default the cells have 2 to 4 points, or those of a raster are as large as its own. This is

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from numbers import Real
@@ -41,7 +41,7 @@ from pcfix.options.correct import AdjustOptions, CorrectOptions, RunOptions
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import CleanOptions, DistanceOptions
 from pcfix.report.adjustment import adjustment_sentence, all_notes
-from pcfix.report.text import Summary
+from pcfix.report.text import Plain, Summary
 from pcfix.running import threads
 from pcfix.water.index import with_index
 
@@ -49,8 +49,6 @@ if TYPE_CHECKING:
     from geopandas import GeoDataFrame
     from pandas import DataFrame
     from xarray import DataArray
-
-Plain = dict[str, Any]
 
 COMPARED = "compare"
 REFERENCE_DSM = "reference_dsm.tif"
@@ -99,87 +97,63 @@ def run(
     >>> float(result.depth.max())  # doctest: +SKIP
     12.25
     """
-    options, out_dir = _checked(taken(RunOptions, options, keywords, "run")), Path(out_dir)
+    options, folder = _checked(taken(RunOptions, options, keywords, "run")), Path(out_dir)
     cloud = str(input) if isinstance(input, str | os.PathLike) else tuple(map(str, input))
-    given = RunFolder(out_dir, cloud, options)
-    inputs = [path for some in given.files().values() for path in some]
+    given = RunFolder(folder, cloud, options)
+    inputs = [path for some in given.files.values() for path in some]
     if options.m3c2:
         load_py4dgeo()
     if isinstance(given.source, Tiles):
         check_folder(given.path_of("corrected"), given.source.paths)
-    record = _opened(given)
+    step = Record(given, say, bar).step
 
-    def step(
-        name: str, title: str, result_file: Path, work: Callable[[Progress | None], Any],
-        outputs: Sequence[Path] = (), words: Callable[[Any], str] = lambda result: "",
-    ) -> Any:  # fmt: skip
-        """Do a step unless it is done, and say where its main result is; return its figures.
-
-        `outputs` are all files that it leaves, by default only the main one.
-        """
-        with bar(title) as progress:
-            result, was_done = record.step(name, outputs or [result_file], partial(work, progress))
-        if name != "adjust" or result["model"] is not None:
-            done = "already done" if was_done else "done"
-            say(f"{name:<9} {done}: {result_file}{words(result)}")
-        return result
-
-    outputs = [out_dir / FOLDER / name for name in ADJUSTED]
-    first = step("adjust", "Adjusting", outputs[0], lambda _: adjust_first(given, inputs), outputs)
+    outputs = [folder / FOLDER / name for name in ADJUSTED]
+    first = step("adjust", "Adjusting", outputs, lambda _: adjust_first(given, inputs))
     if first["model"] is not None:
-        figures = read_json(out_dir / FOLDER / SUMMARY)
+        figures = read_json(folder / FOLDER / SUMMARY)
         for words in (adjustment_sentence(figures), *all_notes(figures)):
             say(f"{'':<9} {words}")
     elif first["why"]:
         say(f"{'adjust':<9} skipped: {first['why']}")
-    adjusted = given.with_adjusted(first)
+    adjusted = given.with_adjusted(first["model"])
 
-    corrected = step(
-        "correct", "Correcting", adjusted.path_of("corrected"), partial(_correct, adjusted),
-        adjusted.cloud_files("corrected"),
-    )  # fmt: skip
+    # a cloud in many files is a folder for the user
+    main, outputs = adjusted.path_of("corrected"), adjusted.cloud_files("corrected")
+    corrected = step("correct", "Correcting", outputs, partial(_correct, adjusted), main=main)
     poses = corrected["poses"]
     if first["absorbed"] is False and poses is not None and poses["absorbed"] is None:
         # the first step has surveys that the correction has not
         words = "have not absorbed the refraction, as the step adjust found"
         corrected = {**corrected, "poses": {**poses, "absorbed": False, "words": words}}
+    main, outputs = adjusted.path_of("cleaned"), adjusted.cloud_files("cleaned")
+    step("clean", "Cleaning", outputs, partial(_clean, adjusted), main=main)
 
-    # the corrected cloud marks which points are below the water
-    how = CleanOptions(overwrite=True, jobs=options.jobs, scheduler=options.scheduler)
-    cleaned = adjusted.path_of("cleaned")
-    step(
-        "clean", "Cleaning", cleaned,
-        lambda progress: clean_file(
-            adjusted.cloud("corrected"), cleaned, options=how, progress=progress
-        ).as_dict(),
-        adjusted.cloud_files("cleaned"),
-    )  # fmt: skip
     errors = corrected["uncertainty"] is not None
     cells = isinstance(adjusted.source, RasterBand)
-    outputs = results.raster_files(out_dir, errors=errors, cells=cells)
-    step(
-        "dsm", "Gridding", outputs[0],
-        lambda progress: results.write_rasters(adjusted, errors=errors, progress=progress), outputs,
-        lambda result: f", cells of {result['resolution_m']:g} m",
+    outputs = results.raster_files(folder, errors=errors, cells=cells)
+    gridded = step(
+        "dsm", "Gridding", outputs, partial(results.write_rasters, adjusted, errors),
+        "{main}, cells of {resolution_m:g} m",
     )  # fmt: skip
     compared: Plain = {}
     if options.reference is not None:
-        found = out_dir / COMPARED / "compare.json"
-        compared = step("compare", "Comparing", found, lambda _: _compare(adjusted))
-    layers = out_dir / "map.gpkg"
+        compared = step(
+            "compare", "Comparing", [folder / COMPARED / "compare.json"],
+            lambda _: _compare(adjusted, gridded["resolution_m"]),
+        )  # fmt: skip
+    layers = folder / "map.gpkg"
     try:
         vectors.load_pyogrio()
     except InputError as error:  # the extra vector is not installed
         say(f"{'map':<9} not written: {error}")
     else:
         draw = partial(results.write_map, layers, adjusted, corrected, compared)
-        step("map", "Drawing the map", layers, lambda _: draw())
+        step("map", "Drawing the map", [layers], lambda _: draw())
     step(
-        "report", "Writing the report", out_dir / PAGE,
-        lambda _: report_run(adjusted, inputs, first, corrected, compared),
-        words=lambda page: f": {page['in_short']}",
+        "report", "Writing the report", [folder / PAGE],
+        lambda _: report_run(adjusted, inputs, first, corrected, compared), "{main}: {in_short}",
     )  # fmt: skip
-    return RunResults(out_dir)
+    return RunResults(folder)
 
 
 def _checked(options: RunOptions) -> RunOptions:
@@ -223,24 +197,6 @@ def _why_not_adjust(options: RunOptions) -> str:
     if options.tide is not None:
         return "a tide gives each image its own water level, and an adjustment has one"
     return ""
-
-
-def _opened(run: RunFolder) -> Record:
-    """Return the record of a folder, made where it is missing; refuse one of another run."""
-    folder = run.folder
-    if not folder.parent.is_dir():
-        sentence = f"{folder}: the folder {folder.parent} does not exist. Create it first."
-        raise SettingError("output.no_folder", sentence, path=folder)
-    folder.mkdir(exist_ok=True)
-    record = Record(run)
-    if not (run.options.overwrite or record.resumes) and any(folder.iterdir()):
-        raise SettingError(
-            "run.other",
-            f"{folder}: holds a run with other options or input files, or other files. Add"
-            " --overwrite to replace them, or give another folder.",
-            path=folder,
-        )
-    return record
 
 
 def adjust_first(run: RunFolder, files: list[Path]) -> Plain:
@@ -319,7 +275,14 @@ def _correct(run: RunFolder, progress: Progress | None) -> Plain:
     return vars(correct_file(run.source, target, options=options, progress=progress))
 
 
-def _compare(run: RunFolder) -> Plain:
+def _clean(run: RunFolder, progress: Progress | None) -> Plain:
+    """Clean the corrected cloud, which marks the points below the water."""
+    options = CleanOptions(overwrite=True, jobs=run.options.jobs, scheduler=run.options.scheduler)
+    source, target = run.cloud("corrected"), run.path_of("cleaned")
+    return clean_file(source, target, options=options, progress=progress).as_dict()
+
+
+def _compare(run: RunFolder, resolution_m: float) -> Plain:
     """Compare the cleaned cloud with the reference, and write a raster of differences."""
     folder = run.folder / COMPARED
     result = compare_clouds(
@@ -332,9 +295,8 @@ def _compare(run: RunFolder) -> Plain:
             heights = folder / REFERENCE_DSM
             # the cells are those of the cloud, whatever a warning says
             with warnings.catch_warnings(action="ignore", category=PcfixWarning):
-                grid_dsm(run.reference, heights, resolution=run.resolution_m, overwrite=True)
-        difference = run.folder / DIFFERENCE
-        rasters.write_dod(run.folder / SURFACE, heights, difference)
+                grid_dsm(run.reference, heights, resolution=resolution_m, overwrite=True)
+        rasters.write_dod(run.folder / SURFACE, heights, run.folder / DIFFERENCE)
     sections = [
         {"distance_m": one.distance_m, "heights_m": one.heights_m} for one in result.sections
     ]

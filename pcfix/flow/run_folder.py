@@ -12,28 +12,27 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from pcfix.errors import PcfixWarning, bad_file
+from pcfix.errors import PcfixWarning, SettingError, bad_file
 from pcfix.flow.adjust import FOLDER
 from pcfix.flow.inputs import Inputs, paths_in, read_blocks
-from pcfix.flow.runner import HOW, json_text
+from pcfix.flow.runner import HOW, Bar, Progress, json_text, no_bar
 from pcfix.flow.surfaces import view_of
 from pcfix.io.clouds import is_cloud, own_water, reference_of
-from pcfix.io.files import belonging, file_state, files_in, read_json, refusing, write_text
-from pcfix.io.rasters import open_raster
-from pcfix.io.tiles import (
-    CloudFiles,
-    Tiles,
-    band_of,
-    cloud_of,
-    inputs_of,
-    open_cloud,
-    tiles_from,
-    tiles_of,
+from pcfix.io.files import (
+    belonging,
+    check_input,
+    file_state,
+    files_in,
+    read_json,
+    refusing,
+    write_text,
 )
+from pcfix.io.tiles import CloudFiles, Tiles, band_of, cloud_of, inputs_of, open_cloud, tiles_from
 from pcfix.model import Cameras, WaterSurface
 from pcfix.options.correct import RunOptions
 from pcfix.options.declare import options_of
 from pcfix.options.steps import DistanceOptions
+from pcfix.report.text import Plain
 from pcfix.version import __version__
 
 RECORD, SURFACE = "run.json", "surface.tif"
@@ -57,7 +56,7 @@ class RunFolder:
     @cached_property
     def source(self) -> CloudFiles:
         """The cloud, in one file or many, or the cells of a raster."""
-        return tiles_of(self.input) or band_of(Path(str(self.input)), self.options)
+        return band_of(cloud_of(self.input), self.options)
 
     @cached_property
     def reference(self) -> Path | Tiles:
@@ -70,24 +69,27 @@ class RunFolder:
         suffix = Path(str(self.options.reference)).suffix.lower()
         return is_cloud(self.reference) or suffix in (".tif", ".tiff")
 
-    def with_adjusted(self, step: dict[str, Any]) -> RunFolder:
+    def with_adjusted(self, model: str | None) -> RunFolder:
         """Return the run for the next steps, with the adjusted cameras if there are any."""
-        if step["model"] is None:
+        if model is None:
             return self
-        cameras = str(self.folder / FOLDER / step["model"])
         options = replace(
-            self.options, cameras=cameras, adjusted_from=self.options.cameras,
-            adjust="no", gcps=None, gnss=None, lens=None,
+            self.options, cameras=str(self.folder / FOLDER / model),
+            adjusted_from=self.options.cameras, adjust="no", gcps=None, gnss=None, lens=None,
         )  # fmt: skip
         return replace(self, options=options)
 
+    @cached_property
     def files(self) -> dict[str, list[Path]]:
-        """Return the input files by the first step that reads them; each exists."""
-        found = [*_files_of(self.source), *(one for path in self._named for one in files_in(path))]
-        found += [Path(self.options.water)] if Path(self.options.water).is_file() else []
-        compared = [] if self.options.reference is None else _files_of(self.reference)
-        compared += [path for _, one in self.options.also for path in _files_of(cloud_of(one))]
-        return {"adjust": found, "compare": compared}
+        """The input files by the first step that reads them; each exists."""
+        water = Path(self.options.water)
+        first = [check_input(one) for one in inputs_of(self.source)]
+        first += [one for path in self._named for one in files_in(path)]
+        first += [water] if water.is_file() else []
+        compared = [] if self.options.reference is None else [self.reference]
+        compared += [cloud_of(path) for _, path in self.options.also]
+        later = [check_input(path) for cloud in compared for path in inputs_of(cloud)]
+        return {"adjust": first, "compare": later}
 
     @property
     def _named(self) -> list[Path]:
@@ -101,10 +103,11 @@ class RunFolder:
 
     def keys(self) -> dict[str, str]:
         """Return a hash for each step, of its options, its input files and the step before it."""
-        settings, files, results = self.settings(), self.files(), self.folder.resolve()
+        settings, results = self.settings(), self.folder.resolve()
         # files that are read with a named one, such as sensor.csv, may appear later
-        read_too = {one for path in self._named for one in belonging(path)}
-        files["adjust"] += sorted(one for one in read_too if results not in one.resolve().parents)
+        more = {one for path in self._named for one in belonging(path)}
+        more = {one for one in more if results not in one.resolve().parents}
+        files = {**self.files, "adjust": [*self.files["adjust"], *sorted(more)]}
         keys, key = dict[str, str](), ""
         for step in STEPS:
             options = sorted(one for one in settings.items() if LATER.get(one[0], "adjust") == step)
@@ -129,35 +132,20 @@ class RunFolder:
         with _shown_before():
             return tiles_from(str(path), files) if isinstance(self.source, Tiles) else path
 
-    @property
-    def resolution_m(self) -> float:
-        """Cell size of the rasters; they must exist."""
-        with open_raster(self.folder / SURFACE) as dsm:
-            return float(dsm.res[0])
-
-    @property
-    def inputs(self) -> Inputs:
-        """The inputs of the correction, without the view list."""
-        return replace(self.options, views=None).part(Inputs)
-
     @cached_property
     def cameras(self) -> Cameras:
         """The cameras in the CRS of the cloud."""
+        inputs = replace(self.options, views=None).part(Inputs)
         with _shown_before():
-            return read_blocks(self.inputs, view_of(self.cloud("corrected"))).cameras
+            return read_blocks(inputs, view_of(self.cloud("corrected"))).cameras
 
     @cached_property
     def water(self) -> WaterSurface:
         """The water surface: as recorded in the corrected cloud, else as requested."""
-        with _shown_before():
-            cloud = self.cloud("corrected")
-            with open_cloud(cloud) as source:
-                stated = own_water(source)
-            return stated or self.inputs.surface(view_of(cloud)).surface
-
-
-def _files_of(cloud: CloudFiles) -> list[Path]:
-    return files_in(cloud) if isinstance(cloud, Path) else inputs_of(cloud)
+        cloud = self.cloud("corrected")
+        with _shown_before(), open_cloud(cloud) as source:
+            stated = own_water(source)
+            return stated or self.options.part(Inputs).surface(view_of(cloud)).surface
 
 
 def _shown_before() -> AbstractContextManager[Any]:
@@ -172,32 +160,56 @@ class Record:
     have not changed, and no step before it is done again. The file is written after each step.
     """
 
-    def __init__(self, run: RunFolder) -> None:
-        self._path, self._keys = run.folder / RECORD, run.keys()
+    def __init__(self, run: RunFolder, say: Callable[[str], None], bar: Bar = no_bar) -> None:
+        """Make the folder, or refuse one of another run.
+
+        `say` is called with a line on each step, and `bar` shows the progress of one.
+        """
+        folder = run.folder
+        if not folder.parent.is_dir():
+            sentence = f"{folder}: the folder {folder.parent} does not exist. Create it first."
+            raise SettingError("output.no_folder", sentence, path=folder)
+        folder.mkdir(exist_ok=True)
+        self._path, self._keys, self._say, self._bar = folder / RECORD, run.keys(), say, bar
         self._content: dict[str, Any] = {"options": run.settings(), "steps": {}}
         self._earlier = read_steps(self._path) if self._path.exists() else {}
-        self.resumes = self._has(STEPS[0])
-        """Whether there is an earlier run whose corrected cloud remains valid."""
+        resumes = self._has(STEPS[0])
+        if not (run.options.overwrite or resumes) and any(folder.iterdir()):
+            raise SettingError(
+                "run.other",
+                f"{folder}: holds a run with other options or input files, or other files. Add"
+                " --overwrite to replace them, or give another folder.",
+                path=folder,
+            )
 
     def _has(self, step: str) -> bool:
         return bool(self._earlier.get(step, {}).get("key") == self._keys[step])
 
-    def step(self, name: str, outputs: Sequence[Path], work: Callable[[], Any]) -> tuple[Any, bool]:
-        """Do a step, or skip it; return its result and whether it was skipped.
+    def step(
+        self, name: str, title: str, outputs: Sequence[Path],
+        work: Callable[[Progress | None], Plain | None], text: str = "{main}",
+        main: Path | None = None,
+    ) -> Plain:  # fmt: skip
+        """Do a step unless it is done, and return its result.
 
-        `outputs` are all files that `work` writes. `work` returns what later steps need, in the
-        types of JSON.
+        `outputs` are all files that `work` writes, and `main` is shown to the user, by default the
+        first; with the `text`, in which values of the result have their names. The result has what
+        later steps need, in the types of JSON.
         """
-        done = self._earlier.get(name, {})
-        was_done = self._has(name) and done["outputs"] == [file_state(one) for one in outputs]
-        if not was_done:
-            self._earlier = {}  # later steps must be done again
-            result = json.loads(json.dumps(work()))
+        done, how = self._earlier.get(name, {}), "already done"
+        if not self._has(name) or done["outputs"] != [file_state(one) for one in outputs]:
+            self._earlier, how = {}, "done"  # later steps must be done again
+            with self._bar(title) as progress:
+                found = json.loads(json.dumps(work(progress)))
             states = [file_state(one) for one in outputs]
-            done = {"key": self._keys[name], "outputs": states, "result": result}
+            done = {"key": self._keys[name], "outputs": states, "result": found}
         self._content["steps"][name] = done
         write_text(self._path, json_text(self._content), overwrite=True)
-        return done["result"], was_done
+        result: Plain = done["result"] or {}
+        if name != "adjust" or result["model"] is not None:
+            words = text.format(main=main or outputs[0], **result)
+            self._say(f"{name:<9} {how}: {words}")
+        return result
 
 
 def read_steps(path: Path) -> dict[str, Any]:

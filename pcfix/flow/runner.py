@@ -22,6 +22,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 from hashlib import sha256
+from itertools import accumulate
 from operator import add
 from os import PathLike
 from pathlib import Path
@@ -109,18 +110,13 @@ class FileTask:
 
     @property
     def record(self) -> Path:
-        """The file with its statistics, written just before its output appears."""
+        """The file with its key and statistics, written just after its output."""
         return self.target.parent / RECORDS / f"{self.target.name}.tally"
 
     @property
     def is_finished(self) -> bool:
         """Whether the output exists, with the same key."""
         return self.target.is_file() and files.read_tally(self.record)[0] == self.key
-
-    def save(self, tally: Any) -> None:
-        """Write the statistics; an older output must not be taken for the one that follows."""
-        self.target.unlink(missing_ok=True)
-        write_bytes(self.record, pickle.dumps((self.key, tally)), overwrite=True)
 
 
 def run_command(
@@ -152,7 +148,7 @@ def run_command(
         task = replace(task, rasters=targets)
         with threads(task.jobs), running(clouds={}), all_or_none():
             planned = plan(task)
-            result: Result = stream(work, planned, task, partial(finish, planned, task))
+            result = finish(planned, task, stream(work, planned, task))
             write_summary(options, result)
         return result
     folder = files.path_of(output)
@@ -163,7 +159,11 @@ def run_command(
         sentence = f"{folder}: is inside the folder of the inputs. Give one outside of it."
         raise SettingError("output.is_input", sentence, path=folder)
     check_summary(options, tiles.paths)
-    tasks = _tasks(name, tiles, folder, options)
+    key, first_rows = key_of(name, options, tiles.paths), accumulate(tiles.points, initial=0)
+    tasks = [
+        FileTask(path.resolve(), folder.resolve() / path.name, points=points, row=row, key=key)
+        for path, points, row in zip(tiles.paths, tiles.points, first_rows, strict=False)
+    ]
     todo = [one for one in tasks if not one.is_finished]
     for one in todo if folder.exists() else ():
         check_cloud(one.target, overwrite=options.overwrite, inputs=tiles.paths)
@@ -204,11 +204,8 @@ def run_command(
     return result
 
 
-def stream(work: Work, plan: Any, task: FileTask, finish: Callable[[Any], Any]) -> Any:
-    """Take every chunk of a file through a command; the target appears when all went well.
-
-    Returns what `finish` makes of the statistics.
-    """
+def stream(work: Work, plan: Any, task: FileTask) -> Any:
+    """Take every chunk of a file through a command, and return the statistics of all points."""
     with open_cloud(task.source, task.jobs) as source:
         own, total = work(plan, source), len(source)
         tally, done, end, reached = None, 0, 0, 0.0  # points before and after, and those reported
@@ -231,20 +228,18 @@ def stream(work: Work, plan: Any, task: FileTask, finish: Callable[[Any], Any]) 
                 if task.progress is not None:
                     task.progress(round(reached), total)
 
-            written: Future[None] | None = None
+            written: Future[Any] = writer.submit(bool)  # nothing yet
             for points in read_ahead(source.chunks()):
                 end = done + len(points)
                 with running(report=report):
                     result, one = own.compute(points, task.row + done)
-                if written is not None:
-                    written.result()  # at most one chunk waits, which bounds the memory
+                written.result()  # at most one chunk waits, which bounds the memory
                 written = writer.submit(write, points, result)
                 tally = one if tally is None else tally + one
                 done = end
                 report(len(points))
-            if written is not None:
-                written.result()
-            return finish(tally)  # before the temporary file is renamed
+            written.result()
+    return tally
 
 
 def read_ahead(chunks: Iterator[Any]) -> Iterator[Any]:
@@ -254,16 +249,6 @@ def read_ahead(chunks: Iterator[Any]) -> Iterator[Any]:
         while (one := following.result()) is not None:
             following = reader.submit(next, chunks, None)
             yield one
-
-
-def _tasks(name: str, tiles: Tiles, folder: Path, options: Any) -> list[FileTask]:
-    """Return a task for each file, in their order."""
-    key, tasks, row = key_of(name, options, tiles.paths), list[FileTask](), 0
-    for path, points in zip(tiles.paths, tiles.points, strict=True):
-        target = folder.resolve() / path.name
-        tasks.append(FileTask(path.resolve(), target, points=points, row=row, key=key))
-        row += points
-    return tasks
 
 
 def key_of(
@@ -307,7 +292,10 @@ def do_task(pickled: bytes, task: FileTask, jobs: int | None = None) -> str:
         work, plan = pickle.loads(pickled)
         with threads(jobs), warnings.catch_warnings():
             warnings.simplefilter("ignore", PcfixWarning)  # shown when the plan was made
-            stream(work, plan, replace(task, jobs=jobs), task.save)
+            task.record.unlink(missing_ok=True)  # that of an older output
+            with all_or_none():
+                tally = stream(work, plan, replace(task, jobs=jobs))
+                write_bytes(task.record, pickle.dumps((task.key, tally)), overwrite=True)
     except PcfixError as error:
         return str(error)
     return ""

@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 import warnings
 from contextlib import closing, nullcontext
+from pathlib import Path
 from xml.etree import ElementTree
 
 import laspy
@@ -228,13 +229,17 @@ def test_later_option(copied, more, first):
     assert ("Lake &lt;2&gt;" in (copied / "out" / "report.html").read_text()) is (first == "report")
 
 
-def steps_done(record):
-    """Do the steps of a record that are not done yet, and return their names."""
-    return [name for name in STEPS if not record.step(name, [], lambda: None)[1]]
+def steps_done(run, steps=STEPS):
+    """Do the steps of a run that are not done yet, and return their names."""
+    printed = []
+    record = Record(run, printed.append)
+    for name in steps:
+        record.step(name, name, [Path(name)], lambda _: {"model": ""})
+    return [line.split()[0] for line in printed if line.split()[1] == "done:"]
 
 
 def asked(folder, **options):
-    options = {"cameras": str(SCENE / "cameras.csv"), "water": "0.37", **options}
+    options = {"cameras": str(SCENE / "cameras.csv"), "water": "0.37", "overwrite": True, **options}
     return RunFolder(folder, str(SCENE / "cloud.laz"), RunOptions(**options))
 
 
@@ -249,40 +254,32 @@ def test_files_and_version(tmp_path, monkeypatch):
     (tmp_path / "out").mkdir()
     named = {"cameras": str(tmp_path / "cameras.csv"), "views": str(tmp_path / "project.psx")}
 
-    def record():
-        return Record(asked(tmp_path / "out", **named))
+    def done():
+        return steps_done(asked(tmp_path / "out", **named))
 
-    assert steps_done(record()) == list(STEPS)
-    assert record().resumes and steps_done(record()) == []
+    assert done() == list(STEPS)
+    assert done() == []
     for name in ("sensor.csv", "project.files/0/doc.xml", "cameras.prj"):
         (tmp_path / name).write_text("another")
-        assert not record().resumes
-        assert steps_done(record()) == list(STEPS)
+        assert done() == list(STEPS)
     (tmp_path / "unread.prj").write_text("another")
-    assert steps_done(record()) == []
+    assert done() == []
     monkeypatch.setattr("pcfix.flow.run_folder.__version__", "9.9")
-    assert not record().resumes
+    assert done() == list(STEPS)
 
 
 def test_reference_added(tmp_path):
     touched = tmp_path / "lidar.laz"
     shutil.copy(SCENE / "lidar.laz", touched)
 
-    def record(**options):
-        return Record(asked(tmp_path, **options))
-
-    before = record()
-    for name in ("adjust", "correct", "clean", "dsm", "map", "report"):
-        before.step(name, [], lambda: None)
-    added = record(reference=str(touched))
-    assert added.resumes
-    assert steps_done(added) == ["compare", "map", "report"]
+    before = [name for name in STEPS if name != "compare"]
+    assert steps_done(asked(tmp_path), before) == before
+    run = asked(tmp_path, reference=str(touched))
+    assert steps_done(run) == ["compare", "map", "report"]
     os.utime(touched)
-    assert steps_done(record(reference=str(touched))) == ["compare", "map", "report"]
+    assert steps_done(asked(tmp_path, reference=str(touched))) == ["compare", "map", "report"]
     for other in ({"index": 1.33}, {"water": "0.4"}):
-        changed = record(reference=str(touched), **other)
-        assert not changed.resumes
-        assert steps_done(changed) == list(STEPS)
+        assert steps_done(asked(tmp_path, reference=str(touched), **other)) == list(STEPS)
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ from tests.utils.program import run_pcfix
 def first_step(scene, folder, **options):
     asked = {"cameras": scene.model, "water": "0", **options}
     given = RunFolder(folder, str(scene.folder / "cloud.las"), RunOptions(**asked))
-    return adjust_first(given, [path for some in given.files().values() for path in some])
+    return adjust_first(given, [path for some in given.files.values() for path in some])
 
 
 STEPS = ["adjust", "correct", "clean", "dsm", "compare", "map", "report"]
