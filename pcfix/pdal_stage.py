@@ -22,46 +22,40 @@ import ctypes
 import json
 import os
 import sys
-import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from pcfix.errors import PcfixError, SettingError, plain, show_warning
 from pcfix.io.pdal import NAME, Dimensions, PdalCloud, Results, metadata_of
 from pcfix.model import LOW_NOISE, WaterDimension, WaterSurface
-from pcfix.options.correct import RasterOutputs
+from pcfix.options.correct import CorrectOptions, LabelOptions, RasterOutputs
 from pcfix.options.declare import OptionSet, named, options_of
 from pcfix.options.shared import BandOption
-
-Set = TypeVar("Set", bound=OptionSet)
+from pcfix.options.steps import CleanOptions
 
 if TYPE_CHECKING:
+    from pcfix.flow.runner import FileTask
     from pcfix.flow.surfaces import CloudView, Points
 
-Stage: TypeAlias = Callable[[Dimensions, Dimensions], bool]
-Work: TypeAlias = Callable[[dict[str, Any], Dimensions, Dimensions], None]
+Done: TypeAlias = tuple[Dimensions, dict[str, Any]]
+"""The arrays that a stage changes, and its summary."""
 
 COLOURS = ("Red", "Green", "Blue")
 
 
-def __getattr__(name: str) -> Stage:
+def __getattr__(name: str) -> Callable[[Dimensions, Dimensions], bool]:
     """Return the stage of this name, bound to the globals of the module that imports it."""
-    work = {"correct": _correct, "label": _label, "clean": _clean}.get(name)
-    if work is None:
+    if name not in STAGES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    namespace = sys._getframe(1).f_globals
-
-    def stage(ins: Dimensions, outs: Dimensions) -> bool:
-        return _run(work, namespace, ins, outs)
-
-    return stage
+    return partial(_run, name, sys._getframe(1).f_globals)
 
 
-def _run(work: Work, namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> bool:
+def _run(name: str, namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> bool:
     """Run with libraries separate from PDAL's, and leave the process usable after a failure."""
     before = sys.getdlopenflags()
     # PDAL links to its own PROJ and GDAL; sharing symbols with ours crashes the program at its exit
@@ -71,7 +65,7 @@ def _run(work: Work, namespace: dict[str, Any], ins: Dimensions, outs: Dimension
         with warnings.catch_warnings():
             if in_program:
                 warnings.showwarning = show_warning
-            work(namespace, ins, outs)
+            _run_stage(name, namespace, ins, outs)
         return True
     except PcfixError as error:
         _repair_process(error)
@@ -92,80 +86,77 @@ def _run(work: Work, namespace: dict[str, Any], ins: Dimensions, outs: Dimension
     raise type(mistake)(mistake.code, sentence, **mistake.values)
 
 
-def _correct(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
-    from pcfix.flow.correct import finish
-    from pcfix.flow.correction import correct_chunk
+# All that loads libraries is imported below, within `_run`.
+
+
+def _run_stage(name: str, namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
+    """Read options and cloud, run the stage, and report its summary."""
     from pcfix.flow.inputs import paths_in
-    from pcfix.flow.planning import plan_correction, read_inputs
     from pcfix.flow.runner import FileTask, check_summary, write_summary
-    from pcfix.io.las.columns import columns_for
-    from pcfix.options.correct import CorrectOptions
     from pcfix.running import threads
 
-    task = FileTask(NAME, Path(NAME))
-    options = _options(namespace, CorrectOptions)
+    work, kind = STAGES[name]
+    options, task = _options(namespace, kind), FileTask(NAME, Path(NAME))
     cloud = PdalCloud(ins, namespace.get("metadata"))
-    results = Results(cloud, columns_for(options.dimensions))
-    plan = read_inputs(options, _view(cloud))
     check_summary(options, paths_in(options))
-    tally: Any = None
     with threads(options.jobs):
-        plan = plan_correction(plan)
-        for rows, points in _chunks(cloud, plan.found.surface):
-            correction, one = correct_chunk(plan, points, rows.start)
-            results.add(rows, correction)
-            tally = one if tally is None else tally + one
-    summary = finish(plan, task, tally)
-    outs.update(results.dimensions)
-    write_summary(options, summary.as_dict())
-    namespace["out_metadata"] = metadata_of(summary.as_dict())
-
-
-def _label(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
-    from pcfix.flow.label import check, label_chunk, plan_labelling
-    from pcfix.options.correct import StageLabelOptions
-
-    options = _options(namespace, StageLabelOptions)
-    cloud = PdalCloud(ins, namespace.get("metadata"))
-    plan = plan_labelling(options, _view(cloud))
-    classes, tally = cloud.classes.copy(), None
-    for rows, points in _chunks(cloud, plan.water):
-        classes[rows], one = label_chunk(plan, points)
-        tally = one if tally is None else tally + one
-    if tally is None:
-        return
-    check(plan, tally)
-    outs["Classification"] = classes
-    outs.update(cloud.flags())
-    found = {**tally.of_classes(), "labelling": plan.labelling.report(tally)}
-    namespace["out_metadata"] = metadata_of(found)
-
-
-def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None:
-    from pcfix.flow.clean import find_noise
-    from pcfix.flow.runner import check_summary, write_summary
-    from pcfix.options.steps import CleanOptions
-    from pcfix.running import threads
-
-    started = time.perf_counter()
-    options = _options(namespace, CleanOptions)
-    cloud = PdalCloud(ins, namespace.get("metadata"))
-    check_summary(options)
-    with threads(options.jobs):
-        noise, found = find_noise(options, _view(cloud))
-    if options.drop:
-        outs["Mask"] = ~noise
-    else:
-        cloud.withheld |= noise
-        outs["Classification"] = np.where(noise, LOW_NOISE, cloud.classes).astype(np.uint8)
-        outs.update(cloud.flags())
-    seconds = round(time.perf_counter() - started, 3)
-    summary = plain({**found, "input": NAME, "output": NAME, "seconds": seconds})
+        arrays, summary = work(options, cloud, task)
+    outs.update(arrays)
     write_summary(options, summary)
     namespace["out_metadata"] = metadata_of(summary)
 
 
-def _options(namespace: dict[str, Any], kind: type[Set]) -> Set:
+def _correct(options: CorrectOptions, cloud: PdalCloud, task: FileTask) -> Done:
+    from pcfix.flow.correct import finish
+    from pcfix.flow.correction import correct_chunk
+    from pcfix.flow.planning import plan_correction, read_inputs
+    from pcfix.io.las.columns import columns_for
+
+    results = Results(cloud, columns_for(options.dimensions))
+    plan, tally = plan_correction(read_inputs(options, _view(cloud))), None
+    for rows, points in _chunks(cloud, plan.found.surface):
+        correction, one = correct_chunk(plan, points, rows.start)
+        results.add(rows, correction)
+        tally = one if tally is None else tally + one
+    summary = finish(plan, task, tally)  # type: ignore[arg-type]  # PDAL runs no stage on no points
+    return results.dimensions, summary.as_dict()
+
+
+def _label(options: LabelOptions, cloud: PdalCloud, task: FileTask) -> Done:
+    from pcfix.flow.label import check, label_chunk, plan_labelling
+
+    plan, classes, tally = plan_labelling(options, _view(cloud)), cloud.classes.copy(), None
+    for rows, points in _chunks(cloud, plan.water):
+        classes[rows], one = label_chunk(plan, points)
+        tally = one if tally is None else tally + one
+    if tally is None:
+        return {}, {}
+    check(plan, tally)
+    summary = {**tally.of_classes(), "labelling": plan.labelling.report(tally)}
+    return {"Classification": classes, **cloud.flags()}, summary
+
+
+def _clean(options: CleanOptions, cloud: PdalCloud, task: FileTask) -> Done:
+    from pcfix.flow.clean import find_noise
+
+    noise, found = find_noise(options, _view(cloud))
+    summary = plain({**found, "input": NAME, "output": NAME, "seconds": task.seconds})
+    if options.drop:
+        return {"Mask": ~noise}, summary
+    cloud.withheld |= noise
+    classes = np.where(noise, LOW_NOISE, cloud.classes).astype(np.uint8)
+    return {"Classification": classes, **cloud.flags()}, summary
+
+
+STAGES: dict[str, tuple[Callable[..., Done], type[OptionSet]]] = {
+    "correct": (_correct, CorrectOptions),
+    "label": (_label, LabelOptions),
+    "clean": (_clean, CleanOptions),
+}
+"""The function of each stage, and its options."""
+
+
+def _options(namespace: dict[str, Any], kind: type[OptionSet]) -> Any:
     """Return the options of the stage, checked."""
     given = namespace.get("pdalargs") or {}
     if not isinstance(given, dict):

@@ -18,7 +18,7 @@ from pcfix.io.las.writing import output_header
 from pcfix.io.tiles import Clouds
 from pcfix.label.labelling import Classes, LabelCounts, Labelling
 from pcfix.model import WaterPlane, WaterSurface
-from pcfix.options.correct import LabelOptions, StageLabelOptions
+from pcfix.options.correct import LabelOptions
 from pcfix.options.declare import File, taken
 from pcfix.sums import Figures
 from pcfix.version import __version__
@@ -61,7 +61,7 @@ class LabelPlan:
     labelling: Labelling
 
 
-def plan_labelling(options: StageLabelOptions, view: CloudView) -> LabelPlan:
+def plan_labelling(options: LabelOptions, view: CloudView) -> LabelPlan:
     """Read water and mask, and scan the surroundings of all points if the rules need them."""
     water = find_surface(options.water, options, view).surface
     check_tilt(water)

@@ -188,11 +188,7 @@ class CorrectOptions(
     """The options of ``pcfix correct``; in Python they are `pcfix.Options`."""
 
 
-class StageLabelOptions(LandRules, MaskOption, NeededOptions):
-    """The options of the PDAL stage ``label``, which writes no files."""
-
-
-class LabelOptions(BandOption, TileOptions, SummaryOption, StageLabelOptions):
+class LabelOptions(BandOption, TileOptions, SummaryOption, LandRules, MaskOption, NeededOptions):
     """The options of ``pcfix label``."""
 
 
