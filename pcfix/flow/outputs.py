@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import shapely
@@ -34,7 +33,7 @@ from pcfix.options.declare import File
 from pcfix.options.steps import DsmOptions
 from pcfix.report.adjustment import adjustment_sentence
 from pcfix.report.comparison import evaluation
-from pcfix.report.page import Report, Table, extent_of, render
+from pcfix.report.page import Table, extent_of, render
 from pcfix.report.run import RunMaps, run_report
 from pcfix.report.styles import Symbol, limits_of, vector_style
 from pcfix.report.text import Plain, Summary
@@ -259,49 +258,28 @@ def _checks(folder: Path, points: FloatArray, depths: File | None) -> list[Layer
 def report_run(
     run: RunFolder, inputs: list[Path], first: Plain, corrected: Plain, compared: Plain
 ) -> Plain:
-    """Write the page of a run, and return its main figures.
+    """Write ``report.html`` and ``figures/*.png`` of a run, and return its main figures.
 
-    `first`, `corrected` and `compared` are the results of these steps.
+    The page lists size and checksum of the files `inputs`. `first`, `corrected` and `compared` are
+    the results of these steps.
     """
-    more: Plain = {"pictures": [], "tables": [], "compared": compared.get("figures", {})}
-    if first["why"]:
-        how = "not adjusted:" if first["model"] is None else "adjusted first, as"
-        more["verdict"] = f" The cameras were {how} {first['why']}."
-    options, summary = run.options, Summary(**corrected)
+    folder, options, summary = run.folder, run.options, Summary(**corrected)
     names = [SURFACE, DEPTH, *([] if summary.uncertainty is None else [UNCERTAINTY])]
     names += [DIFFERENCE] if compared and run.has_surface else []
     with open_cloud(run.cloud("cleaned")) as source:
-        maps = read_maps(run.folder, names, *crs_words(stated_crs(source)))
+        maps = _read_maps(folder, names, *crs_words(stated_crs(source)))
+    more: Plain = {"verdict": "", "compared": compared.get("figures", {})}
     if compared:
-        figures = evaluation(
-            compared["figures"], compared["sections"], maps.difference_m, extent_of(maps.lattice)
+        extent = extent_of(maps.lattice)
+        more["pictures"], more["tables"] = evaluation(
+            compared["figures"], compared["sections"], maps.difference_m, extent
         )
-        more |= {"pictures": figures[0], "tables": figures[1]}
+    if first["why"]:
+        how = "not adjusted:" if first["model"] is None else "adjusted first, as"
+        more["verdict"] = f" The cameras were {how} {first['why']}."
     if first["model"] is not None:
-        more["verdict"] += f" {adjustment_sentence(read_json(run.folder / FOLDER / SUMMARY))}."
-    page = write_report(
-        run.folder, summary, run.cameras, maps, inputs,
-        project=options.project or "", date=options.date or "", **more,
-    )  # fmt: skip
-    shown = (
-        f"{', '.join(filter(None, [tile.title, tile.tag]))}: "
-        + ", ".join(f"{name} {value}" for name, value in tile.figures)
-        for tile in page.tiles
-        if tile.figures
-    )
-    return {"in_short": "; ".join(shown)}
-
-
-def write_report(
-    folder: Path, summary: Summary, cameras: Cameras, maps: RunMaps, inputs: Sequence[Path],
-    **more: Any,
-) -> Report:  # fmt: skip
-    """Write ``report.html`` and ``figures/*.png`` of a run, into its folder.
-
-    The page lists size and checksum of the files `inputs`; `more` goes to `run_report`.
-    """
+        more["verdict"] += f" {adjustment_sentence(read_json(folder / FOLDER / SUMMARY))}."
     rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in inputs]
-    table = Table("Input files", ["file", "bytes", "SHA-256"], rows)
     files = []
     for name, words in RESULTS.items():
         tiles = folder / name.removesuffix(".laz")
@@ -311,16 +289,25 @@ def write_report(
             files.append((f"{tiles.name}/", words))
     sections = sorted(folder.glob("compare/section_*.csv"))
     files += [(f"compare/{one.name}", "a cross-section") for one in sections]
-    report = run_report(summary, cameras, maps, inputs=[table], files=files, **more)
+    page = run_report(
+        summary, run.cameras, maps, project=options.project or "", date=options.date or "",
+        inputs=[Table("Input files", ["file", "bytes", "SHA-256"], rows)], files=files, **more,
+    )  # fmt: skip
     figures = folder / "figures"
     figures.mkdir(exist_ok=True)
-    for picture in report.pictures:
+    for picture in page.pictures:
         write_bytes(figures / f"{picture.name}.png", picture.png, overwrite=True)
-    write_text(folder / PAGE, render(report), overwrite=True)
-    return report
+    write_text(folder / PAGE, render(page), overwrite=True)
+    shown = (
+        f"{', '.join(filter(None, [tile.title, tile.tag]))}: "
+        + ", ".join(f"{name} {value}" for name, value in tile.figures)
+        for tile in page.tiles
+        if tile.figures
+    )
+    return {"in_short": "; ".join(shown)}
 
 
-def read_maps(folder: Path, names: Sequence[str], crs: str = "", heights: str = "") -> RunMaps:
+def _read_maps(folder: Path, names: Sequence[str], crs: str, heights: str) -> RunMaps:
     """Read rasters of a run by name, in cells of theirs, or of several where there are many.
 
     `crs` and `heights` name the CRS of the cloud and its vertical datum.

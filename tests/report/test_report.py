@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import shutil
 import zlib
 from html.parser import HTMLParser
 from itertools import pairwise
@@ -11,8 +12,10 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.flow.outputs import read_maps, write_report
+from pcfix.flow.outputs import report_run
+from pcfix.flow.run_folder import RunFolder
 from pcfix.grid.lattice import Lattice
+from pcfix.options.correct import RunOptions
 from pcfix.report.page import Layer, Report, Table, Tile, render
 from tests.utils.browser import needs_browser, open_page
 from tests.utils.shared import SCENE
@@ -26,11 +29,12 @@ def report(tmp_path_factory):
     summary = pcfix.correct_file(
         cloud, folder / "corrected.laz", cameras=cameras, water=0.37, method="snell", max_angle=None
     )
-    for what in (names := ["surface", "depth", "uncertainty"]):
+    for what in ("surface", "depth", "uncertainty"):
         more = {} if what == "surface" else {"what": what}
         pcfix.grid_dsm(folder / "corrected.laz", folder / f"{what}.tif", resolution=1.0, **more)
-    maps = read_maps(folder, [f"{what}.tif" for what in names])
-    write_report(folder, summary, pcfix.read_cameras(cameras), maps, [cloud, cameras])
+    shutil.copy(folder / "corrected.laz", folder / "cleaned.laz")
+    run = RunFolder(folder, str(cloud), RunOptions(cameras=str(cameras), water="0.37"))
+    report_run(run, [cloud, cameras], {"why": "", "model": None}, vars(summary), {})
     return folder, summary
 
 
