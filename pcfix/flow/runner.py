@@ -57,8 +57,6 @@ HOW = ("overwrite", "jobs", "scheduler", "summary")
 """Options on which no output depends."""
 WAIT_S = 10
 """For a scheduler to answer, and for its first worker."""
-Run = Callable[[Callable[..., str], bytes, Sequence[Any]], Iterator[tuple[Any, str]]]
-"""Yields tasks with their errors as they are done, with the same pickled bytes for all."""
 POINTS_A_PROCESS = 500_000
 """These take about as long as another process takes to start."""
 
@@ -176,7 +174,7 @@ def run_command(
             sentence = f"{folder}: cannot be created ({error.strerror})."
             raise InputError("output.folder", sentence) from error
         done = len(tiles) - points
-        for one, why in run(do_task, pickle.dumps((work, planned)), todo):
+        for one, why in run(pickle.dumps((work, planned)), todo):
             failed += [why] if why else []
             done += 0 if why else one.points
             if progress is not None:
@@ -304,10 +302,10 @@ def do_task(pickled: bytes, task: FileTask, jobs: int | None = None) -> str:
 def in_processes(
     work: Callable[..., str], shared: bytes, tasks: Sequence[Any], most: int, jobs: int | None
 ) -> Iterator[tuple[Any, str]]:
-    """Do tasks in processes of this machine, see `Run`.
+    """Do tasks in processes of this machine, and yield each with its error as it is done.
 
     At most `most` processes share `jobs` threads, all cores by default. A single one is this
-    process.
+    process. `shared` is for all tasks.
     """
     jobs = jobs or current().threads
     most = min(most, jobs, len(tasks))
@@ -338,18 +336,6 @@ def _begin_process() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
 
 
-def on_cluster(
-    client: Any, work: Callable[..., str], shared: bytes, tasks: Sequence[Any]
-) -> Iterator[tuple[Any, str]]:
-    """Do tasks on the workers of a cluster, see `Run`."""
-    everywhere = client.scatter(shared, broadcast=True)  # a lost worker loses its own copy only
-    executor: Executor = client.get_executor(pure=False)
-    try:
-        yield from _finished({executor.submit(work, everywhere, one, 1): one for one in tasks})
-    finally:
-        executor.shutdown(wait=False)
-
-
 def _finished(futures: dict[Future[str], Any]) -> Iterator[tuple[Any, str]]:
     """Yield tasks with their errors as they are done."""
     for future in completed(futures):
@@ -362,13 +348,17 @@ def _finished(futures: dict[Future[str], Any]) -> Iterator[tuple[Any, str]]:
 
 
 @contextmanager
-def machines(address: str | None, jobs: int | None, points: int) -> Iterator[Run]:
-    """Give the function that runs a task for each file, with this number of points in all.
+def machines(
+    address: str | None, jobs: int | None, points: int
+) -> Iterator[Callable[[bytes, Sequence[FileTask]], Iterator[tuple[FileTask, str]]]]:
+    """Give a function that does `do_task` for tasks of this number of points in all.
 
-    It uses processes of this machine, or the workers of the scheduler at an address.
+    It takes what is pickled for all tasks, and yields each with its error as it is done. It uses
+    processes of this machine, or the workers of the scheduler at an address.
     """
     if address is None:
-        yield partial(in_processes, most=jobs or 1 + points // POINTS_A_PROCESS, jobs=jobs)
+        most = jobs or 1 + points // POINTS_A_PROCESS
+        yield partial(in_processes, do_task, most=most, jobs=jobs)
         return
     distributed = optional_library("distributed", "cluster", f"--scheduler {address}")
     try:
@@ -389,7 +379,17 @@ def machines(address: str | None, jobs: int | None, points: int) -> Iterator[Run
                 f"scheduler {address}: has no workers. Start some with 'dask worker {address}'.",
                 address=address,
             ) from error
-        yield partial(on_cluster, client)
+
+        def run(shared: bytes, tasks: Sequence[FileTask]) -> Iterator[tuple[FileTask, str]]:
+            everywhere = client.scatter(shared, broadcast=True)  # a lost worker loses its own copy
+            executor: Executor = client.get_executor(pure=False)
+            try:
+                futures = {executor.submit(do_task, everywhere, one, 1): one for one in tasks}
+                yield from _finished(futures)
+            finally:
+                executor.shutdown(wait=False)
+
+        yield run
 
 
 # Files that a command reads and writes
