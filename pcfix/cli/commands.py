@@ -193,7 +193,7 @@ def water(spec: str, /, *, options: WaterCheckOptions) -> None:
     """Read, fit or detect a water surface, with its standard error."""
     from pcfix.flow.water import check_water, water_text
 
-    say(water_text(check_water(spec, options)))
+    say(water_text(*check_water(spec, options)))
 
 
 @command("pcfix restore corrected.laz cloud.laz", input=TILED, output=CLOUD)

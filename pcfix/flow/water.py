@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -36,8 +36,10 @@ _FIT: RowTable = (
 
 def check_water(
     spec: Any, options: WaterCheckOptions | None = None, **keywords: Any
-) -> WaterReport:
+) -> tuple[FoundSurface, Plain]:
     """Read, fit or find a water surface, and describe it; ``pcfix water``.
+
+    Returns the surface, and what describes it in the types of JSON.
 
     Parameters
     ----------
@@ -81,19 +83,12 @@ def check_water(
         "notes": list(map(str, found.notes)),
     })  # fmt: skip
     write_summary(given, figures)
-    return WaterReport(found, figures)
+    return found, figures
 
 
-class WaterReport(NamedTuple):
-    """The report of ``pcfix water``."""
-
-    found: FoundSurface
-    figures: Plain  # as JSON holds them
-
-
-def water_text(report: WaterReport) -> str:
-    """Return the summary of a water surface."""
-    (found, r), rows = report, list[tuple[str, str]]()
+def water_text(found: FoundSurface, r: Plain) -> str:
+    """Return the summary of a water surface from the results of `check_water`."""
+    rows = list[tuple[str, str]]()
     if isinstance(found, ShoreFit):
         rows = filled(_FIT, found.as_dict())
         off = np.where(found.accepted, 0.0, np.nan_to_num(found.residual_m))

@@ -20,21 +20,6 @@ CLOUD, CAMERAS, SENSOR = SCENE / "cloud.laz", SCENE / "cameras.csv", SCENE / "se
 SOROLLA, sorolla = needs("cameras", "metashape", "uclm_sorolla")
 
 
-def table(path, change=lambda xyz: xyz, crs=None):
-    """Write the scene's cameras with other coordinates, and return the path."""
-    lines = CAMERAS.read_text().splitlines()
-    rows = [line.split(",") for line in lines[1:]]
-    moved = change(np.array([[float(v) for v in row[1:4]] for row in rows]))
-    text = [f"# crs: {crs}"] if crs else []
-    text.append(lines[0])
-    text += [
-        ",".join([row[0], *(repr(float(v)) for v in xyz), *row[4:]])
-        for row, xyz in zip(rows, moved, strict=True)
-    ]
-    path.write_text("\n".join(text) + "\n")
-    return path
-
-
 def test_good_block(tmp_path):
     done = run_pcfix(
         "cameras", CAMERAS, "--cloud", CLOUD, "--water", "0.37",
@@ -63,10 +48,12 @@ def test_heights_above_the_water(tmp_path):
     """Geocentric cameras have none; cameras below the water have no GSD."""
     to_earth = Transformer.from_crs("EPSG:32633", "EPSG:4978", always_xy=True)
 
-    def geocentric(xyz):
-        return np.column_stack(to_earth.transform(*xyz.T))
-
-    path = table(tmp_path / "cameras.csv", geocentric, "EPSG:4978")
+    lines = ["# crs: EPSG:4978", *CAMERAS.read_text().splitlines()]
+    for i, row in enumerate(line.split(",") for line in lines[2:]):
+        xyz = to_earth.transform(*map(float, row[1:4]))
+        lines[2 + i] = ",".join([row[0], *map(repr, xyz), *row[4:]])
+    path = tmp_path / "cameras.csv"
+    path.write_text("\n".join(lines))
     report = check_cameras(path, sensor=SENSOR, water=0.37)
     assert report.figures["problem"]
     assert report.figures["height_above_water_m"] is None
@@ -123,12 +110,6 @@ def test_groups_of_lenses(lenses, images, different):
     most = [max(one.focal for one in lenses if sensor["name"] == one.sensor)
             for sensor in sensors]  # fmt: skip
     assert [sensor["focal_most"] for sensor in sensors] == most
-
-
-@pytest.mark.parametrize("text", ["1,2", "a,b,c", "1,2,inf", ""])
-def test_offset_refused(text):
-    with pytest.raises(pcfix.SettingError):
-        Inputs(cameras=CAMERAS, water=0.37, cameras_offset=text)
 
 
 def test_sensor_of_the_original_cameras(tmp_path):

@@ -5,7 +5,6 @@ import json
 import laspy
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 import pcfix
 from pcfix.flow.water import check_water
@@ -17,51 +16,26 @@ from tests.utils.shared import SCENE
 CLOUD, CAMERAS = SCENE / "cloud.laz", SCENE / "cameras.csv"
 LEVEL_M = 0.37
 CRS = "EPSG:32633"
-TILT = 0.003
 
 
-class River:
-    """A level scene turned by 0.3 %: then its water is a tilted plane, and all else is exact."""
-
-    def __init__(self):
-        scene = pcfix.simulate_scene(3000, seed=11)
-        pivot = np.array([410_260.0, 4_650_340.0, LEVEL_M])
-        turn = Rotation.from_euler("y", -np.arctan(TILT)).as_matrix()
-
-        def turned(xyz):
-            return (xyz - pivot) @ turn.T + pivot
-
-        self.apparent, self.true = turned(scene.apparent_xyz), turned(scene.true_xyz)
-        self.cameras = pcfix.Cameras(
-            scene.cameras.labels, turned(scene.cameras.centres),
-            scene.cameras.rotations @ turn.T, scene.cameras.lenses,
-        )  # fmt: skip
-        self.views, self.gsd_m, self.pivot = scene.views, scene.gsd_m, pivot
-        self.low, self.high = self.apparent[:, :2].min(axis=0), self.apparent[:, :2].max(axis=0)
-
-    def height_at(self, xy):
-        """Return the true surface at places (n, 2)."""
-        return LEVEL_M + TILT * (xy[:, 0] - self.pivot[0])
-
-    def shoreline(self, seed, count=30, noise_m=0.01, outliers=0.2):
-        """Return points on both banks, of which a fifth are decimetres off."""
-        rng = np.random.default_rng(seed)
-        x = rng.uniform(self.low[0], self.high[0], count)
-        y = np.where(rng.random(count) < 0.5, self.low[1], self.high[1])
-        xy = np.column_stack([x, y + rng.uniform(-1.0, 1.0, count)])
-        z = self.height_at(xy) + rng.normal(0.0, noise_m, count)
-        wrong = rng.permutation(count)[: round(outliers * count)]
-        z[wrong] += rng.choice([-1.0, 1.0], len(wrong)) * rng.uniform(0.3, 2.0, len(wrong))
-        return np.column_stack([xy, z]), wrong
-
-    def rmse_z(self, corrected):
-        wet = self.true[:, 2] < self.height_at(self.true[:, :2]) - 0.2
-        return np.sqrt(np.mean((corrected.xyz - self.true)[wet, 2] ** 2))
+def shoreline(scene, seed, count=30, noise_m=0.01, outliers=0.2):
+    """Return points on two banks, and the rows of the fifth that are decimetres off."""
+    rng, (low, high) = np.random.default_rng(seed), bounds(scene)
+    x = rng.uniform(low[0], high[0], count)
+    y = np.where(rng.random(count) < 0.5, low[1], high[1])
+    xy = np.column_stack([x, y + rng.uniform(-1.0, 1.0, count)])
+    z = height_at(scene.water, xy) + rng.normal(0.0, noise_m, count)
+    wrong = rng.permutation(count)[: round(outliers * count)]
+    z[wrong] += rng.choice([-1.0, 1.0], len(wrong)) * rng.uniform(0.3, 2.0, len(wrong))
+    return np.column_stack([xy, z]), wrong
 
 
-@pytest.fixture(scope="module")
-def river():
-    return River()
+def bounds(scene):
+    return scene.apparent_xyz[:, :2].min(axis=0), scene.apparent_xyz[:, :2].max(axis=0)
+
+
+def height_at(water, xy):
+    return water.a + xy @ [water.b, water.c]
 
 
 @pytest.fixture(scope="module")
@@ -80,27 +54,25 @@ def write_points(path, xyz, names="x,y,z"):
     return path
 
 
-def test_tilted_river(river, tmp_path):
-    points, wrong = river.shoreline(seed=5)
-    path = write_points(tmp_path / "shore.csv", points)
-    report = check_water(path)
-    fit = report.found
-    corners = np.array([[x, y] for x in (0, 1) for y in (0, 1)]) * (river.high - river.low)
-    corners = corners + river.low
+def test_tilted_river(tmp_path):
+    scene = pcfix.simulate_scene(3000, seed=11, tilt_percent=0.5)
+    points, wrong = shoreline(scene, seed=5)
+    fit = check_water(write_points(tmp_path / "shore.csv", points))[0]
+    low, high = bounds(scene)
+    corners = low + np.array([[x, y] for x in (0, 1) for y in (0, 1)]) * (high - low)
     places = np.column_stack([corners, corners[:, :1]])
-    miss = surface_above(fit.surface, places).height_m - river.height_at(corners)
+    miss = surface_above(fit.surface, places).height_m - height_at(scene.water, corners)
     # noise of 1 cm on 24 good points: standard error 4 mm at a corner, so that 2 cm are 4 of them
     assert np.abs(miss).max() < 0.02
     assert set(np.flatnonzero(~fit.accepted)) == set(wrong)
-    assert fit.as_dict()["tilt_percent"] == pytest.approx(0.3, abs=0.03)
-    found = pcfix.correct_points(
-        river.apparent, river.cameras, report.found.surface, views=river.views
-    )
-    assert river.rmse_z(found) < river.gsd_m
-    level = pcfix.correct_points(
-        river.apparent, river.cameras, float(np.mean(points[:, 2])), views=river.views
-    )
-    assert river.rmse_z(level) > 2.0 * river.gsd_m  # what ignoring the tilt costs
+    assert fit.as_dict()["tilt_percent"] == pytest.approx(0.5, abs=0.03)
+    deep = scene.true_xyz[:, 2] < height_at(scene.water, scene.true_xyz[:, :2]) - 0.2
+    rmse = []
+    for water in (fit.surface, float(np.mean(points[:, 2]))):
+        found = pcfix.correct_points(scene.apparent_xyz, scene.cameras, water, views=scene.views)
+        rmse.append(np.sqrt(np.mean((found.xyz - scene.true_xyz)[deep, 2] ** 2)) / scene.gsd_m)
+    assert rmse[0] < 1.0
+    assert rmse[1] > 2.0  # what ignoring the tilt costs
 
 
 def invoke(*arguments):

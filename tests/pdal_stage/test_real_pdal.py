@@ -103,9 +103,6 @@ def test_water_of_a_dimension(tmp_path: Path, door: str) -> None:
     assert_same(tmp_path / "cli.las", tmp_path / "stage.las")
 
 
-# Recipes
-
-
 def options_of(recipe: str, folder: Path, **more: object) -> list[str]:
     """Return the words that send a recipe to the sample scene and its outputs to a folder."""
     # the doors are compared, not the methods: the quickest one will do
@@ -217,12 +214,6 @@ def test_options_of_recipes(path: Path) -> None:
         "readers.las", "readers.gdal", "filters.python", "filters.merge", "filters.splitter",
         "filters.outlier", "filters.range", "writers.las", "writers.gdal",
     }  # fmt: skip
-
-
-# Clouds larger than memory
-
-
-# Mistakes
 
 
 SURVIVE = """
