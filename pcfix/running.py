@@ -40,30 +40,14 @@ def _available_cores() -> int:
 
 @dataclass(frozen=True)
 class Run:
-    """Settings of a running command.
+    """Settings of a running command."""
 
-    Attributes
-    ----------
-    threads : int
-        Number of threads for kernels and searches.
-    report : callable
-        Called with the number of points that have just been corrected.
-    say : callable, optional
-        Called with a line of text after each step of an adjustment.
-    empty : callable
-        Creates large arrays; `pcfix.io.files.scratch_arrays` creates them on disk.
-    release : callable
-        Frees the memory of arrays on disk.
-    clouds : dict, optional
-        Points of small clouds by path, for commands that read them more than once.
-    """
-
-    threads: int
-    report: Callable[[float], None] = _nothing
-    say: Callable[[str], None] | None = None
-    empty: Empty = np.empty
-    release: Callable[[], None] = _nothing
-    clouds: dict[Path, list[Any]] | None = None
+    threads: int  # for kernels and searches
+    report: Callable[[float], None] = _nothing  # takes how many points have just been corrected
+    say: Callable[[str], None] | None = None  # takes a line of text after a step of an adjustment
+    empty: Empty = np.empty  # `pcfix.io.files.scratch_arrays` gives one for arrays on disk
+    release: Callable[[], None] = _nothing  # frees the memory of arrays on disk
+    clouds: dict[Path, list[Any]] | None = None  # points of small clouds that are read repeatedly
 
 
 _RUN = ContextVar("pcfix_run", default=Run(_available_cores()))  # noqa: B039 (frozen)

@@ -125,10 +125,9 @@ class Option(NamedTuple):
 
         A single value may replace a list, and a number may be text, as both occur in JSON.
         """
-        if self.repeats and isinstance(value, str):
+        is_one = _is_number(value) or (self.repeats and isinstance(value, str))
+        if isinstance(self.default, tuple) and is_one:
             value = (value,)
-        elif isinstance(self.default, tuple) and _is_number(value):
-            value = str(value) if self.parse is not None else (value,)
         if isinstance(value, str) and self.parse is not None:
             try:
                 value = self.parse(value)
