@@ -27,8 +27,6 @@ from pcfix.report.text import Plain, aligned
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
 
-MOST_SENSORS = 8
-"""Sensors in the text; the others are counted."""
 SAMPLE_POINTS = 50_000
 """Points of the cloud that are tested in the frames, evenly spread."""
 SHOWN_NAMES = 5
@@ -202,9 +200,7 @@ def cameras_text(report: CamerasReport) -> str:
     if missing:
         more = ", ..." if len(missing) > SHOWN_NAMES else ""
         images += f", {len(missing):,} without: {', '.join(missing[:SHOWN_NAMES])}{more}"
-    rows = [("Images", images), *(("Sensor", _sensor_words(s)) for s in sensors[:MOST_SENSORS])]
-    if len(sensors) > MOST_SENSORS:
-        rows.append(("", f"and {len(sensors) - MOST_SENSORS} more"))
+    rows = [("Images", images), *(("Sensor", _sensor_words(one)) for one in sensors)]
     if not sensors:
         rows.append(("Sensor", "none: the image sizes are not known"))
     if cameras.rotations is None:
