@@ -18,11 +18,9 @@ def optional_library(name: str, extra: str, who: str) -> Any:
         root = Path(__file__).parents[1]
         is_checkout = (root / "pyproject.toml").is_file()
         what = f"-e '{root}[{extra}]'" if is_checkout else f"'pcfix[{extra}]'"
-        raise InputError(
-            "library.missing",
-            f"{who} needs {name}, which is not installed. Run: {sys.executable} -m pip install"
-            f" {what}", library=name, extra=extra,
-        ) from error  # fmt: skip
+        sentence = f"{who} needs {name}, which is not installed. Run: {sys.executable} -m pip"
+        sentence += f" install {what}"
+        raise InputError("library.missing", sentence, library=name, extra=extra) from error
 
 
 analysis_library = partial(optional_library, extra="analysis", who="This")
@@ -44,9 +42,6 @@ def load_open3d(part: str = "open3d") -> Any:
             pass  # the libusb of the system may do
         return importlib.import_module(part)
     except (ImportError, OSError) as error:
-        raise InputError(
-            "library.missing",
-            f"open3d cannot be loaded ({error}). On Debian and Ubuntu: apt-get install"
-            " libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6.",
-            library="open3d",
-        ) from error
+        sentence = f"open3d cannot be loaded ({error}). On Debian and Ubuntu: apt-get install"
+        sentence += " libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6."
+        raise InputError("library.missing", sentence, library="open3d") from error

@@ -72,9 +72,8 @@ def running(**changes: Any) -> Iterator[None]:
 def threads(jobs: int | None) -> Iterator[None]:
     """Run with this number of threads; None changes nothing. Raises SettingError below 1."""
     if jobs is not None and jobs < 1:
-        raise SettingError(
-            "option.range", f"jobs {jobs} is less than 1.", option="jobs", value=jobs
-        )
+        sentence = f"jobs {jobs} is less than 1."
+        raise SettingError("option.range", sentence, option="jobs", value=jobs)
     with running(threads=jobs or current().threads):
         yield
 

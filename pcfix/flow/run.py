@@ -162,12 +162,9 @@ def _checked(options: RunOptions) -> RunOptions:
     for name in ("cameras", "water", "adjusted_from", "gcps"):
         value = getattr(options, name)
         if not isinstance(value, str | os.PathLike | Real | None):
-            raise SettingError(
-                "option.type",
-                f"run: {name} is a {type(value).__name__}. Give a file or text, which run.json can"
-                " keep, or use correct_file.",
-                option=name,
-            )
+            sentence = f"run: {name} is a {type(value).__name__}. Give a file or text, which"
+            sentence += " run.json can keep, or use correct_file."
+            raise SettingError("option.type", sentence, option=name)
         texts[name] = None if value is None else str(value)
     if options.water is None:
         raise SettingError("water.missing", "water is missing: give the water surface.")

@@ -175,12 +175,9 @@ class Record:
         self._earlier = read_steps(self._path) if self._path.exists() else {}
         resumes = self._has(STEPS[0])
         if not (run.options.overwrite or resumes) and any(folder.iterdir()):
-            raise SettingError(
-                "run.other",
-                f"{folder}: holds a run with other options or input files, or other files. Add"
-                " --overwrite to replace them, or give another folder.",
-                path=folder,
-            )
+            sentence = f"{folder}: holds a run with other options or input files, or other files."
+            sentence += " Add --overwrite to replace them, or give another folder."
+            raise SettingError("run.other", sentence, path=folder)
 
     def _has(self, step: str) -> bool:
         return bool(self._earlier.get(step, {}).get("key") == self._keys[step])
@@ -228,7 +225,6 @@ def finished_steps(folder: Path) -> dict[str, Any]:
         raise bad_file(path, "run.no_file", "the run has not written it.")
     steps = read_steps(path)
     if STEPS[-1] not in steps:
-        raise bad_file(
-            folder, "run.unfinished", "the run did not finish. Run it again; it resumes."
-        )
+        sentence = "the run did not finish. Run it again; it resumes."
+        raise bad_file(folder, "run.unfinished", sentence)
     return {name: step["result"] for name, step in steps.items()}

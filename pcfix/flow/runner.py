@@ -180,13 +180,10 @@ def run_command(
             if progress is not None:
                 progress(done, len(tiles))
         if failed:
-            raise InputError(
-                "tiles.failed",
-                f"{tiles}: {len(failed)} of {len(tasks)} files failed. The same command continues"
-                " with them; if files have changed, add --overwrite.\n"
-                + "\n".join(f"  {one}" for one in failed),
-                failed=failed,
-            )
+            sentence = f"{tiles}: {len(failed)} of {len(tasks)} files failed. The same command"
+            sentence += " continues with them; if files have changed, add --overwrite."
+            lines = "\n  ".join([sentence, *failed])
+            raise InputError("tiles.failed", lines, failed=failed)
         # in the order of the files, so that no sum depends on which was first
         tallies = [files.read_tally(one.record)[1] for one in tasks]
         tally = reduce(add, tallies) if tallies[0] is not None else None
@@ -280,11 +277,8 @@ def do_task(pickled: bytes, task: FileTask, jobs: int | None = None) -> str:
     """Process one file, here or on a worker; return the error, if there was one."""
     try:
         if task.pcfix != version.__version__:
-            raise InputError(
-                "cluster.version",
-                f"{task.source}: this worker has pcfix {version.__version__}, not {task.pcfix}."
-                " Install that there.",
-            )
+            sentence = f"{task.source}: this worker has pcfix {version.__version__}, not"
+            raise InputError("cluster.version", f"{sentence} {task.pcfix}. Install that there.")
         if task.is_finished:  # by a worker that was lost before it could say so
             return ""
         work, plan = pickle.loads(pickled)
@@ -364,21 +358,15 @@ def machines(
     try:
         client = distributed.Client(address, timeout=WAIT_S, set_as_default=False)
     except (OSError, ValueError) as error:  # TimeoutError is an OSError
-        raise InputError(
-            "cluster.no_answer",
-            f"scheduler {address}: does not answer within {WAIT_S} s ({error}). Check the address,"
-            " and that 'dask scheduler' runs there.",
-            address=address,
-        ) from error
+        sentence = f"scheduler {address}: does not answer within {WAIT_S} s ({error}). Check the"
+        sentence += " address, and that 'dask scheduler' runs there."
+        raise InputError("cluster.no_answer", sentence, address=address) from error
     with client:
         try:
             client.wait_for_workers(1, timeout=WAIT_S)
         except TimeoutError as error:
-            raise InputError(
-                "cluster.no_workers",
-                f"scheduler {address}: has no workers. Start some with 'dask worker {address}'.",
-                address=address,
-            ) from error
+            sentence = f"scheduler {address}: has no workers. Start 'dask worker {address}'."
+            raise InputError("cluster.no_workers", sentence, address=address) from error
 
         def run(shared: bytes, tasks: Sequence[FileTask]) -> Iterator[tuple[FileTask, str]]:
             everywhere = client.scatter(shared, broadcast=True)  # a lost worker loses its own copy

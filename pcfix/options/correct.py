@@ -85,13 +85,10 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     def check(self) -> None:
         """Check that a matcher is modelled for `consistent` only."""
         if self.camera_set == "mvs" and self.method not in ("auto", "consistent"):
-            raise SettingError(
-                "option.needs",
-                f"camera-set mvs needs method consistent, not {self.method}. For the other methods"
-                " it is worse than all cameras.",
-                option="camera_set",
-                needs="method consistent",
-            )
+            sentence = f"camera-set mvs needs method consistent, not {self.method}. For the other"
+            sentence += " methods it is worse than all cameras."
+            values = {"option": "camera_set", "needs": "method consistent"}
+            raise SettingError("option.needs", sentence, **values)
 
     @property
     def needs_cameras(self) -> bool:
@@ -101,21 +98,15 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     def check_no_cameras(self) -> None:
         """Raise SettingError for methods and options that need cameras."""
         if self.needs_cameras:
-            factor = self.method in WITHOUT_CAMERAS
-            wanted = "depth-factor auto" if factor else f"method {self.method}"
-            other = "a number" if factor else f"a method without: {' or '.join(WITHOUT_CAMERAS)}"
-            raise SettingError(
-                "cameras.missing",
-                f"cameras are missing: {wanted} needs them. Give them, or {other}.",
-            )
+            wanted = f"method {self.method}"
+            other = f"a method without: {' or '.join(WITHOUT_CAMERAS)}"
+            if self.method in WITHOUT_CAMERAS:
+                wanted, other = "depth-factor auto", "a number"
+            sentence = f"cameras are missing: {wanted} needs them. Give them, or {other}."
+            raise SettingError("cameras.missing", sentence)
         for one in options_of(type(self)):
             if one.with_cameras and getattr(self, one.name) not in (one.default, "off"):
-                raise SettingError(
-                    "option.needs",
-                    f"{one.flag[2:]} has no effect without cameras. Give both, or neither.",
-                    option=one.name,
-                    needs="cameras",
-                )
+                raise one.without("cameras")
 
     @property
     def limit_deg(self) -> float | None:

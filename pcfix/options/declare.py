@@ -180,13 +180,17 @@ class Option(NamedTuple):
             raise self._wrong("type", value, "must be a whole number")
         return int(value)
 
+    def without(self, needs: str) -> SettingError:
+        """Return the error of an option that has no effect without another one, or its value."""
+        sentence = f"{self.flag[2:]} has no effect without --{needs.replace('_', '-')}. Give both,"
+        sentence += " or neither."
+        return SettingError("option.needs", sentence, option=self.name, needs=needs)
+
     def _wrong(self, code: str, value: Any, words: str, **values: Any) -> SettingError:
         """Return the error of a value that is not as it must be."""
+        values |= {"option": self.name, "value": value}
         shown = f"'{value}'" if isinstance(value, str) else value
-        return SettingError(
-            f"option.{code}", f"{self.flag[2:]} {shown} {words}.",
-            option=self.name, value=value, **values,
-        )  # fmt: skip
+        return SettingError(f"option.{code}", f"{self.flag[2:]} {shown} {words}.", **values)
 
 
 def _is_number(value: Any) -> bool:
@@ -229,13 +233,7 @@ class OptionSet:
                 getattr(self, other) == wanted if wanted else is_given(other)
             )
             if not met and is_given(name):
-                flag = f"{options[other].flag} {wanted}".strip()
-                raise SettingError(
-                    "option.needs",
-                    f"{one.flag[2:]} has no effect without {flag}. Give both, or neither.",
-                    option=name,
-                    needs=one.needs,
-                )
+                raise one.without(one.needs)
             for others in one.requires:
                 names = others.split(" or ")
                 if is_given(name) and sum(map(is_given, names)) != 1:
@@ -312,12 +310,8 @@ def taken(kind: type[Set], given: OptionSet | None, keywords: Mapping[str, Any],
         return kind(**named(keywords, options_of(kind), where))
     if keywords:
         name = next(iter(keywords))
-        raise SettingError(
-            "option.twice",
-            f"{where}: give options=... or {name}=..., not both. dataclasses.replace changes"
-            " single options.",
-            option=name,
-        )
+        sentence = f"{where}: give options=... or {name}=..., not both. dataclasses.replace changes"
+        raise SettingError("option.twice", f"{sentence} single options.", option=name)
     return given if isinstance(given, kind) else given.part(kind)
 
 
@@ -329,14 +323,10 @@ def named(given: Mapping[str, Any], known: Iterable[Option], where: str) -> dict
     names = [one.name for one in known]
     for name in given:
         if name not in names:
-            near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-            hint = f"Did you mean {near[0]}?" if near else f"The options are {', '.join(names)}."
-            raise SettingError(
-                "option.unknown",
-                f"{where}: there is no option '{name}'. {hint}",
-                option=name,
-                near=next(iter(near), None),
-            )
+            near = next(iter(difflib.get_close_matches(name, names, n=1, cutoff=0.5)), None)
+            hint = f"Did you mean {near}?" if near else f"The options are {', '.join(names)}."
+            sentence = f"{where}: there is no option '{name}'. {hint}"
+            raise SettingError("option.unknown", sentence, option=name, near=near)
     return dict(given)
 
 

@@ -132,24 +132,17 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
     def check(self) -> None:
         """Check the rules between the value, the surface and the width of holes."""
         if self.what == "uncertainty" and (self.method != "mean" or self.fill is not None):
-            raise SettingError(
-                "option.excludes",
-                "what uncertainty is the root mean square of the points of a cell. Omit --method"
-                " and --fill.",
-                option="what",
-            )
+            sentence = "what uncertainty is the root mean square of the points of a cell. Omit"
+            sentence += " --method and --fill."
+            raise SettingError("option.excludes", sentence, option="what")
         if self.what in ("depth", "uncertainty"):
             object.__setattr__(self, "surface", "bed")
         most = MAX_HOLE_CELLS * (self.resolution or math.inf)
         if self.fill is not None and self.fill > most:
-            raise SettingError(
-                "option.range",
-                f"fill {self.fill:g} must be at most {most:g}, {MAX_HOLE_CELLS:,} cells."
-                " Use a smaller width, or a coarser resolution.",
-                option="fill",
-                value=self.fill,
-                most=most,
-            )
+            sentence = f"fill {self.fill:g} must be at most {most:g}, {MAX_HOLE_CELLS:,} cells."
+            sentence += " Use a smaller width, or a coarser resolution."
+            values = {"option": "fill", "value": self.fill, "most": most}
+            raise SettingError("option.range", sentence, **values)
 
 
 class DsmOptions(BandOption, OverwriteOption, SummaryOption, DsmRules, panel=Panel.OUTPUT):
@@ -175,11 +168,9 @@ def _bands(given: Any) -> tuple[tuple[float, ...], ...]:
             band = numbers(one) if isinstance(one, str) else tuple(map(float, one))
         if len(band) != 2 or not 0.0 <= band[0] < band[1] < math.inf:
             text = one if isinstance(one, str) else ",".join(map(str, one))
-            raise SettingError(
-                "option.type",
-                f"share '{text}' must be LOW,HIGH: two distances in metres, not negative, the lower"
-                " one first.", option="share", value=text,
-            )  # fmt: skip
+            sentence = f"share '{text}' must be LOW,HIGH: two distances in metres, not negative,"
+            sentence += " the lower one first."
+            raise SettingError("option.type", sentence, option="share", value=text)
         bands.append(band)
     return tuple(bands)
 
@@ -191,11 +182,8 @@ def _named_clouds(given: Any) -> tuple[tuple[str, str], ...]:
         text = one if isinstance(one, str) else f"{one[0]}={os.fspath(one[1])}"
         name, _, path = text.partition("=")
         if not (_NAME.fullmatch(name) and path):
-            raise SettingError(
-                "option.type",
-                f"also '{text}' must be NAME=CLOUD. A name has letters, digits, spaces and . + - _",
-                option="also", value=text,
-            )  # fmt: skip
+            sentence = f"also '{text}' must be NAME=CLOUD. A name has letters, digits, spaces and"
+            raise SettingError("option.type", f"{sentence} . + - _", option="also", value=text)
         if name in LAYERS or name in found:
             sentence = f"also '{text}': the name {name} is taken. Give another one."
             raise SettingError("option.name_taken", sentence, option="also", value=name)
@@ -299,13 +287,9 @@ def _command(given: str) -> str:
     """Check that a command has the places for images and cloud."""
     missing = [one for one in ("{images}", "{cloud}") if one not in given]
     if given not in ("stereo", "") and missing:
-        raise SettingError(
-            "option.command",
-            f"rebuild '{given}' has no {' and '.join(missing)}. Use them for the folder that the"
-            " command reads and the cloud that it writes, or give stereo.",
-            option="rebuild",
-            missing=missing,
-        )
+        sentence = f"rebuild '{given}' has no {' and '.join(missing)}. Use them for the folder that"
+        sentence += " the command reads and the cloud that it writes, or give stereo."
+        raise SettingError("option.command", sentence, option="rebuild", missing=missing)
     return given
 
 
