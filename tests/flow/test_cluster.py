@@ -109,15 +109,6 @@ def test_killed_worker(scheduler, workers, cloud, tmp_path):
     assert not list((tmp_path / "out").glob(".*.part*"))
 
 
-def on_cluster(cloud, folder, scheduler):
-    """Label, clean and run on the cluster; return the folder of each cloud."""
-    given = {"scheduler": scheduler[1]}
-    pcfix.label_file(cloud, folder / "labelled", water=0.37, **given)
-    pcfix.clean_file(cloud, folder / "clean", **given)
-    pcfix.run(cloud, folder / "run", **given, **GIVEN)
-    return [folder / "labelled", folder / "clean", folder / "run/corrected", folder / "run/cleaned"]
-
-
 @pytest.mark.usefixtures("workers")
 def test_other_commands(scheduler, cloud, tmp_path, monkeypatch):
     merged = tmp_path / "merged"
@@ -126,7 +117,12 @@ def test_other_commands(scheduler, cloud, tmp_path, monkeypatch):
     pcfix.clean_file(cloud[1], merged / "clean.las")
     pcfix.run(cloud[1], merged / "run", **GIVEN)
     monkeypatch.setattr("pcfix.flow.runner.in_processes", None)  # nothing is done on this machine
-    for found in on_cluster(cloud[0], tmp_path, scheduler):
+    given = {"scheduler": scheduler[1]}
+    pcfix.label_file(cloud[0], tmp_path / "labelled", water=0.37, **given)
+    pcfix.clean_file(cloud[0], tmp_path / "clean", **given)
+    pcfix.run(cloud[0], tmp_path / "run", **given, **GIVEN)
+    for name in ("labelled", "clean", "run/corrected", "run/cleaned"):
+        found = tmp_path / name
         one = merged / found.relative_to(tmp_path)
         suffix = ".laz" if "run" in one.parts else ".las"
         tiles = sorted(found.glob("tile*.laz"))
