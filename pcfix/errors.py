@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Iterable
 from dataclasses import asdict, is_dataclass
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -72,6 +73,10 @@ class PcfixWarning(CodedError, UserWarning):  # noqa: N818
 def warn(name: object, code: str, sentence: str, **values: Any) -> None:
     """Warn about a file; the message is its path and a sentence."""
     warnings.warn(PcfixWarning(code, f"{name}: {sentence}", **values), stacklevel=3)
+
+
+silently = partial(warnings.catch_warnings, action="ignore", category=PcfixWarning)
+"""A context in which no warning of pcfix is shown."""
 
 
 def coded(code: str, notes: Iterable[object]) -> list[PcfixWarning]:

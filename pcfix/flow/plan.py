@@ -7,7 +7,6 @@ part of the error budget. An adjustment through the water gives the errors of th
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -18,7 +17,7 @@ from pcfix.adjust.block import Block, plain_block, restricted, well_seen
 from pcfix.adjust.parameters import Unknowns
 from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import prepare
-from pcfix.errors import PcfixWarning, SettingError
+from pcfix.errors import SettingError, silently
 from pcfix.flow.correct import correct_points
 from pcfix.flow.pose_errors import pose_errors
 from pcfix.flow.runner import check_summary, write_summary
@@ -166,8 +165,7 @@ def _corrected(given: PlanOptions, bed: Block, apparent: FloatArray, part: str =
         names = {one.name for one in options_of(BudgetOptions)}
         off = dict.fromkeys(names.difference(PARTS[part]), 0.0)
     views, options = Views(bed.start, bed.camera), replace(_refraction(given), **off)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PcfixWarning)
+    with silently():
         return correct_points(apparent, bed.cameras, 0.0, views=views, options=options)
 
 

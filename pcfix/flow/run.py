@@ -6,7 +6,6 @@ The results are opened as rasters, lines and tables (`RunResults`).
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from pcfix.adjust.diagnosis import MOST_STATED_M
 from pcfix.compare.m3c2 import load_py4dgeo
-from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError, bad_file, plain
+from pcfix.errors import InputError, PcfixError, SettingError, bad_file, plain, silently
 from pcfix.flow import outputs as results
 from pcfix.flow.adjust import FOLDER, MODELS, SUMMARY, adjust_into
 from pcfix.flow.clean import clean_file
@@ -229,7 +228,7 @@ def _decide(run: RunFolder) -> tuple[str, bool | None]:
         return _why_not_adjust(options), None
     inputs, view = options.part(Inputs), view_of(run.source)
     # the correction shows the warnings
-    with warnings.catch_warnings(action="ignore", category=PcfixWarning):
+    with silently():
         cameras = inputs.block(view.crs)[0]
         if options.gnss is not None:
             cameras = read_gnss(options.gnss, cameras)
@@ -291,7 +290,7 @@ def _compare(run: RunFolder, resolution_m: float) -> Plain:
         if is_cloud(run.reference):
             heights = folder / REFERENCE_DSM
             # the cells are those of the cloud, whatever a warning says
-            with warnings.catch_warnings(action="ignore", category=PcfixWarning):
+            with silently():
                 grid_dsm(run.reference, heights, resolution=resolution_m, overwrite=True)
         rasters.write_dod(run.folder / SURFACE, heights, run.folder / DIFFERENCE)
     sections = [

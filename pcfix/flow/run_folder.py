@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from pcfix.errors import PcfixWarning, SettingError, bad_file
+from pcfix.errors import SettingError, bad_file, silently
 from pcfix.flow.adjust import FOLDER
 from pcfix.flow.inputs import Inputs, paths_in, read_blocks
 from pcfix.flow.runner import HOW, Bar, Progress, json_text, no_bar
@@ -129,28 +127,23 @@ class RunFolder:
     def cloud(self, name: str) -> Path | Tiles:
         """Return the cloud corrected or cleaned, which must exist."""
         path, files = self.path_of(name), self.cloud_files(name)
-        with _shown_before():
+        with silently():  # this and other warnings were shown when the cloud was corrected
             return tiles_from(str(path), files) if isinstance(self.source, Tiles) else path
 
     @cached_property
     def cameras(self) -> Cameras:
         """The cameras in the CRS of the cloud."""
         inputs = replace(self.options, views=None).part(Inputs)
-        with _shown_before():
+        with silently():
             return read_blocks(inputs, view_of(self.cloud("corrected"))).cameras
 
     @cached_property
     def water(self) -> WaterSurface:
         """The water surface: as recorded in the corrected cloud, else as requested."""
         cloud = self.cloud("corrected")
-        with _shown_before(), open_cloud(cloud) as source:
+        with silently(), open_cloud(cloud) as source:
             stated = own_water(source)
             return stated or self.options.part(Inputs).surface(view_of(cloud)).surface
-
-
-def _shown_before() -> AbstractContextManager[Any]:
-    """Ignore warnings that were shown when the cloud was corrected."""
-    return warnings.catch_warnings(action="ignore", category=PcfixWarning)
 
 
 class Record:

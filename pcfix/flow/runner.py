@@ -14,7 +14,6 @@ import pickle
 import signal
 import sys
 import time
-import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures import as_completed as completed
@@ -30,7 +29,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar, cast
 
 from pcfix import version
-from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
+from pcfix.errors import InputError, PcfixError, SettingError, silently
 from pcfix.flow.raster import raster_outputs, raster_writer
 from pcfix.io import files
 from pcfix.io.files import all_or_none, write_bytes, write_text
@@ -250,24 +249,21 @@ def key_of(
     name: str, options: Any, inputs: Iterable[Path] = (), ignored: Collection[str] = HOW
 ) -> str:
     """Return a checksum of all that the outputs of a command depend on."""
-    asked = {
-        one.name: _plain(getattr(options, one.name))
-        for one in options_of(type(options))
-        if one.name not in ignored
-    }
+    names = [one.name for one in options_of(type(options)) if one.name not in ignored]
+    asked = {name: _state(getattr(options, name)) for name in names}
     depends = [version.__version__, name, asked, [files.file_state(path) for path in inputs]]
-    return sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()
+    # objects, such as cameras, are pickled
+    text = json.dumps(depends, sort_keys=True, default=lambda one: pickle.dumps(one).hex())
+    return sha256(text.encode()).hexdigest()
 
 
-def _plain(value: Any) -> Any:
-    """Return an option as JSON holds it; of files their size and time."""
-    if isinstance(value, str) or hasattr(value, "joinpath"):
+def _state(value: Any) -> Any:
+    """Return the value of an option; for files and folders with the size and time of each file."""
+    if isinstance(value, str | PathLike):
         path = Path(str(value).partition(LAYER_MARK)[0])
         found = files.belonging(path) if path.exists() else []
-        return [files.file_state(one) for one in found] or str(value)
-    if value is None or isinstance(value, int | float | tuple):
-        return value
-    return sha256(pickle.dumps(value)).hexdigest()
+        return [str(value), *map(files.file_state, found)]
+    return value
 
 
 # Many files, on processes or a cluster
@@ -282,8 +278,7 @@ def do_task(pickled: bytes, task: FileTask, jobs: int | None = None) -> str:
         if task.is_finished:  # by a worker that was lost before it could say so
             return ""
         work, plan = pickle.loads(pickled)
-        with threads(jobs), warnings.catch_warnings():
-            warnings.simplefilter("ignore", PcfixWarning)  # shown when the plan was made
+        with threads(jobs), silently():  # warnings were shown when the plan was made
             task.record.unlink(missing_ok=True)  # that of an older output
             with all_or_none():
                 tally = stream(work, plan, replace(task, jobs=jobs))
