@@ -278,21 +278,17 @@ class WaterRaster:
         """Check size, position and heights."""
         shape = self.height_m.shape
         if len(shape) != 2 or min(shape) < 2:
-            raise SettingError(
-                "water.raster_size", f"Give at least 2 rows and columns, not {shape}."
-            )
+            sentence = f"Give at least 2 rows and columns, not {shape}."
+            raise SettingError("water.raster_size", sentence)
         place = (self.left_m, self.top_m, *self.cell_m)
         if not (np.isfinite(place).all() and min(self.cell_m) > 0.0):
-            raise SettingError(
-                "water.raster_place",
-                f"Water raster {self.name}: the corner {self.left_m:g}, {self.top_m:g} must be"
-                f" finite and the cells {self.cell_m[0]:g} x {self.cell_m[1]:g} m positive.",
-            )
+            sentence = f"Water raster {self.name}: the corner {self.left_m:g}, {self.top_m:g} must"
+            cell = f"{self.cell_m[0]:g} x {self.cell_m[1]:g} m"
+            sentence += f" be finite and the cells {cell} positive."
+            raise SettingError("water.raster_place", sentence)
         if np.isinf(self.height_m).any() or not np.isfinite(self.height_m).any():
-            raise SettingError(
-                "water.raster_heights",
-                f"Water raster {self.name}: heights must be finite, or NaN in some cells.",
-            )
+            sentence = f"Water raster {self.name}: heights must be finite, or NaN in some cells."
+            raise SettingError("water.raster_heights", sentence)
 
     def __str__(self) -> str:
         rows, columns = self.height_m.shape

@@ -93,15 +93,13 @@ def command(example: str, **helps: str) -> Callable[[Callable[..., None]], Calla
 
 def _keyword(one: Option, is_shown: bool) -> inspect.Parameter:
     """Return an option as a keyword; text for a parser is passed on unchanged."""
-    kind: Any = one.type
-    if one.is_path:
-        kind = Path | None
-    elif one.repeats:
+    kind: Any = one.type if one.default is not None else one.type | None
+    if one.repeats:
         kind = tuple[str, ...]
-    elif one.parse is not None or kind is Any:
-        kind = str | one.type if isinstance(one.default, tuple) else str | None
-    elif one.default is None:
-        kind = one.type | None
+    elif one.is_path:
+        kind = Path | None
+    elif one.parse is not None or one.type is Any:
+        kind = str | None
     default = "" if one.needed else one.default_text
     has_opposite = one.off or (one.type is bool and one.default)
     parameter = Parameter(
