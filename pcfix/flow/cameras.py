@@ -89,17 +89,15 @@ def check_cameras(
         above = cameras.centres[:, 2] - level
     if cameras.rotations is not None and not problem:
         tilt = np.degrees(np.arccos(np.clip(-cameras.rotations[:, 2, 2], -1.0, 1.0)))
-    gnss = _gnss(cameras, str(path))
     if view is not None:
-        flight = {"file": path, "water_m": level}
-        fit = _fit(cameras, view, xyz, quick_ties(inputs, view.crs), flight)
+        fit = _fit(cameras, view, xyz, quick_ties(inputs, view.crs), path, level)
     figures = plain({
         "path": path,
         "crs_read": read.crs,
         "sensors": sensors_of(cameras, above),
         "height_above_water_m": None if above is None else (above.min(), above.mean(), above.max()),
         "tilt_deg": None if tilt is None else (np.median(tilt), tilt.max()),  # axes from nadir
-        "gnss": gnss,
+        "gnss": _gnss(cameras, str(path)),
         "problem": problem,  # why the cameras are not in a map and have no heights
         "source": cameras.source,
         "images_posed": len(cameras),
@@ -168,8 +166,8 @@ def _gnss(cameras: Cameras, name: str) -> Plain | None:
 
 
 def _fit(
-    cameras: Cameras, view: CloudView, xyz: FloatArray, ties: TiePoints | None,
-    flight: dict[str, Any],
+    cameras: Cameras, view: CloudView, xyz: FloatArray, ties: TiePoints | None, file: File,
+    water_m: float | None,
 ) -> Plain:  # fmt: skip
     """Test cameras against a sample of the cloud.
 
@@ -178,7 +176,7 @@ def _fit(
     """
     visible = np.minimum(count_visible_cameras(xyz, cameras), 3)
     shares = np.bincount(visible, minlength=4) / len(xyz)
-    found = plausible(cameras, xyz, ties, **flight)
+    found = plausible(cameras, xyz, ties, file=file, water_m=water_m)
     verdict = likely_mistake(cameras.centres, xyz.min(axis=0), xyz.max(axis=0))
     verdict = verdict or " ".join(map(str, found.problems))
     return {

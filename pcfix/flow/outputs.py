@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -130,9 +129,8 @@ def _write_shaded(folder: Path) -> None:
 
     target, edge = folder / SHADED, int(HOLE_CELLS)
     high = limits_of(rasters.preview(folder / DEPTH)[0], "depth")[1]
-    with ExitStack() as stack:
-        surface = stack.enter_context(rasters.open_raster(folder / SURFACE))
-        depth = stack.enter_context(rasters.open_raster(folder / DEPTH))
+    one, other = (rasters.open_raster(folder / name) for name in (SURFACE, DEPTH))
+    with one as surface, other as depth:
         lattice, below = rasters.lattice_of(surface), rasters.lattice_of(depth)
         down, right = lattice.first_row - below.first_row, lattice.first_column - below.first_column
         bands = dict.fromkeys(("red", "green", "blue", "alpha"), "")

@@ -28,20 +28,12 @@ def scene(tmp_path_factory):
     return folder
 
 
-def in_a_process(*words):
-    return subprocess.run(
-        [sys.executable, "-m", "pcfix", *map(str, words)],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-
-
 def test_command_line(scene, tmp_path):
     """And what is piped is the summary and nothing else."""
     words = ("--cameras", scene / "cameras.csv", "--water", "0.37", "--max-angle", "45")
-    done = in_a_process(
-        "correct", scene / "cloud.laz", tmp_path / "a.las", *words, "--jobs=1",
-        "--summary", tmp_path / "run.json",
-    )  # fmt: skip
+    command = ["correct", scene / "cloud.laz", tmp_path / "a.las", *words, "--jobs=1"]
+    command = [sys.executable, "-m", "pcfix", *command, "--summary", tmp_path / "run.json"]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     given = {"cameras": scene / "cameras.csv", "water": 0.37, "max_angle": 45}
     pcfix.correct_file(scene / "cloud.laz", tmp_path / "b.las", **given)

@@ -71,14 +71,6 @@ def test_files_of_steps(finished):
     ]  # fmt: skip
 
 
-def test_same_as_correct(finished, tmp_path):
-    pcfix.correct_file(
-        SCENE / "cloud.laz", tmp_path / "c.laz", cameras=SCENE / "cameras.csv", water=0.37
-    )
-    one, other = laspy.read(tmp_path / "c.laz"), laspy.read(finished[0] / "corrected.laz")
-    np.testing.assert_array_equal(one.points.array, other.points.array)
-
-
 def test_dod(finished):
     names = ("surface.tif", "compare/reference_dsm.tif", "compare/dod.tif")
     dsm, reference, dod = (rasterio.open(finished[0] / name) for name in names)
