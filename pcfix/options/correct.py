@@ -55,27 +55,21 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
         "depth-maps", with_cameras=True
     )
     """Dense matcher of --camera-set mvs. depth-maps: fused (OpenMVS, COLMAP); single-map: one image
-    at each place (SURE); nearest-map: the image nearest in plan; pairs: median of stereo pairs
-    (MicMac)."""
+    at each place (SURE); nearest-map: that nearest in plan; pairs: median of pairs (MicMac)."""
     software: Software | None = option(None, with_cameras=True)
     """Software that reconstructed the cloud: its usual reconstruction types are more likely, if the
     cloud does not show clearly which it is. [default: as named in the header of the cloud]"""
     max_angle: float | str | None = option(
-        "auto",
-        with_cameras=True,
-        basic=True,
-        above=0,
-        most=90,
+        "auto", with_cameras=True, basic=True, above=0, most=90, metavar="DEG",
         parse=number_or("auto", "none"),
-        metavar="DEG",
-    )
+    )  # fmt: skip
     """Maximum incidence angle of a ray, from the surface normal; none for no limit. auto: no limit,
     but 35 for snell and the formulas if the cloud was clearly reconstructed without rays at larger
     angles. [deg] [default: auto; must be given for poses without a lens]"""
     occlusion: Literal["auto", "on", "off"] = option("auto", with_cameras=True)
     """Skip cameras from which the cloud occludes the point; auto: if there are oblique images."""
     depth_factor: float | str | None = option(
-        None, least=1, most=3, needs="method factor", parse=number_or("auto"), metavar="N"
+        None, least=1, most=3, needs="method factor", parse=number_or("auto")
     )
     """Ratio of true to apparent depth; auto: from the height, focal length and base of the cameras.
     [default: the refractive index]"""
@@ -268,8 +262,7 @@ class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
     poses: Literal["free", "fixed"] = option("free")
     """Adjust the poses, or hold them fixed."""
     datum: Literal["observed", "free"] = option("observed")
-    """Datum of the block: from observations, or free: mean position, direction and scale of the
-    original poses."""
+    """Datum: observations, or free: mean position, direction and scale of the original poses."""
     ties: Literal["auto", "cloud"] = option("auto")
     """Use points of the cloud as tie points; auto: only if there are no measured ones."""
     gnss_sigma: float | None = option(None, above=0)
@@ -289,7 +282,7 @@ class AdjustOptions(
     gcps_crs: str | None = option(None, metavar="CRS")
     """CRS of the control points."""
     water_mask: File | None = option(None, basic=True)
-    """Polygons inside which points may be submerged. [default: everywhere]"""
+    """Polygons where points may be submerged. [default: everywhere]"""
 
 
 Options = CorrectOptions

@@ -32,8 +32,7 @@ class FlightOptions(OptionSet, panel=Panel.FLIGHT):
     oblique_directions: int = option(4, least=1, most=36)
     """Headings of oblique images, from north."""
     oblique_share: float | None = option(None, least=0.01, most=1)
-    """Share of oblique images; 1 for all. [default: each direction a third as dense as the nadir
-    images]"""
+    """Share of oblique images; 1 for all. [default: each direction a third as dense as nadir]"""
     position_noise_m: float = option(0.0, least=0, most=100)
     """Standard deviation of the given projection centres."""
     attitude_noise_deg: float = option(0.0, least=0, most=5)
@@ -82,8 +81,7 @@ class SceneCloudOptions(OptionSet, panel=Panel.CLOUDS):
     lidar_noise_m: float = option(0.05, least=0, most=10)
     """Standard deviation of the LiDAR heights."""
     seed: int = option(1, basic=True, least=0)
-    """Seed of the random numbers. Each kind of noise has a separate stream, so adding noise changes
-    neither terrain nor block."""
+    """Seed of the random numbers; each kind of noise has a separate stream."""
 
 
 class SceneOptions(SceneCloudOptions, SceneWaterOptions, CameraOptions, FlightOptions):

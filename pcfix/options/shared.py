@@ -35,13 +35,10 @@ class Panel(StrEnum):
 class IndexOptions(OptionSet, panel=Panel.WATER):
     """The refractive index of the water."""
 
-    index: float | str | None = option(
-        None, basic=True, least=1.0, most=1.5, parse=number_or(), metavar="N"
-    )
+    index: float | str | None = option(None, basic=True, least=1.0, most=1.5, parse=number_or())
     """Refractive index of the water relative to air: a number, fresh or sea. [default: 1.34]"""
     index_formula: IndexFormula = option("skarlatos")
-    """Formula of the index from salinity, temperature and wavelength: Skarlatos & Agrafiotis 2018,
-    eq 13, or Quan & Fry 1995."""
+    """Formula of the index: Skarlatos & Agrafiotis 2018, eq 13, or Quan & Fry 1995."""
 
     @property
     def refractive_index(self) -> float:
@@ -83,23 +80,17 @@ class LandRules(OptionSet, panel=Panel.WATER):
     least_pool: float | None = option(None, least=0.0, needs="connected")
     """Also correct pools of at least this area. [m2] [default: a tenth of the largest water]"""
     respect_classes: tuple[int, ...] = option(
-        (),
-        least=0,
-        most=255,
-        parse=numbers,
+        (), least=0, most=255, parse=numbers, metavar="N,N",
         then=lambda found: tuple(sorted({*found})),
-        metavar="N,N",
-    )
-    """Points of these classes are never submerged; 2,5,6 are ground, trees and buildings. [default:
-    none]"""
+    )  # fmt: skip
+    """Classes that are never submerged; 2,5,6 are ground, trees and buildings. [default: none]"""
 
 
 class MaskOption(OptionSet, panel=Panel.WATER):
     """The area in which points may be submerged."""
 
     water_mask: File | None = option(None, basic=True)
-    """Polygons (.gpkg, .shp, .geojson) inside which points may be submerged. [default:
-    everywhere]"""
+    """Polygons (.gpkg, .shp, .geojson) where points may be submerged. [default: everywhere]"""
 
 
 class PortOptions(OptionSet, panel=Panel.WATER):
@@ -197,8 +188,7 @@ class JobOptions(OverwriteOption, panel=Panel.OUTPUT):
     """The number of threads or processes."""
 
     jobs: int | None = option(None, basic=True, least=1)
-    """Number of threads or, for many files, of files processed at the same time. [default: all
-    cores]"""
+    """Number of threads or, for many files, of files processed at once. [default: all cores]"""
 
 
 class TileOptions(JobOptions, panel=Panel.OUTPUT):

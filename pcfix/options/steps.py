@@ -54,8 +54,7 @@ class CleanRules(OptionSet, panel=Panel.TESTS):
     """Noise if the mean distance to the neighbours exceeds that of all points by this many standard
     deviations."""
     radius: float | None = option(None, basic=True, above=0)
-    """Noise if fewer than --radius-neighbours other points are within this distance. [m] [default:
-    no such test]"""
+    """Noise if fewer than --radius-neighbours points are this near. [m] [default: no such test]"""
     radius_neighbours: int = option(3, least=1, most=MOST_NEIGHBOURS)
     """Minimum number of other points within --radius."""
     weak: bool = option(True)
@@ -279,8 +278,7 @@ class OrthoOptions(
     resolution: float | None = option(None, basic=True, above=0)
     """Cell size. [m] [default: one ground pixel]"""
     water: Any = option(None, basic=True, metavar="SPEC")
-    """Water surface, as for 'pcfix photos'. Omit it if refraction was already removed from the
-    photographs."""
+    """Water surface, as for 'pcfix photos'; omit it for photographs without refraction."""
 
 
 def _command(given: str) -> str:
@@ -334,8 +332,7 @@ class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions, pa
     level: float = option(0.0)
     """With --surface: height of the calm water. [m]"""
     cameras: Any = option(None, basic=True, metavar="PATH", needs="surface")
-    """With --surface: pose of the hovering camera, by the name of the first frame, or the only one
-    in the file."""
+    """With --surface: pose of the hovering camera: that of the first frame, or the only one."""
     gsd: float | None = option(None, basic=True, above=0, needs="surface")
     """With --surface, instead of --cameras, for a nadir view: pixel size at the bed. [m]"""
     interval: float | None = option(None, above=0, needs="surface")
