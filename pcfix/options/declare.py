@@ -240,12 +240,10 @@ class OptionSet:
                     give = "exactly one of them" if names[1:] else "both"
                     sentence = f"{one.flag[2:]} needs {others}: give {give}."
                     raise SettingError("option.missing", sentence, option=names[0])
-        for group in reversed(type(self).__mro__):
-            if "check" in vars(group):
-                vars(group)["check"](self)
+        self.check()
 
     def check(self) -> None:
-        """Check the rules between options; called for each class of a command."""
+        """Check the rules between options that the declarations do not state."""
 
     def missing(self) -> Option | None:
         """Return the first needed option that was not given or replaced by another one."""
