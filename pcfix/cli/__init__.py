@@ -63,10 +63,8 @@ def main(tokens: Sequence[str] | None = None) -> None:
         if error.encoding != "utf-8" or "\n" in error.object:
             raise
         _stop(printable(f"{error.object}: the name is not in UTF-8. Rename the file."), 1)
-    except _EndedError as end:
-        _stop("stopped.", 128 + end.args[0])
-    except KeyboardInterrupt as stop:
-        _stop(str(stop) or "stopped.", 130)
+    except KeyboardInterrupt:
+        _stop("stopped.", 128 + [*ended, signal.SIGINT][0])
     except BrokenPipeError:
         sys.exit(1)
     except OSError as error:
@@ -86,10 +84,6 @@ def _run(arguments: list[str]) -> None:
     app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
 
 
-class _EndedError(KeyboardInterrupt):
-    """A signal ends the process, which cleans up as after Ctrl-C."""
-
-
 def _end_by_signals(ended: list[int]) -> None:
     """Make SIGTERM and SIGHUP end the process as Ctrl-C does, unless they are ignored.
 
@@ -105,7 +99,7 @@ def _end_by_signals(ended: list[int]) -> None:
                 return
             caller = caller.f_back
         ended.append(number)
-        raise _EndedError(number)
+        raise KeyboardInterrupt
 
     usual = (signal.SIG_DFL, signal.default_int_handler)
     for number in (getattr(signal, one, None) for one in ("SIGINT", "SIGTERM", "SIGHUP")):

@@ -109,16 +109,6 @@ def test_withheld(tmp_path, keeps):
         np.testing.assert_array_equal(outs["ClassFlags"] & ~np.uint8(4), others)
 
 
-def test_label(cloud):
-    _, ins, metadata = cloud
-    outs, report = run("label", ins, metadata, water=WATER_M)
-    wet = ins["Z"] < WATER_M
-    np.testing.assert_array_equal(outs["Classification"], np.where(wet, 40, ins["Classification"]))
-    np.testing.assert_array_equal(outs["ClassFlags"], ins["ClassFlags"])
-    assert set(outs) == {"Classification", "ClassFlags"}
-    assert report["children"][0]["value"] == wet.sum()
-
-
 def test_report(cloud, tmp_path):
     """The metadata and the summary are those of a file."""
     path, ins, metadata = cloud
