@@ -457,13 +457,10 @@ def file_task(
     jobs. `reads` are further inputs, of which values that are no paths do not count; `more` are
     further outputs, checked like the output, by `check`.
     """
-    started = time.perf_counter()
     source: Any = input if isinstance(input, Tiles) else files.check_input(input)
     known = [one for one in (*inputs_of(input), *reads) if isinstance(one, str | PathLike)]
     for path in (output, *more):
         known.append(check(path, overwrite=options.overwrite, inputs=known))
     check_summary(options, known)
-    if not isinstance(source, Tiles):
-        source = band_of(source, options)
     jobs = getattr(options, "jobs", None)
-    return FileTask(source, Path(output), jobs, progress, started)
+    return FileTask(band_of(source, options), Path(output), jobs, progress)
