@@ -25,7 +25,7 @@ from pcfix.flow.diagnosis import diagnose_inputs, has_datum
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.outputs import DIFFERENCE, PAGE, SECTIONS, report_run
-from pcfix.flow.run_folder import SURFACE, Record, RunFolder, finished_steps
+from pcfix.flow.run_folder import RECORD, STEPS, SURFACE, Record, RunFolder, read_steps
 from pcfix.flow.runner import Bar, Progress, check_folder, no_bar
 from pcfix.flow.surfaces import view_of
 from pcfix.io import rasters, vectors
@@ -312,8 +312,12 @@ class RunResults:
 
     @cached_property
     def _steps(self) -> Plain:
-        """The result of each step."""
-        return finished_steps(self.folder)
+        """The result of each step of a finished run."""
+        steps = read_steps(self._file(RECORD))
+        if STEPS[-1] not in steps:
+            sentence = "the run did not finish. Run it again; it resumes."
+            raise bad_file(self.folder, "run.unfinished", sentence)
+        return {name: step["result"] for name, step in steps.items()}
 
     @property
     def report(self) -> Path:

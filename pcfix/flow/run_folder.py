@@ -10,7 +10,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from pcfix.errors import SettingError, bad_file, silently
+from pcfix.errors import SettingError, silently
 from pcfix.flow.adjust import FOLDER
 from pcfix.flow.inputs import Inputs, paths_in, read_blocks
 from pcfix.flow.runner import HOW, Bar, Progress, json_text, no_bar
@@ -209,15 +209,3 @@ def read_steps(path: Path) -> dict[str, Any]:
         steps: dict[str, Any] = read_json(path)["steps"]
         _ = [(one["key"], one["outputs"], one["result"]) for one in steps.values()]
     return steps
-
-
-def finished_steps(folder: Path) -> dict[str, Any]:
-    """Return the result of each step of a finished run by name."""
-    path = folder / RECORD
-    if not path.is_file():
-        raise bad_file(path, "run.no_file", "the run has not written it.")
-    steps = read_steps(path)
-    if STEPS[-1] not in steps:
-        sentence = "the run did not finish. Run it again; it resumes."
-        raise bad_file(folder, "run.unfinished", sentence)
-    return {name: step["result"] for name, step in steps.items()}
