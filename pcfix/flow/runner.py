@@ -145,9 +145,11 @@ def run_command(
         task = replace(task, rasters=targets)
         with threads(task.jobs), running(clouds={}), all_or_none():
             planned = plan(task)
+            # the output appears when the block ends, if `finish` does not refuse it
             result = finish(planned, task, stream(work, planned, task))
             write_summary(options, result)
         return result
+    # Many files: check all, plan for them as one cloud, and do a task for each
     folder = files.path_of(output)
     task = FileTask(tiles, folder)
     check_folder(folder, tiles.paths)
