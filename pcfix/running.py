@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,8 +19,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-
-from pcfix.errors import SettingError
 
 Array: TypeAlias = npt.NDArray[Any]
 Empty: TypeAlias = Callable[[tuple[int, ...], npt.DTypeLike], Array]
@@ -68,14 +66,9 @@ def running(**changes: Any) -> Iterator[None]:
         _RUN.reset(token)
 
 
-@contextmanager
-def threads(jobs: int | None) -> Iterator[None]:
-    """Run with this number of threads; None changes nothing. Raises SettingError below 1."""
-    if jobs is not None and jobs < 1:
-        sentence = f"jobs {jobs} is less than 1."
-        raise SettingError("option.range", sentence, option="jobs", value=jobs)
-    with running(threads=jobs or current().threads):
-        yield
+def threads(jobs: int | None) -> AbstractContextManager[None]:
+    """Run with this number of threads until the block ends; None changes nothing."""
+    return running(threads=jobs or current().threads)
 
 
 # Large arrays

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import PcfixWarning, plain
+from pcfix.flow.inputs import paths_in
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import find_surface, sample_of, view_of
 from pcfix.io.files import check_input
@@ -49,10 +50,8 @@ def check_water(
         See `pcfix.correct_file`.
     """
     given = taken(WaterCheckOptions, options, keywords, "check_water")
-    cloud = given.cloud
-    inputs = [] if cloud is None else [cloud]
-    check_summary(given, inputs)
-    view = None if cloud is None else view_of(check_input(cloud))
+    check_summary(given, paths_in(given))
+    view = None if given.cloud is None else view_of(check_input(given.cloud))
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("always", PcfixWarning)
         found = find_surface(spec, given, view)
