@@ -20,26 +20,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.grid.lattice import Lattice
-from pcfix.grid.maps import (
-    HEIGHT,
-    NO_LIGHT,
-    Extent,
-    contours,
-    depth_interval,
-    hillshade,
-    smoothed,
-    stops_of,
-)
+from pcfix.grid.maps import HEIGHT, contours, depth_interval, hillshade, smoothed, stops_of
 from pcfix.model import FloatArray
 from pcfix.sums import nice_step
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
-FIGURES = 4
-"""Shown; the others are folded."""
 
 BEFORE, AFTER, WATER, REFERENCE = "#b3541e", "#0b5e8a", "#4aa3c7", "#222222"
 """Colours of different lightness, for readers with colour blindness."""
@@ -69,30 +56,23 @@ def png_of(figure: Figure) -> bytes:
 
 
 def map_figure(
-    values: FloatArray, extent_m: Extent, label: str, shade: FloatArray | None = None, **look: Any
+    values: FloatArray, lattice: Lattice, label: str, shade: FloatArray | None = None, **look: Any
 ) -> Figure:
-    """Draw a map of values over west, east, south and north, metres; `shade` is its relief.
-
-    Values have the shape (rows, columns).
-    """
-    west, east, south, north = extent_m
+    """Draw a map of values of cells, shape (rows, columns); `shade` is its relief, 0 to 1."""
+    west, south, east, north = lattice.bounds_m
+    extent_m = west, east, south, north
     height_in = float(np.clip(6.5 * (north - south) / (east - west) + 0.8, 2.8, 9.0))
     figure, axes = new_figure(8.0, height_in)
-    label_plan(axes)
+    axes.set_aspect("equal")
+    axes.ticklabel_format(style="plain", useOffset=False)  # whole coordinates,
+    axes.tick_params(axis="x", labelrotation=30.0)  # turned so that they have room
+    axes.set(xlabel="East (m)", ylabel="North (m)")
     if shade is not None:
         axes.imshow(shade, extent=extent_m, cmap="gray", vmin=0.0, vmax=1.0)
         look["alpha"] = 0.75
     image = axes.imshow(values, extent=extent_m, **look)
     figure.colorbar(image, ax=axes, label=label, shrink=0.9)
     return figure
-
-
-def label_plan(axes: Axes) -> None:
-    """Name the axes of a plan; equal scales, whole coordinates, turned so that they have room."""
-    axes.set_aspect("equal")
-    axes.ticklabel_format(style="plain", useOffset=False)
-    axes.tick_params(axis="x", labelrotation=30.0)
-    axes.set(xlabel="East (m)", ylabel="North (m)")
 
 
 @dataclass(frozen=True)
@@ -171,7 +151,7 @@ class Report:
     lattice: Lattice | None = None  # the cells of the map; None for a page without a map
     height_m: FloatArray | None = None  # their heights, shape (rows, columns), shown as relief
     layers: Sequence[Layer] = ()
-    pictures: Sequence[Picture] = ()  # the first `FIGURES` are shown, the others folded
+    pictures: Sequence[Picture] = ()  # the first four are shown, the others folded
     provenance: list[Table] = field(default_factory=list)
     tiles: Sequence[Tile] = ()
     files: Sequence[tuple[str, str]] = ()  # path from the page, and its contents
@@ -206,7 +186,7 @@ def render(report: Report) -> str:
     data = None
     if report.lattice is not None and report.height_m is not None:
         data = Markup(map_json(report.lattice, report.height_m, report.layers))
-    return template.render(report=report, figures=FIGURES, map_data=data)
+    return template.render(report=report, map_data=data)
 
 
 _NO_DATA = -32768
@@ -218,12 +198,6 @@ _COLOURS = 64
 _TICKS = 7
 SMOOTH_CELLS = 1.5
 """Single cells are noisy: the shade is of a surface smoothed by this."""
-
-
-def extent_of(lattice: Lattice) -> Extent:
-    """Return west, east, south and north of the cells, metres."""
-    west, south, east, north = lattice.bounds_m
-    return west, east, south, north
 
 
 def map_json(lattice: Lattice, height_m: FloatArray, layers: Sequence[Layer]) -> str:
@@ -258,9 +232,7 @@ def map_json(lattice: Lattice, height_m: FloatArray, layers: Sequence[Layer]) ->
 
 def relief(height_m: FloatArray, cell_m: float) -> FloatArray:
     """Return the shade of a surface lit from the north-west, 45 degrees up, 0 to 1."""
-    smooth = np.pad(smoothed(height_m, SMOOTH_CELLS), 1, constant_values=np.nan)
-    light = hillshade(smooth, cell_m)
-    return np.where(light == NO_LIGHT, np.nan, (light - 1.0) / 254.0)
+    return hillshade(np.pad(smoothed(height_m, SMOOTH_CELLS), 1, constant_values=np.nan), cell_m)
 
 
 def _of_layer(layer: Layer) -> dict[str, Any]:

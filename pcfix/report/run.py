@@ -25,8 +25,6 @@ from pcfix.report.page import (
     Report,
     Table,
     Tile,
-    extent_of,
-    label_plan,
     map_figure,
     name_of,
     new_figure,
@@ -36,6 +34,7 @@ from pcfix.report.text import Summary, formal_words, summary_rows
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Plain = dict[str, Any]
@@ -161,7 +160,7 @@ def _pictures(s: Summary, cameras: Cameras, maps: RunMaps, compared: Plain) -> l
     lattice, depth = maps.lattice, s.depth_m
     interval = depth_interval(maps.depth_m, maps.uncertainty_m)
     shade = relief(maps.height_m, lattice.resolution_m)
-    figure = map_figure(maps.depth_m, extent_of(lattice), "Depth (m)", shade, cmap=DEPTH)
+    figure = map_figure(maps.depth_m, lattice, "Depth (m)", shade, cmap=DEPTH)
     for _, place in contours(maps.depth_m, interval):
         x, y = (place + 0.5).T * lattice.resolution_m  # from the corner of the map
         figure.axes[0].plot(lattice.left_m + x, lattice.top_m - y, color=REFERENCE, linewidth=0.5)
@@ -172,7 +171,8 @@ def _pictures(s: Summary, cameras: Cameras, maps: RunMaps, compared: Plain) -> l
     pictures = [Picture("depth", "Depth", alt, figure)]
     if s.cameras:
         alt = f"Projection centres over the cloud; {s.cameras_used} of {s.cameras} were used."
-        figure = cameras_figure(maps, cameras, s.cameras_unused)
+        figure = map_figure(maps.depth_m, lattice, "Depth (m)", shade, cmap=DEPTH)
+        draw_cameras(figure.axes[0], cameras, s.cameras_unused)
         pictures.append(Picture("cameras", "Cameras", alt, figure))
     known = np.isfinite(maps.depth_m) & np.isfinite(maps.uncertainty_m)
     if s.uncertainty is not None and known.any():
@@ -188,22 +188,15 @@ def _pictures(s: Summary, cameras: Cameras, maps: RunMaps, compared: Plain) -> l
     return pictures
 
 
-def cameras_figure(maps: RunMaps, cameras: Cameras, unused: Sequence[str]) -> Figure:
-    """Draw the projection centres in plan over the cloud."""
-    extent_m = extent_of(maps.lattice)
+def draw_cameras(plan: Axes, cameras: Cameras, unused: Sequence[str]) -> None:
+    """Draw the projection centres on a map."""
     used = ~np.isin(np.array(cameras.labels), unused)
-    figure, plan = new_figure(8.0, 5.0)
-    plan.imshow(maps.height_m, extent=extent_m, cmap="Greys_r", alpha=0.6)
-    depth = plan.imshow(maps.depth_m, extent=extent_m, cmap=DEPTH)
-    figure.colorbar(depth, ax=plan, label="Depth (m)", shrink=0.8)
     for chosen, mark, colour, name in (used, "o", AFTER, "used"), (~used, "x", BEFORE, "not used"):
         if chosen.any():
             x, y, _ = cameras.centres[chosen].T
             plan.plot(x, y, mark, color=colour, label=name, markersize=4)
-    label_plan(plan)
     # above the axes, where it covers no camera
     plan.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False)
-    return figure
 
 
 def tvu_figure(depth_m: FloatArray, tvu_m: FloatArray, measured: Sequence[Plain]) -> Figure:
