@@ -5,9 +5,7 @@ All text is derived from the plain values of `adjustment_dict`, which a resumed 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-import numpy as np
+import math
 
 from pcfix.adjust.parameters import words_of
 from pcfix.adjust.result import Plain
@@ -110,13 +108,6 @@ def _facts(d: Plain) -> Rows:
     })  # fmt: skip
 
 
-def _surface(d: Plain) -> Iterator[tuple[str, Plain]]:
-    """Yield the parameters of water or port by name."""
-    for name, row in (d["water"] or d["port"] or {}).items():
-        if isinstance(row, dict):
-            yield name, row
-
-
 # Tables
 
 
@@ -124,34 +115,26 @@ def _change_table(d: Plain) -> Table:
     """Return lens, water, residuals and centres before and after."""
     unit, rows = d["image_unit"], list[list[str]]()
     several = len({row["sensor"] for row in d["lens"]}) > 1
-
-    def add(name: str, row: Plain, of_lens: str = "") -> None:
-        """Add an unknown with its standard error."""
+    unknowns = [(row["name"], row, f", {row['sensor']}" * several) for row in d["lens"]]
+    surface = d["water"] or d["port"] or {}
+    unknowns += [
+        (name, row, "") for name, row in surface.items() if isinstance(row, dict) and row["free"]
+    ]
+    for name, row, of_lens in unknowns:
         label, of_unit = words_of(name)
         of_unit = unit if name in ("f", "cx", "cy", "b1", "b2") else of_unit.strip()
         label = label.capitalize() + of_lens + (f" ({of_unit})" if of_unit else "")
         before, after = f"{row['before']:.6g}", f"{row['after']:.6g}"
         rows.append([label, before, after, f"{row['sigma']:.2g}"])
-
-    for row in d["lens"]:
-        add(row["name"], row, f", {row['sensor']}" if several else "")
-    for name, row in _surface(d):
-        if row["free"]:
-            add(name, row)
     for key, where in WHERE:
         r = d["residuals"][key]
         if r["points"]:
             before, after = fixed(r["rms_before_px"], 3), fixed(r["rms_px"], 3)
             rows.append([f"Residuals {where} ({unit})", before, after, ""])
-    if (gnss := d["gnss"]) is not None:
-        before, after = (fixed(_length(gnss[name]), 3) for name in ("rms_before_m", "rms_m"))
-        rows.append(["Centres minus GNSS (m)", before, after, ""])
+    if (gnss := d["gnss"]) is not None:  # the lengths of vectors, of their known components
+        lengths = (math.hypot(*filter(None, gnss[name])) for name in ("rms_before_m", "rms_m"))
+        rows.append(["Centres minus GNSS (m)", *(fixed(one, 3) for one in lengths), ""])
     return Table("Before and after", ["", "before", "after", "standard error"], rows)
-
-
-def _length(values: list[float | None]) -> float:
-    """Return the length of a vector, of its known components."""
-    return float(np.sqrt(sum(value**2 for value in values if value is not None)))
 
 
 def _survey_table(d: Plain) -> Table:

@@ -32,15 +32,11 @@ BEFORE, AFTER, WATER, REFERENCE = "#b3541e", "#0b5e8a", "#4aa3c7", "#222222"
 """Colours of different lightness, for readers with colour blindness."""
 
 
-def new_figure(
-    width_in: float = 8.0, height_in: float = 4.5, mosaic: Any = None, **grid: Any
-) -> tuple[Figure, Any]:
-    """Return a figure, drawn without a screen, and its axes: a grid, or a mosaic by name."""
+def new_figure(width_in: float = 8.0, height_in: float = 4.5, **grid: Any) -> tuple[Figure, Any]:
+    """Return a figure, drawn without a screen, and its axes, or a grid of them."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
-    if mosaic is not None:
-        return figure, figure.subplot_mosaic(mosaic, **grid)
     return figure, figure.subplots(**grid)
 
 
