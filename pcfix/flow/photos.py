@@ -240,7 +240,7 @@ def photo_of(path: Path, cameras: Cameras, row: int, size: tuple[int, int]) -> P
     The cameras have angles and lenses; size or shape of the frame must match the image.
     """
     (columns, rows), lens = size, cast(tuple[Lens, ...], cameras.lenses)[row]
-    scale = 1.0 if lens.unit == "px" else columns / lens.width
+    scale = columns / lens.width
     if lens.unit == "px":
         matches = size == (round(lens.width), round(lens.height))
     else:
