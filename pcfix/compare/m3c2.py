@@ -18,9 +18,6 @@ from pcfix.model import FloatArray, IntArray
 from pcfix.sums import Figures
 
 MAX_CORE_POINTS = 100_000
-SPACING_SAMPLE = 10_000
-NORMAL_SPACINGS, CYLINDER_SPACINGS = 6.0, 3.0
-"""Radii in point spacings of the sparser cloud: a cylinder holds about 28 points."""
 
 
 def load_py4dgeo() -> Any:
@@ -46,10 +43,10 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
     py4dgeo = load_py4dgeo()
     spacing = 1e-3  # median distance to the nearest other point, of the sparser cloud
     for one in xyz, reference:
-        sample = one[sample_rows(len(one), SPACING_SAMPLE)]
+        sample = one[sample_rows(len(one), 10_000)]
         near, _ = Neighbours(make_tiles(one), 3).nearest(sample, min(2, len(one)))
         spacing = max(spacing, float(np.median(near[:, -1])))
-    normal, cylinder = NORMAL_SPACINGS * spacing, CYLINDER_SPACINGS * spacing
+    normal, cylinder = 6.0 * spacing, 3.0 * spacing  # radii; a cylinder holds about 28 points
     # py4dgeo cuts a cylinder into lengths of its radius: an odd number of them, as a core point on
     # the border of two would count twice, once or not at all
     pieces = 2 * math.ceil((max_distance_m / cylinder - 1.0) / 2.0) + 1

@@ -6,7 +6,7 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pcfix.compare.figures import Comparison, bins_table, figures_of, parse_line
 from pcfix.compare.m3c2 import load_py4dgeo
@@ -15,14 +15,11 @@ from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
 from pcfix.io.atomic import all_or_none
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
-from pcfix.io.files import check_output, scratch_arrays, write_text
+from pcfix.io.files import check_output, scratch_arrays, write_bytes, write_text
 from pcfix.io.tiles import Clouds, band_of, cloud_of, inputs_of
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CompareOptions, CompareRules
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 DEPTHS = "depth_bins.csv"
 
@@ -112,12 +109,13 @@ def _write(result: Comparison, given: CompareOptions) -> None:
             for name, content in files.items():
                 write_text(folder / name, content, overwrite=given.overwrite)
 
-        def figure() -> Figure:
-            from pcfix.report.comparison import c2c_figure
+        if given.plot is not None:
+            from pcfix.report.comparison import c2c_figure  # matplotlib is slow to import
+            from pcfix.report.page import png_of
 
-            return c2c_figure(result.as_dict())
-
-        write_summary(given, result.as_dict(), figure)
+            plot = png_of(c2c_figure(result.as_dict()))
+            write_bytes(given.plot, plot, overwrite=given.overwrite)
+        write_summary(given, result.as_dict())
     if folder is not None:
         for path in folder.glob("section_*.csv"):
             if path.name not in files:

@@ -17,7 +17,6 @@ from pcfix.sums import nice_step
 DEPTH = "YlGnBu"
 HEIGHT = "cividis"
 UNCERTAINTY = "OrRd"
-RAYS = "Purples"
 DIFFERENCE = "RdBu_r"
 
 
