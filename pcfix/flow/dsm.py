@@ -41,19 +41,12 @@ from pcfix.version import __version__
 
 WINDOW_POINTS = 400_000
 """Points that are gridded at once, about."""
-TIN_REACH_SPACINGS = 5.0
-TIN_REACH_CELLS = 3.0
-"""Largest diameter of circles around triangles: the larger of the two, or --fill."""
-
 BLOCK_CELLS = 1024
 """Longest side of a window."""
 BIN_POINTS = 200_000
 """Points of a tile by which they are sorted, on average."""
-SIGMA_Z = "SigmaZ"
-DIMENSIONS = {"height": None, "depth": "WaterDepth", "uncertainty": SIGMA_Z}
+DIMENSIONS = {"height": None, "depth": "WaterDepth", "uncertainty": "SigmaZ"}
 """Where the values of a quantity are."""
-POINTS_A_SQUARE, MOST_SQUARES = 6.0, 4_000_000
-"""Points of a square, if these fill the area, and squares to measure the spacing of points."""
 
 
 def grid_dsm(
@@ -114,9 +107,8 @@ def grid_dsm(
             gap_m = _spacing_m(source, used, rules.cell_m)
         lattice = lattice_over(*bounds(used[:, :2]), rules.cell_m, str(task.source))
         tiles = make_tiles(used, points=BIN_POINTS)
-        # the widest circle around a triangle
-        reach = TIN_REACH_SPACINGS * gap_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
-        reach_m = max(reach)
+        # diameter of the widest circle around a triangle of a TIN
+        reach_m = max(5.0 * gap_m, 3.0 * rules.cell_m, rules.fill or 0.0)
         paths = {"dsm": task.target, **more}
         tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
         counted = _write_rasters(tiles, lattice, reach_m, gap_m, rules, paths, crs, tags, report)
@@ -222,7 +214,8 @@ def point_spacing_m(cloud: CloudFiles, near: Path) -> float:
 
 def _spacing_m(source: LasSource, xyz: FloatArray, finest_m: float = MIN_RESOLUTION_M) -> float:
     """Return the spacing of points of a cloud by squares of at least a size; see `spacing_m`."""
-    share = max(POINTS_A_SQUARE / len(source), 1.0 / MOST_SQUARES)
+    # squares with six points if these fill the area, but at most 4 million of them
+    share = max(6.0 / len(source), 1.0 / 4_000_000)
     # as the header states it, which need not be right
     area = float(np.prod(source.header.maxs[:2] - source.header.mins[:2]))
     side = np.sqrt(share * area) if np.isfinite(area) and area > 0.0 else 0.0
@@ -247,7 +240,7 @@ def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], Non
         is_bed = classes == BATHYMETRIC_POINT
         wanted = is_bed if rules.surface == "bed" else ~np.isin(classes, NOISE_CLASSES)
         wanted &= ~np.asarray(points["withheld"]).astype(bool) & np.isfinite(xyz[:, 2])
-        if dimension == SIGMA_Z:
+        if dimension == "SigmaZ":
             wanted &= xyz[:, 2] > 0.0  # others have none
         xyz = xyz[wanted]
         result[count : count + len(xyz)] = xyz

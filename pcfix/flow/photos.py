@@ -34,12 +34,6 @@ from pcfix.sums import Figures
 from pcfix.water.checks import check_above_water
 from pcfix.water.index import index_of
 
-LEAST_STEP_PX = 8
-COARSE_STEP_PX = 100
-"""Between the rays that test whether an image sees any of the ground."""
-LENS_TOLERANCE = 0.005
-"""Of the shape of a frame in millimetres against that of the image."""
-
 
 def map_photos(
     images: File,
@@ -199,7 +193,7 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
         )
         raise GeometryError("cameras.below_ground", sentence, path=name, lowest_m=low)
     scene = Scene(ground, surface, index_of(given.index, given.index_formula)[0])
-    coarse = ((photo, nodes_of(photo.lens, COARSE_STEP_PX)[0]) for photo in photos)
+    coarse = ((photo, nodes_of(photo.lens, 100)[0]) for photo in photos)
     if not any(ground_seen(photo, scene, nodes)[2].any() for photo, nodes in coarse):
         sentence = (
             f"{given.dsm}: is in none of the {len(photos)} photographs. Check its CRS and that of"
@@ -207,7 +201,7 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
         )
         raise GeometryError("cameras.no_overlap", sentence, path=given.dsm)
     gsd = float(np.median(sizes))
-    step = max(LEAST_STEP_PX, int(np.ceil(ground.cell_m / gsd)))
+    step = max(8, int(np.ceil(ground.cell_m / gsd)))  # a cell of the ground, or 8 px
     return PhotoBlock(tuple(paths), tuple(photos), scene, step, tuple(notes), crs, gsd, waters)
 
 
@@ -244,7 +238,7 @@ def photo_of(path: Path, cameras: Cameras, row: int, size: tuple[int, int]) -> P
     if lens.unit == "px":
         matches = size == (round(lens.width), round(lens.height))
     else:
-        matches = abs(rows / lens.height / scale - 1.0) <= LENS_TOLERANCE
+        matches = abs(rows / lens.height / scale - 1.0) <= 0.005  # the same shape
     if not matches:
         sentence = (
             f"has {columns} x {rows} pixels, but the camera file says {lens.width:g} x"

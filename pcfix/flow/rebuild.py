@@ -38,9 +38,6 @@ from pcfix.sums import Figures
 from pcfix.water.surface import surface_above
 
 RECORD = "pcfix-rebuild.json"
-STEREO_CELL_PIXELS = 2.0
-STEREO_STEP_M = 0.001
-CACHED_PHOTOGRAPHS = 16
 COMMAND_ONLY = ("overwrite", "jobs", "summary", "rebuild", "until_gsd", "most_rounds")
 """Options that a later call may change and still resume."""
 
@@ -141,7 +138,7 @@ def _reconstruct(
     if given.rebuild == "stereo":
         import cv2
 
-        @lru_cache(maxsize=CACHED_PHOTOGRAPHS)
+        @lru_cache(maxsize=16)
         def picture(row: int) -> Picture:
             pixels = read_colours(images / block.paths[row].name)
             grey = pixels[..., 0]
@@ -151,9 +148,9 @@ def _reconstruct(
                 grey = (grey >> 8).astype(np.uint8)
             return Picture(np.ascontiguousarray(grey), blank=blank_in(pixels))
 
-        side = STEREO_CELL_PIXELS * block.gsd_m
+        side = 2.0 * block.gsd_m
         xyz = stereo_cloud(block.photos, block.scene.ground, side, picture, progress)
-        write_points(cloud, xyz, (block.crs, STEREO_STEP_M))
+        write_points(cloud, xyz, (block.crs, 0.001))
         return
     cloud.unlink(missing_ok=True)
     words = shlex.split(given.rebuild or "")

@@ -32,14 +32,9 @@ if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
-AXIS_SHARE = 0.06
-"""Length of the line along the axis of a camera, as a share of its height above the clouds."""
 WATER_CELLS = 40
 SHOWN = ("WaterDepth", "SigmaZ", *SHIFTS)
 LINE_COLOURS = {"water": (0.65, 0.82, 0.89), "cameras": (0.04, 0.37, 0.54)}
-AZIMUTH_DEG, ELEVATION_DEG = -119.0, 29.0
-"""The view is from the south-west, from above."""
-MOST_DOTS = 30_000
 GREY = 0.72
 """Of points without a value, such as land where depths are shown."""
 MOST_PERCENT = 98.0
@@ -126,7 +121,8 @@ def view_clouds(
     if given.cameras is not None:
         inputs = replace(given, water=0.0 if given.water is None else given.water).part(Inputs)
         cameras = inputs.block(first.crs)[0]
-        length = AXIS_SHARE * max(float(np.median(cameras.centres[:, 2])) - high[2], 1.0)
+        # the lines along optical axes are short against the height above the clouds
+        length = 0.06 * max(float(np.median(cameras.centres[:, 2])) - high[2], 1.0)
         down = np.array([0.0, 0.0, -1.0])
         axes = down if cameras.rotations is None else cameras.rotations[:, 2]
         lines["cameras"] = np.stack([cameras.centres, cameras.centres + length * axes], axis=1)
@@ -248,14 +244,14 @@ def view_figure(shown: list[Shown], lines: Lines, scale: ScalarMappable, label: 
     width, grid = 0.8 + 6.4 * len(shown), {"ncols": len(shown), "squeeze": False}
     figure, axes = new_figure(width, 5.2, **grid, subplot_kw={"projection": "3d"})
     for panel, one in zip(axes[0], shown, strict=True):
-        step = max(1, len(one.xyz) // MOST_DOTS)
+        step = max(1, len(one.xyz) // 30_000)
         panel.set_title(one.name)
         panel.scatter(*one.xyz[::step].T, c=one.rgb[::step], s=1, depthshade=False)
         for kind, edges in lines.items():
             gaps = np.full((len(edges), 1, 3), np.nan)  # between the edges
             line = np.hstack([edges, gaps]).reshape(-1, 3)
             panel.plot(*line.T, color=LINE_COLOURS[kind], linewidth=0.5)
-        panel.view_init(ELEVATION_DEG, AZIMUTH_DEG)
+        panel.view_init(29.0, -119.0)  # degrees: from the south-west, from above
         panel.set_aspect("equal")
         panel.set(xlabel="East (m)", ylabel="North (m)", zlabel="Height (m)")
     figure.colorbar(scale, ax=list(axes[0]), label=label, shrink=0.8, extend="both")

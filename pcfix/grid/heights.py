@@ -68,9 +68,6 @@ def cell_statistics(cell: IntArray, z: FloatArray, size: int) -> dict[str, Any]:
     return {"points": count, **dict(zip(names, statistics, strict=True))}
 
 
-MOVED = 1e-4
-"""Displacement for the choice of triangles, relative to the spacing of the points."""
-ON_EDGE = 1e-9  # of a barycentric coordinate: a centre on an edge belongs to both sides
 _MIX = np.array([0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB], np.uint64)
 
 
@@ -86,7 +83,7 @@ def triangulated(
     """
     out = np.full(window.height * window.width, np.nan)
     position, z = _one_a_place(position, z)
-    moved = position + MOVED * spacing * _offsets(position)
+    moved = position + 1e-4 * spacing * _offsets(position)  # for the choice of triangles
     row, column = np.divmod(np.arange(out.size), window.width)
     centre = np.column_stack([column + window.column, row + window.row]) + 0.5
     origin = np.floor(moved.mean(axis=0)) if len(moved) else 0.0
@@ -94,7 +91,7 @@ def triangulated(
         mesh = Delaunay(moved - origin)
     except (QhullError, ValueError):  # fewer than three points, or all on one line
         return out.reshape(window.height, window.width)
-    found = mesh.find_simplex(centre - origin, tol=ON_EDGE)
+    found = mesh.find_simplex(centre - origin, tol=1e-9)  # a centre on an edge is on both sides
     corners = np.sort(mesh.simplices[found], axis=1)
     # the radius of the circle through three points is a b c / 4 area
     a, b, c = np.moveaxis(moved[corners], 1, 0)

@@ -146,10 +146,8 @@ def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float, name: s
         return np.asarray(last - first + 1.0)
 
     if size(resolution_m).prod() > MAX_CELLS:
-        finest = resolution_m
-        while size(finest).prod() > MAX_CELLS:
-            finest = float(f"{1.05 * finest:.2g}")
         columns, rows = size(resolution_m)
+        finest = float(f"{1.06 * resolution_m * math.sqrt(columns * rows / MAX_CELLS):.2g}")
         sentence = (
             f"{name}: a resolution of {resolution_m:g} m makes {columns:,.0f} x {rows:,.0f} cells,"
             f" more than {MAX_CELLS:,}. Use {finest:g} m or more, or first remove points that are"

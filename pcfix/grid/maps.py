@@ -97,13 +97,6 @@ def smoothed(values: FloatArray, sigma_cells: float) -> FloatArray:
     return np.where(known, total / np.maximum(weight, 1e-9), np.nan)
 
 
-MOST_LEVELS, LEAST_INTERVAL_M = 15, 1e-3
-SMOOTH_CELLS = 1.0
-"""Standard deviation of the filter before the lines are drawn."""
-LEAST_CELLS = 12.0
-"""Shorter lines are dropped."""
-
-
 def depth_interval(depth_m: FloatArray, uncertainty_m: FloatArray) -> float:
     """Return the interval for a map of depths: few levels, and not finer than the uncertainty.
 
@@ -112,7 +105,7 @@ def depth_interval(depth_m: FloatArray, uncertainty_m: FloatArray) -> float:
     known = uncertainty_m[np.isfinite(uncertainty_m)]
     deepest = np.max(depth_m, where=np.isfinite(depth_m), initial=0.0)
     sigma = float(np.median(known)) if known.size else 0.0
-    return nice_step(max(float(deepest) / MOST_LEVELS, sigma, LEAST_INTERVAL_M))
+    return nice_step(max(float(deepest) / 15, sigma, 1e-3))
 
 
 def contours(values: FloatArray, interval: float) -> list[tuple[float, FloatArray]]:
@@ -125,12 +118,12 @@ def contours(values: FloatArray, interval: float) -> list[tuple[float, FloatArra
 
     if min(values.shape) < 2 or not np.isfinite(values).any():
         return []
-    maker = contour_generator(z=np.ma.masked_invalid(smoothed(values, SMOOTH_CELLS)))
+    maker = contour_generator(z=np.ma.masked_invalid(smoothed(values, 1.0)))
     first = math.floor(float(np.nanmin(values)) / interval) + 1
     last = math.ceil(float(np.nanmax(values)) / interval)
     return [
         (round(step * interval, 6), line)
         for step in range(first, last)
         for line in map(np.asarray, maker.lines(step * interval))
-        if np.hypot(*np.diff(line, axis=0).T).sum() >= LEAST_CELLS
+        if np.hypot(*np.diff(line, axis=0).T).sum() >= 12.0  # cells
     ]

@@ -21,17 +21,9 @@ from pcfix.model import BoolArray, FloatArray
 from pcfix.photos.mapping import Ground, Photo
 from pcfix.photos.ortho import Picture
 
-PARTNERS = 4
 BASE_SHARES = (0.1, 0.3, 0.55)
 """Shortest, best and longest base, as shares of the shorter side of the image."""
-MOST_ANGLE_DEG = 30.0
-"""Between the axes of a pair."""
-SPARE_PX = 4
-SPARE_RELIEF = 0.5
-"""The bed is searched this share of the range of heights below the ground."""
-BLOCK_PX = 5
-FEWEST_PAIRS = 2
-"""Pairs, and half of its own, that a cell needs within a pixel of parallax of the median."""
+SPARE_PX, BLOCK_PX = 4, 5  # disparities beyond those expected, and the side of matched blocks
 HALF = 1 << 31
 """Added to columns, so that those west of x = 0 do not run into the row of their number."""
 
@@ -50,7 +42,8 @@ def stereo_cloud(
     `photos`, and where it has no picture.
     """
     low, high = np.nanquantile(ground.height_m, [0.001, 0.999])
-    heights = float(low - SPARE_RELIEF * (high - low) - 1.0), float(high + 1.0)
+    # the bed is searched half of the range of heights below the ground
+    heights = float(low - 0.5 * (high - low) - 1.0), float(high + 1.0)
     middle = float(np.nanmedian(ground.height_m))
     pairs, cells, means = pairs_of(photos, middle), [], []
     for done, (one, other) in enumerate(pairs, start=1):
@@ -81,12 +74,12 @@ def stereo_cloud(
     agreeing = np.bincount(cell[agrees], minlength=len(own))
     row = own >> 32
     centre = cell_m * (np.column_stack([own - (row << 32) - HALF, row]) + 0.5)
-    fine = agreeing >= np.maximum(FEWEST_PAIRS, 0.5 * fused["points"])
+    fine = agreeing >= np.maximum(2, 0.5 * fused["points"])
     return np.column_stack([centre, fused["median"]])[fine]
 
 
 def pairs_of(photos: Sequence[Photo], ground_m: float) -> list[tuple[int, int]]:
-    """Pair each image with the neighbours whose bases are nearest to the best."""
+    """Pair each image with the four neighbours whose bases are nearest to the best."""
     shortest, best, longest = BASE_SHARES
     centres = np.array([photo.centre for photo in photos])
     axes = np.array([photo.rotation[2] for photo in photos])
@@ -96,9 +89,9 @@ def pairs_of(photos: Sequence[Photo], ground_m: float) -> list[tuple[int, int]]:
         base = np.linalg.norm(centres - photo.centre, axis=1)
         share = base * photo.lens.focal / (photo.centre[2] - ground_m) / side
         fits = (share > shortest) & (share < longest)
-        fits &= axes @ axes[row] > np.cos(np.radians(MOST_ANGLE_DEG))
+        fits &= axes @ axes[row] > np.cos(np.radians(30.0))  # nearly parallel axes
         near = np.flatnonzero(fits)
-        for other in near[np.argsort(np.abs(share[near] - best), kind="stable")][:PARTNERS]:
+        for other in near[np.argsort(np.abs(share[near] - best), kind="stable")][:4]:
             chosen.add((min(row, int(other)), max(row, int(other))))
     return sorted(chosen)
 

@@ -12,10 +12,7 @@ from pcfix.adjust.result import Plain
 from pcfix.report.page import Report, Table, render
 from pcfix.report.text import Rows, RowTable, filled, share, wrapped
 
-TITLE = "Refractive bundle adjustment"
 WHERE = (("land", "on land"), ("water", "under water"))
-MOST_LISTED = 12
-"""Surveyed points in the text; the page has all of them."""
 _FACTS: RowTable = (
     ("Water", "{water[surface]}", "water"),
     ("Port", "--port {port[surface]}", "port"),
@@ -57,7 +54,7 @@ def adjustment_text(d: Plain) -> str:
     lines = [_head(d), *_change_table(d).lines()]
     lines += [wrapped(f"  {label:<29} ", words) for label, words in _facts(d)]
     if (surveyed := _survey_table(d)).rows:
-        lines += surveyed.lines()[: 1 + MOST_LISTED]
+        lines += surveyed.lines()[:13]  # a header and twelve points; the page has all of them
     return "\n".join([*lines, *(wrapped("", f"Note: {note}") for note in all_notes(d))])
 
 
@@ -69,7 +66,7 @@ def adjustment_page(d: Plain) -> str:
     head = Table("In short", [], [list(row) for row in _facts(d)])
     tables = [_change_table(d), _residual_table(d), _survey_table(d)]
     tables = [table for table in tables if table.rows]
-    return render(Report(TITLE, lead, head, all_notes(d), tables))
+    return render(Report("Refractive bundle adjustment", lead, head, all_notes(d), tables))
 
 
 def _head(d: Plain) -> str:

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from pcfix.compare.figures import Comparison
 
 TIMES = (("before", "uncorrected", BEFORE), ("after", "corrected", AFTER))
-NAMES = {"apparent": "uncorrected"}
 FURTHER = ("#6a3d9a", "#33804d", "#c51b7d", "#8c6d1f", "#5f6b73")
 """Colours of further clouds, in turn."""
 KINDS = {
@@ -254,7 +253,8 @@ def _section(number: int, section: Plain) -> Picture:
     colours |= dict(zip(further, cycle(FURTHER), strict=False))
     for name, colour in colours.items():
         if name in heights:
-            line, label = np.array(heights[name], float), NAMES.get(name, name)
+            line = np.array(heights[name], float)
+            label = "uncorrected" if name == "apparent" else name
             width = 2.5 if name == "reference" else 1.2  # it lies under the others
             axes.plot(section["distance_m"], line, color=colour, linewidth=width, label=label)
     axes.set(xlabel="Distance along the line (m)", ylabel="Height (m)")

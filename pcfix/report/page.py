@@ -186,14 +186,6 @@ def render(report: Report) -> str:
 
 
 _NO_DATA = -32768
-_STEPS = 32_000
-"""Of the 16 bits in which the page holds the values of its map."""
-_SMALLEST_STEP = 0.001
-"""In metres or pixels; finer steps would only be noise that does not pack."""
-_COLOURS = 64
-_TICKS = 7
-SMOOTH_CELLS = 1.5
-"""Single cells are noisy: the shade is of a surface smoothed by this."""
 
 
 def map_json(lattice: Lattice, height_m: FloatArray, layers: Sequence[Layer]) -> str:
@@ -228,18 +220,20 @@ def map_json(lattice: Lattice, height_m: FloatArray, layers: Sequence[Layer]) ->
 
 def relief(height_m: FloatArray, cell_m: float) -> FloatArray:
     """Return the shade of a surface lit from the north-west, 45 degrees up, 0 to 1."""
-    return hillshade(np.pad(smoothed(height_m, SMOOTH_CELLS), 1, constant_values=np.nan), cell_m)
+    smooth = smoothed(height_m, 1.5)  # as single cells are noisy
+    return hillshade(np.pad(smooth, 1, constant_values=np.nan), cell_m)
 
 
 def _of_layer(layer: Layer) -> dict[str, Any]:
     """Return a layer; the range of its colours is round, and leaves out a percent at each end."""
     known = layer.values[np.isfinite(layer.values)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-    step = max((high - low) / _STEPS, _SMALLEST_STEP)
+    # 16 bits hold 32,000 steps; those below a millimetre would be noise that does not pack
+    step = max((high - low) / 32_000, 0.001)
     shown = np.percentile(known, [1.0, 99.0]) if known.size else np.array([0.0, 1.0])
     if layer.is_centred:
         shown = np.abs(shown).max() * np.array([-1.0, 1.0])
-    tick = nice_step(max(float(shown[1] - shown[0]), 1e-3) / _TICKS)
+    tick = nice_step(max(float(shown[1] - shown[0]), 1e-3) / 7)
     first = np.floor(shown[0] / tick)
     ticks = max(np.ceil(shown[1] / tick) - first, 1.0)
     whole_steps = np.rint((layer.values - low) / step)
@@ -251,7 +245,7 @@ def _of_layer(layer: Layer) -> dict[str, Any]:
         "low": float(first * tick),
         "high": float((first + ticks) * tick),
         "ticks": int(ticks),
-        "colours": [colour for _, colour in stops_of(layer.ramp, _COLOURS)],
+        "colours": [colour for _, colour in stops_of(layer.ramp, 64)],
         "plusMinus": layer.plus_minus,
         "values": _packed(np.where(np.isfinite(whole_steps), whole_steps, _NO_DATA)),
     }

@@ -40,11 +40,6 @@ if TYPE_CHECKING:
 Plain = dict[str, Any]
 FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras")
 """Those that are shown where they are there, the first four of them."""
-SHOWN_NOTES = 3
-REFERENCE_M = 0.03
-"""Noise of a reference such as LiDAR on hard ground; a smaller bias is no cause for a warning."""
-MAP_FACTS = ("Submerged", "Cameras", "Water", "")
-"""Labels of the rows that are also shown beside the map."""
 
 
 class RunMaps(NamedTuple):
@@ -92,7 +87,7 @@ def run_report(
         ["CRS", maps.crs or "not stated by the cloud"],
         ["Heights", maps.heights or "vertical datum not stated by the cloud"],
         ["Points", f"{s.points:,}"],
-        *([label, words] for label, words in rows if label in MAP_FACTS),
+        *(list(row) for row in rows if row[0] in ("Submerged", "Cameras", "Water", "")),
     ]
     depths = f"{depth['min']:.2f} to {depth['max']:.2f} m", f"{depth['mean']:.2f} m"
     # the rows of the terminal, and why the method was chosen
@@ -114,7 +109,7 @@ def run_report(
         tiles=[
             Tile("Depth", figures=list(zip(("range", "mean"), depths, strict=True))),
             accuracy_tile(s, compared),
-            Tile("Warnings", notes=notes[:SHOWN_NOTES] or ["None."]),
+            Tile("Warnings", notes=notes[:3] or ["None."]),
         ],
         warnings=notes,
         lattice=maps.lattice,
@@ -259,7 +254,8 @@ def notes_of(s: Summary, heights: str, compared: Plain) -> list[str]:
         notes.append("No reference: the accuracy is predicted. Check points on the bed measure it.")
     elif compared["bed"]:
         bias, sd = (compared["bed"]["after"][key] for key in ("mean_m", "sd_m"))
-        if abs(bias) > max(sd, REFERENCE_M):
+        # LiDAR itself has about 3 cm of noise
+        if abs(bias) > max(sd, 0.03):
             notes.append(
                 f"The bed is too {'high' if bias > 0.0 else 'low'} by {abs(bias):.3f} m on average,"
                 " more than it scatters. Check water level, refractive index, vertical datum and"

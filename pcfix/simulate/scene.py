@@ -184,9 +184,6 @@ def plane_in_world(plane: WaterPlane) -> WaterPlane:
 
 # Blocks as drones fly them: nadir strips, and obliques around them
 
-OBLIQUE_PITCH_DEG = 20.0
-ATTITUDE_SD_DEG = 1.5
-PLACE_SD_M, USUAL_HEIGHT_M = 0.5, 80.0  # of a drone; below the usual height it shrinks with it
 _RING_BASES, _RING_SPACINGS = 2.0, 1.5  # steps of a ring of obliques in those of the nadir images
 
 
@@ -198,8 +195,8 @@ def fly_block(
     Returns the cameras, and yaw, pitch and roll of each, degrees, shape (k, 3).
     """
     plan, attitude = _plan(extent_m, chosen)
-    attitude = attitude + rng.normal(0.0, ATTITUDE_SD_DEG, attitude.shape)
-    sd = PLACE_SD_M * min(1.0, chosen.flying_height_m / USUAL_HEIGHT_M)
+    attitude = attitude + rng.normal(0.0, 1.5, attitude.shape)  # degrees
+    sd = 0.5 * min(1.0, chosen.flying_height_m / 80.0)  # metres, of a drone; less if it flies low
     height = chosen.water + chosen.flying_height_m + rng.normal(0.0, sd, len(plan))
     centres = np.column_stack([plan + rng.normal(0.0, sd, plan.shape), height])
     cameras = Cameras(
@@ -231,7 +228,7 @@ def _plan(extent_m: tuple[float, float], chosen: SceneSettings) -> tuple[FloatAr
         yaw = np.where(np.rint(nadir[:, 1] / spacing) % 2, 270.0, 90.0)  # to and fro
         places.append(nadir)
         angles.append(np.column_stack([yaw, np.zeros((len(nadir), 2))]))
-    pitch = OBLIQUE_PITCH_DEG if chosen.obliques_deg is None else chosen.obliques_deg
+    pitch = 20.0 if chosen.obliques_deg is None else chosen.obliques_deg
     back = chosen.flying_height_m * np.tan(np.radians(pitch))
     directions = chosen.oblique_directions if chosen.has_obliques else 0
     share = chosen.oblique_share
@@ -344,7 +341,8 @@ def find_visible(truth: FloatArray, site: Site, rng: np.random.Generator) -> Vis
     point, camera = np.nonzero(np.hypot(*across) < reach)
     surface = site.water.piercing_points(truth[point], cameras.centres[camera])
     ideal, z = project(surface, cameras, camera, site.optics.lens)
-    inside = (z > 0) & site.optics.frames(site.optics.to_image(ideal))
+    image, size = site.optics.to_image(ideal), [site.optics.lens.width, site.optics.lens.height]
+    inside = (z > 0) & ((image >= 0) & (image < size)).all(axis=1)
     point, camera, ideal = point[inside], camera[inside], ideal[inside]
     taken = np.bincount(point, minlength=len(truth))[point] >= LEAST_VIEWS
     if site.detection < 1.0:

@@ -10,12 +10,10 @@ import numpy as np
 
 from pcfix.errors import SettingError
 from pcfix.lens.imaging import project, unproject
-from pcfix.model import BoolArray, FloatArray, Lens, WaterPlane
+from pcfix.model import FloatArray, Lens, WaterPlane
 from pcfix.options.scenes import SceneOptions
 from pcfix.simulate.terrain import BEDS
 from pcfix.water.index import index_of
-
-RIVER_TILT_PERCENT = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +41,6 @@ class Optics:
         rays = unproject(self.lens, image)
         principal = [self.lens.principal_x, self.lens.principal_y]
         return np.asarray(self.lens.focal * rays[:, :2] / rays[:, 2:] + principal)
-
-    def frames(self, image: FloatArray) -> BoolArray:
-        """Return which image points lie in the frame."""
-        inside = (image >= 0) & (image < [self.lens.width, self.lens.height])
-        return np.asarray(inside.all(axis=1))
 
 
 class SceneSettings(SceneOptions):
@@ -94,9 +87,8 @@ class SceneSettings(SceneOptions):
     @property
     def water_tilt(self) -> float:
         """The slope of the mean water plane, m/m."""
-        if self.tilt_percent is None:
-            return RIVER_TILT_PERCENT / 100.0 if self.bed == "river" else 0.0
-        return self.tilt_percent / 100.0
+        usual = 0.3 if self.bed == "river" else 0.0
+        return (usual if self.tilt_percent is None else self.tilt_percent) / 100.0
 
     @cached_property
     def optics(self) -> Optics:

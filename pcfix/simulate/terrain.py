@@ -13,11 +13,8 @@ from scipy.special import expit
 from pcfix.model import FloatArray, WaterPlane
 from pcfix.options.scenes import BedKind
 
-LAND_HEIGHT_M = 3.0
 GREATEST_DEPTH_M = 12.0
 STEPS = 6
-_ROCKS_PER_M2 = 1.0 / 150.0
-_BANK = 0.3  # of a river's depth
 
 
 @dataclass(frozen=True)
@@ -42,7 +39,7 @@ class Terrain:
         """Make a terrain; a shore gets random rocks."""
         rocks = np.zeros((0, 4))
         if kind == "shore":
-            count = int(extent_m[0] * extent_m[1] * _ROCKS_PER_M2)
+            count = int(extent_m[0] * extent_m[1] * (1.0 / 150.0))  # one in 150 m2
             place = rng.uniform(0.0, 1.0, (count, 2)) * extent_m
             size = np.column_stack([rng.uniform(0.2, 0.8, count), rng.uniform(0.5, 2.0, count)])
             rocks = np.column_stack([place, size])
@@ -57,7 +54,7 @@ class Terrain:
 def _shore(ground: Terrain, x: FloatArray, y: FloatArray) -> FloatArray:
     """Return land at x = 0, then beach and bed with swells, rocks and a ledge to deep water."""
     size = min(1.0, ground.greatest_depth_m / GREATEST_DEPTH_M)  # shallow shores are smoother
-    land, share = LAND_HEIGHT_M * size, np.maximum(x / ground.length_m, 0.0)
+    land, share = 3.0 * size, np.maximum(x / ground.length_m, 0.0)
     slope = land - (land + ground.greatest_depth_m) * share**1.2
     swell = 0.4 * np.sin(x / 7.0) * np.cos(y / 9.0) + 0.15 * np.sin(x / 2.3 + y / 3.1)
     ledge = -0.6 * expit((x - 0.6 * ground.length_m - 0.1 * y) / 0.3)
@@ -85,7 +82,7 @@ def _river(ground: Terrain, x: FloatArray, y: FloatArray) -> FloatArray:
     across = (y - middle) / (0.35 * ground.width_m)
     pools = 0.8 + 0.2 * np.sin(3.0 * turn)
     deepest = ground.greatest_depth_m
-    return np.asarray(np.minimum(-deepest * pools * (1.0 - across**2), _BANK * deepest))
+    return np.asarray(np.minimum(-deepest * pools * (1.0 - across**2), 0.3 * deepest))
 
 
 class Bed(NamedTuple):

@@ -18,9 +18,6 @@ import numpy as np
 
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, WaterPlane
 
-_NEWTON_STEPS = 60
-_CONVERGED_M = 1e-11
-
 
 def piercing_points_of_planes(
     points: FloatArray, centres: FloatArray, anchors: FloatArray, normals: FloatArray,
@@ -51,7 +48,7 @@ def _root_of_snell(
     """Return x in [0, reach] with x/|(x, H)| = n (D - x)/|(D - x, h)|; the difference rises."""
     low, high = np.zeros_like(reach), reach.copy()
     x = reach * height / (height + depth / n)
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(60):
         rest = reach - x
         air, water = np.hypot(x, height), np.hypot(rest, depth)
         value = x / air - n * rest / water
@@ -61,7 +58,7 @@ def _root_of_snell(
         following = np.where((following < low) | (following > high), (low + high) / 2.0, following)
         moved = np.abs(following - x).max(initial=0.0)
         x = following
-        if moved < _CONVERGED_M:
+        if moved < 1e-11:  # metres
             return x
     raise ArithmeticError("the piercing point was not found")
 
