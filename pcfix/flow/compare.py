@@ -83,15 +83,15 @@ def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
     """Raise an error for outputs that cannot be written, before anything is computed."""
     if given.out_dir is not None:
         folder = Path(given.out_dir)
-        if folder.exists() and not folder.is_dir():
-            sentence = f"{folder} is a file. Give a folder."
-            raise SettingError("output.no_folder", sentence, path=folder)
-        if not folder.exists():
-            check_output(folder, overwrite=False)
         if folder.is_dir():
             ours = [*folder.glob("section_*.csv"), folder / "compare.json", folder / DEPTHS]
             for path in ours:
                 check_output(path, overwrite=given.overwrite, inputs=inputs)
+        elif folder.exists():
+            sentence = f"{folder} is a file. Give a folder."
+            raise SettingError("output.no_folder", sentence, path=folder)
+        else:
+            check_output(folder, overwrite=False)
     check_summary(given, inputs)
 
 

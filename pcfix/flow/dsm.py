@@ -164,7 +164,8 @@ def _write_rasters(
     margin = margin_cells(widest) if widest else 0
     # windows have about this number of points if points are everywhere, and are wide for a margin
     side = np.sqrt(WINDOW_POINTS) * spacing or BLOCK_CELLS
-    cells, filled, known, count, total, low, high, done = 0, 0, 0, 0, 0.0, np.inf, -np.inf, 0
+    # numbers of cells: with points, filled, with a height; the heights before filling, their sum
+    sums, low, high, done = np.zeros(5), np.inf, -np.inf, 0
     with ExitStack() as files:
         bands: dict[str, str] = {rules.what: METRE}
         system = crs if rules.what == "height" else plan
@@ -186,18 +187,18 @@ def _write_rasters(
             rasters.write_bands(dsm, [height], window)
             if "counts" in paths:
                 rasters.write_bands(counts, [number, spread], window)
-            cells += int((number > 0).sum())
-            filled += int((~np.isnan(height) & (number == 0)).sum())
-            known += int((~np.isnan(height)).sum())
-            count, total = count + values.size, total + float(values.sum())
+            has_points, known = number > 0, ~np.isnan(height)
+            counts_here = has_points.sum(), (known & ~has_points).sum(), known.sum()
+            sums += [*counts_here, values.size, values.sum()]
             low, high = values.min(initial=low), values.max(initial=high)
             done += height.size
             report(0.5 + 0.5 * done / (lattice.height * lattice.width))
-    found = {"min": low, "mean": total / count, "max": high} if count else {}
+    cells, filled, full, count = sums[:4].astype(int).tolist()
+    found = {"min": low, "mean": sums[4] / count, "max": high} if count else {}
     return {
         "cells": cells,  # with points
         "filled": filled,  # with a height but no points
-        "empty": lattice.width * lattice.height - known,  # without a height
+        "empty": lattice.width * lattice.height - full,  # without a height
         # of the cells, before holes are filled
         "values": {name: round(float(value), 4) for name, value in found.items()},
     }

@@ -115,16 +115,13 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def _one_a_place(position: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return points sorted by column and row, each place once, with the mean of its heights."""
-    order = np.lexsort((z, position[:, 1], position[:, 0]))
+    order = np.lexsort((position[:, 1], position[:, 0]))
     position, z = position[order], z[order]
     new = np.ones(len(z), bool)
     new[1:] = (position[1:] != position[:-1]).any(axis=1)
     if new.all():
         return position, z
-    first = np.flatnonzero(new)
-    n = np.diff(first, append=len(z))
-    mean = z[first] + np.add.reduceat(z - np.repeat(z[first], n), first) / n
-    return position[first], mean
+    return position[new], cell_statistics(np.cumsum(new) - 1, z, int(new.sum()))["mean"]
 
 
 def _offsets(position: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from pcfix.options.declare import taken
 from pcfix.options.scenes import SceneOptions
 from pcfix.simulate.settings import Optics, SceneSettings
 from pcfix.simulate.terrain import Terrain
-from pcfix.simulate.tracing import Water, project, rotations_of, triangulate
+from pcfix.simulate.tracing import Water, project, triangulate
 
 ORIGIN_M = np.array([410_200.0, 4_650_300.0, 0.0])  # in UTM zone 33 north
 EPSG = 32633
@@ -334,7 +334,7 @@ def find_visible(truth: FloatArray, site: Site, rng: np.random.Generator) -> Vis
     cameras = site.true
     # how far from below each camera it can see anything: the most oblique ray of the frame's
     # corner, prolonged as if there were no refraction
-    off_nadir = np.arccos(np.clip(-rotations_of(cameras)[:, 2, 2], -1.0, 1.0))
+    off_nadir = np.arccos(np.clip(-np.asarray(cameras.rotations)[:, 2, 2], -1.0, 1.0))
     widest = np.minimum(np.arctan(site.optics.reach) + off_nadir, np.radians(80.0))
     reach = (cameras.centres[:, 2] - site.lowest_m) * np.tan(widest)
     across = truth[:, None, 0] - cameras.centres[:, 0], truth[:, None, 1] - cameras.centres[:, 1]

@@ -63,19 +63,12 @@ def _root_of_snell(
     raise ArithmeticError("the piercing point was not found")
 
 
-def rotations_of(cameras: Cameras) -> FloatArray:
-    """Return the rotations of simulated cameras, which all have them."""
-    if cameras.rotations is None:
-        raise ValueError("simulated images need cameras with angles")
-    return cameras.rotations
-
-
 def project(
     targets: FloatArray, cameras: Cameras, camera: IntArray, lens: Lens
 ) -> tuple[FloatArray, FloatArray]:
     """Return pixels, shape (m, 2), and the depth along the optical axis, shape (m,)."""
     ray = targets - cameras.centres[camera]
-    x, y, z = np.einsum("mij,mj->im", rotations_of(cameras)[camera], ray)
+    x, y, z = np.einsum("mij,mj->im", np.asarray(cameras.rotations)[camera], ray)
     u = lens.focal * x / z + lens.principal_x
     v = lens.focal * y / z + lens.principal_y
     return np.column_stack([u, v]), z
@@ -90,7 +83,7 @@ def triangulate(
     Gauss-Newton from a guess, shape (n, 3). Point i has the pairs from ``start[i]`` to
     ``start[i + 1]``, at least two.
     """
-    rows = rotations_of(cameras)[camera]
+    rows = np.asarray(cameras.rotations)[camera]
     owner = np.repeat(np.arange(len(start) - 1), np.diff(start))
     points = guess.copy()
     for _ in range(20):
