@@ -32,9 +32,10 @@ def grid_window(
     TIN, and `spacing` of the points (see `pcfix.clean.neighbours`) are in cells. The bands have the
     shape of the window, NaN if unknown.
     """
-    cell = lattice.cells(points)
-    inner, shape = window.holds(cell), (window.height, window.width)
-    code = (cell[inner, 1] - window.row) * window.width + cell[inner, 0] - window.column
+    shape = window.height, window.width
+    column, row = (lattice.cells(points) - (window.column, window.row)).T
+    inner = (column >= 0) & (column < window.width) & (row >= 0) & (row < window.height)
+    code = row[inner] * window.width + column[inner]
     cells = cell_statistics(code, points[inner, 2], window.height * window.width)
     if method == "tin":
         height = triangulated(lattice.positions(points), points[:, 2], window, reach, spacing)

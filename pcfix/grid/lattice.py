@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.model import FloatArray, IntArray
 from pcfix.options.steps import MIN_RESOLUTION_M
 
 MAX_CELLS = 1_000_000_000
@@ -41,12 +41,6 @@ class Window(NamedTuple):
         return Window(
             self.row - cells, self.row_stop + cells, self.column - cells, self.column_stop + cells
         )
-
-    def holds(self, cell: IntArray) -> BoolArray:
-        """Return whether columns and rows, shape (n, 2), are in the window."""
-        column, row = cell.T
-        across = (column >= self.column) & (column < self.column_stop)
-        return np.asarray(across & (row >= self.row) & (row < self.row_stop))
 
     def parts(self, side: int) -> Iterator[Window]:
         """Yield squares of `side` cells that cover the window, row by row."""

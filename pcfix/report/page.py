@@ -87,10 +87,8 @@ class Picture:
 
     @property
     def data(self) -> str:
-        """The picture for an HTML page; its "/" are no folders (see `_as_read`)."""
-        from markupsafe import Markup
-
-        return Markup(base64.b64encode(self.png).decode())
+        """The picture for an HTML page."""
+        return base64.b64encode(self.png).decode()
 
 
 @dataclass(frozen=True)
@@ -164,7 +162,10 @@ def name_of(path: str) -> str:
 
 
 def _as_read(value: Any) -> Any:
-    """Return a value as a reader sees it: files by their names, and a dash for nothing."""
+    """Return a value as a reader sees it: files by their names, and a dash for nothing.
+
+    What the template marks as safe are data, whose "/" are no folders.
+    """
     if isinstance(value, str) and not hasattr(value, "__html__"):
         return _FOLDERS.sub("", value)
     return "-" if value is None else value
@@ -173,7 +174,6 @@ def _as_read(value: Any) -> Any:
 def render(report: Report) -> str:
     """Return the page; it uses no address outside itself, and works without scripts."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
 
     template = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
@@ -181,7 +181,7 @@ def render(report: Report) -> str:
     ).get_template("page.html.j2")  # fmt: skip
     data = None
     if report.lattice is not None and report.height_m is not None:
-        data = Markup(map_json(report.lattice, report.height_m, report.layers))
+        data = map_json(report.lattice, report.height_m, report.layers)
     return template.render(report=report, map_data=data)
 
 
