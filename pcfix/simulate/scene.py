@@ -14,7 +14,12 @@ from pcfix.options.declare import taken
 from pcfix.options.scenes import SceneOptions
 from pcfix.simulate.settings import Optics, SceneSettings
 from pcfix.simulate.terrain import Terrain
-from pcfix.simulate.tracing import Water, project, triangulate
+from pcfix.simulate.tracing import (
+    anchors_and_normals,
+    piercing_points_of_planes,
+    project,
+    triangulate,
+)
 
 ORIGIN_M = np.array([410_200.0, 4_650_300.0, 0.0])  # in UTM zone 33 north
 EPSG = 32633
@@ -159,7 +164,7 @@ def lay_out(chosen: SceneSettings) -> Site:
     fall_m = chosen.water_tilt * float(np.hypot(*extent)) / 2.0
     return Site(
         terrain, true, true_angles, given, given_angles, chosen.optics,
-        Water(plane, chosen.refractive_index), chosen.water - chosen.depth_m - fall_m,
+        chosen.refractive_index, chosen.water - chosen.depth_m - fall_m,
         chosen.image_noise, chosen.detection, rng, luck,
     )  # fmt: skip
 
@@ -277,7 +282,7 @@ class Site:
     given: Cameras
     given_angles: FloatArray
     optics: Optics
-    water: Water
+    refractive_index: float
     lowest_m: float
     image_noise_px: float
     detection: float
@@ -339,7 +344,9 @@ def find_visible(truth: FloatArray, site: Site, rng: np.random.Generator) -> Vis
     reach = (cameras.centres[:, 2] - site.lowest_m) * np.tan(widest)
     across = truth[:, None, 0] - cameras.centres[:, 0], truth[:, None, 1] - cameras.centres[:, 1]
     point, camera = np.nonzero(np.hypot(*across) < reach)
-    surface = site.water.piercing_points(truth[point], cameras.centres[camera])
+    planes = anchors_and_normals(site.terrain.water, len(point))
+    pairs = truth[point], cameras.centres[camera]
+    surface = piercing_points_of_planes(*pairs, *planes, site.refractive_index)
     ideal, z = project(surface, cameras, camera, site.optics.lens)
     image, size = site.optics.to_image(ideal), [site.optics.lens.width, site.optics.lens.height]
     inside = (z > 0) & ((image >= 0) & (image < size)).all(axis=1)

@@ -60,12 +60,9 @@ def _shore(ground: Terrain, x: FloatArray, y: FloatArray) -> FloatArray:
     ledge = -0.6 * expit((x - 0.6 * ground.length_m - 0.1 * y) / 0.3)
     z = slope + size * swell + size * ledge
     if len(ground.rocks):
-        tree = cKDTree(ground.rocks[:, :2])
-        for start in range(0, len(x), 50_000):
-            part = slice(start, start + 50_000)
-            distance, rock = tree.query(np.column_stack([x[part], y[part]]), k=1)
-            height, radius = ground.rocks[rock, 2:].T
-            z[part] += size * np.asarray(height * np.exp(-((distance / radius) ** 2)))
+        distance, rock = cKDTree(ground.rocks[:, :2]).query(np.column_stack([x, y]))
+        height, radius = ground.rocks[rock, 2:].T
+        z = z + size * (height * np.exp(-((distance / radius) ** 2)))
     return np.asarray(z)
 
 

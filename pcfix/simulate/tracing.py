@@ -12,11 +12,17 @@ stated otherwise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, WaterPlane
+
+
+def anchors_and_normals(plane: WaterPlane, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return a point of a plane and its unit normal, each of shape (count, 3)."""
+    up = np.array([-plane.b, -plane.c, 1.0])
+    up /= np.linalg.norm(up)
+    anchor = np.array([0.0, 0.0, plane.a])
+    return np.broadcast_to(anchor, (count, 3)), np.broadcast_to(up, (count, 3))
 
 
 def piercing_points_of_planes(
@@ -100,23 +106,3 @@ def triangulate(
         if np.abs(step).max(initial=0.0) < 1e-7:
             break
     return points
-
-
-@dataclass(frozen=True, eq=False)
-class Water:
-    """The surface that light is traced through: a plane in the frame of the points."""
-
-    plane: WaterPlane
-    refractive_index: float
-
-    def planes(self, count: int) -> tuple[FloatArray, FloatArray]:
-        """Return a point of the plane and its unit normal, each of shape (count, 3)."""
-        up = np.array([-self.plane.b, -self.plane.c, 1.0])
-        up /= np.linalg.norm(up)
-        anchor = np.array([0.0, 0.0, self.plane.a])
-        return np.broadcast_to(anchor, (count, 3)), np.broadcast_to(up, (count, 3))
-
-    def piercing_points(self, points: FloatArray, centres: FloatArray) -> FloatArray:
-        """Return where the light from each point to its camera passes the surface, (m, 3)."""
-        planes = self.planes(len(points))
-        return piercing_points_of_planes(points, centres, *planes, self.refractive_index)
