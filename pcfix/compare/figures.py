@@ -186,10 +186,7 @@ def _pairs(match: Match) -> Figures:
     name = match.survey.name if sparse else match.reference.name
     count = len(match.cloud if sparse else match.reference.xyz)
     if count < k:
-        sentence = (
-            f"{name}: {count} points are too few for planes through {k} neighbours. Give more"
-            " points (at least 6, with --neighbours 6)."
-        )
+        sentence = f"{name}: {count} points are too few for {k} neighbours. Give more points."
         code = f"{'cloud' if sparse else 'reference'}.too_few_points"
         raise GeometryError(code, sentence, path=name, points=count, least=k)
 

@@ -66,10 +66,7 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
     detection = uncertainty["lodetection"]
     known = np.isfinite(distance)
     if not known.any():
-        sentence = (
-            f"M3C2: no cylinder of {cylinder:.3g} m radius contains points of both clouds within"
-            f" {max_distance_m:.3g} m. Check that they overlap."
-        )
+        sentence = f"M3C2: no points within {max_distance_m:.3g} m. Check that the clouds overlap."
         values = {"radius_m": cylinder, "max_distance_m": max_distance_m}
         raise GeometryError("reference.no_overlap", sentence, **values)
     distance, detection = distance[known], detection[known]

@@ -25,7 +25,7 @@ from pcfix.io.rasters import new_raster, write_bands
 from pcfix.model import FloatArray, Lens, WaterRaster
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import CalmOptions
-from pcfix.photos.calm import LEAST_CORNERS, corners_in, covered, median_of, register, warped
+from pcfix.photos.calm import corners_in, covered, median_of, register, warped
 from pcfix.photos.mapping import Photo
 from pcfix.photos.waves import Nodes, View, displacements, fit_waves, nodes_of, slopes_of
 from pcfix.running import release, threads
@@ -132,10 +132,7 @@ def _registered(frames: Frames, images: Iterable[Any]) -> tuple[FloatArray, Floa
     lost = np.flatnonzero(~np.isfinite(homographies).all(axis=(1, 2)))
     if len(lost):
         names = [frames.names[row] for row in lost]
-        sentence = (
-            f"{frames.path}: {len(lost)} frames share fewer than {LEAST_CORNERS} corners with the"
-            f" first, such as {names[0]}. Remove them, or start with another frame."
-        )
+        sentence = f"{', '.join(names[:3])}: do not match the first frame. Omit these frames."
         raise InputError("frames.no_overlap", sentence, frames=names)
     return homographies, scatter
 

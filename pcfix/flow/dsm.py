@@ -227,10 +227,7 @@ def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], Non
     """Read the points to grid, shape (n, 3), the gridded values in the place of z."""
     dimension = DIMENSIONS[rules.what]
     if dimension not in (None, *source.header.point_format.dimension_names):
-        sentence = (
-            f"has no dimension {dimension}, which --what {rules.what} needs. Correct the cloud"
-            " first, with --dimensions all."
-        )
+        sentence = f"has no dimension {dimension}. Correct the cloud first, with --dimensions all."
         raise bad_file(source.path, "cloud.no_dimension", sentence, dimension=dimension)
     result, count, done = empty((len(source), 3)), 0, 0
     for points in source.chunks():
@@ -249,10 +246,7 @@ def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], Non
         release()
         report(0.5 * done / len(source))
     if count == 0 and rules.surface == "bed":
-        sentence = (
-            f"has no point of class {BATHYMETRIC_POINT} (bed) that is not withheld. Correct the"
-            " cloud first, or use --surface all."
-        )
+        sentence = "has no bed (class 40). Correct the cloud first, or use --surface all."
         raise bad_file(source.path, "dsm.no_bed", sentence)
     if count == 0:
         sentence = "all points are noise (classes 7 and 18) or withheld. Classify it again."

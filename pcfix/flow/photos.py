@@ -144,10 +144,7 @@ def finished(given: Any, started: float, notes: Iterable[PcfixWarning], **figure
 def check_kind(name: File, image: npt.NDArray[Any], first: npt.NDArray[Any]) -> None:
     """Check that an image has the bands and the type of the first one."""
     if image.shape[2] != first.shape[2] or image.dtype != first.dtype:
-        sentence = (
-            f"has {image.shape[2]} bands of {image.dtype}, but the first image {first.shape[2]} of"
-            f" {first.dtype}. Give images of one kind."
-        )
+        sentence = f"has {image.shape[2]} bands of {image.dtype}, unlike the first image. Omit it."
         raise bad_file(name, "photos.kind", sentence, bands=image.shape[2])
 
 
@@ -183,20 +180,14 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
         raise SettingError("option.no_use", sentence, option="resolution")
     heights, origin, crs, corrected = read_heights(given.dsm, given.resolution, scratch)
     if corrected and given.mapping == "paper":
-        sentence = (
-            f"{given.dsm}: is of a corrected cloud, but --mapping paper needs the apparent bed."
-            " Give the DSM of the uncorrected cloud, or --mapping exact."
-        )
+        sentence = f"{given.dsm}: is corrected. Give one of the apparent bed, or --mapping exact."
         raise SettingError("dsm.corrected", sentence, path=given.dsm)
     notes = list[PcfixWarning]()
     cameras, _ = inputs.block(crs, read)
     row = match_labels([path.name for path in paths], cameras.labels, one_to_one=False)[0]
     lost = [path.name for path, one in zip(paths, row, strict=True) if one < 0]
     if len(lost) == len(paths):
-        sentence = (
-            f"has no pose for these photographs (first {lost[0]}; first pose"
-            f" {cameras.labels[0]}). Give the folder whose files have the names in the camera file."
-        )
+        sentence = f"has no pose for {lost[0]} or the others. Give the folder of its photographs."
         raise bad_file(name, "photos.no_pose", sentence, photograph=lost[0])
     if lost:
         words = f"{name}: {len(lost)} photographs have no pose and are ignored, such as {lost[0]}."
@@ -218,18 +209,12 @@ def block_of(given: PhotosOptions, paths: list[Path], scratch: Path) -> PhotoBlo
     low = float(np.nanmin(ground.height_m))
     sizes = [(photo.centre[2] - low) / photo.lens.focal for photo in photos]
     if not min(sizes) > 0.0:
-        sentence = (
-            f"{name}: cameras are below the DSM, whose lowest height is {low:.1f} m. Check its CRS"
-            " and vertical datum."
-        )
+        sentence = f"{name}: cameras are below the ground ({low:.1f} m). Check the vertical datum."
         raise GeometryError("cameras.below_ground", sentence, path=name, lowest_m=low)
     scene = Scene(ground, surface, index_of(given.index, given.index_formula)[0])
     coarse = ((photo, nodes_of(photo.lens, 100)[0]) for photo in photos)
     if not any(ground_seen(photo, scene, nodes)[2].any() for photo, nodes in coarse):
-        sentence = (
-            f"{given.dsm}: is in none of the {len(photos)} photographs. Check its CRS and that of"
-            f" {given.cameras} (--cameras-crs, --cameras-offset)."
-        )
+        sentence = f"{given.dsm}: is in none of the photographs. Check its CRS and --cameras-crs."
         raise GeometryError("cameras.no_overlap", sentence, path=given.dsm)
     gsd = float(np.median(sizes))
     step = max(8, int(np.ceil(ground.cell_m / gsd)))  # a cell of the ground, or 8 px
@@ -326,9 +311,7 @@ def rebuild_rounds(
         shutil.rmtree(folders.pop())
     place, key = target / RECORD, key_of("rebuild", given, ignored=COMMAND_ONLY)
     if folders and place.exists() and read_json(place) != {"key": key}:
-        sentence = (
-            f"{target}: has rounds of other options or inputs. Add --overwrite to replace them."
-        )
+        sentence = f"{target}: has rounds of another call. Add --overwrite to replace them."
         raise SettingError("output.exists", sentence, path=target)
     write_text(place, json_text({"key": key}), overwrite=True)
     if is_cloud(Path(given.dsm)):  # it is gridded to the folder

@@ -143,9 +143,8 @@ def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float, name: s
         columns, rows = size(resolution_m)
         finest = float(f"{1.06 * resolution_m * math.sqrt(columns * rows / MAX_CELLS):.2g}")
         sentence = (
-            f"{name}: a resolution of {resolution_m:g} m makes {columns:,.0f} x {rows:,.0f} cells,"
-            f" more than {MAX_CELLS:,}. Use {finest:g} m or more, or first remove points that are"
-            " far from all others (pcfix clean)."
+            f"{name}: {columns:,.0f} x {rows:,.0f} cells of {resolution_m:g} m are too many. Use"
+            f" {finest:g} m or more, or first remove points far from all others (pcfix clean)."
         )
         raise SettingError("option.resolution", sentence, value=resolution_m, finest=finest)
     (west, south), (east, north) = cells_of(np.array([low, high]), resolution_m).tolist()

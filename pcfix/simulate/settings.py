@@ -57,17 +57,13 @@ class SceneSettings(SceneOptions):
         if not 0.98 < pitch[0] / pitch[1] < 1.02:
             um = [1000 * side for side in pitch]
             sentence = (
-                f"sensor_mm {self.sensor_mm} and sensor_px {self.sensor_px} make pixels of"
-                f" {um[0]:.3g} x {um[1]:.3g} um. Give square pixels."
+                f"sensor_mm: pixels of {um[0]:.3g} x {um[1]:.3g} um are not square. Check it."
             )
             raise SettingError("scene.pixels", sentence, pixel_um=um)
         # above the highest water of the area
         height = self.flying_height_m - self.water_tilt * float(np.hypot(*self.area_m)) / 2.0
         if height <= 0.5 * self.depth_m:
-            sentence = (
-                f"Flying height {height:.4g} m above the highest water is not more than half the"
-                f" greatest depth {self.depth_m:g} m. Fly higher or give a smaller depth or tilt."
-            )
+            sentence = f"{height:.4g} m is too low for a depth of {self.depth_m:g} m. Fly higher."
             raise SettingError("scene.too_low", sentence, height_m=height, depth_m=self.depth_m)
         if self.oblique_share is not None and not self.has_obliques:
             sentence = f"oblique share {self.oblique_share:g} needs obliques. Give their angle."
