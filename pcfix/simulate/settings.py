@@ -56,9 +56,7 @@ class SceneSettings(SceneOptions):
         pitch = [mm / px for mm, px in zip(self.sensor_mm, self.sensor_px, strict=True)]
         if not 0.98 < pitch[0] / pitch[1] < 1.02:
             um = [1000 * side for side in pitch]
-            sentence = (
-                f"sensor_mm: pixels of {um[0]:.3g} x {um[1]:.3g} um are not square. Check it."
-            )
+            sentence = f"sensor_mm makes pixels of {um[0]:.3g} x {um[1]:.3g} um. Give square ones."
             raise SettingError("scene.pixels", sentence, pixel_um=um)
         # above the highest water of the area
         height = self.flying_height_m - self.water_tilt * float(np.hypot(*self.area_m)) / 2.0
