@@ -21,8 +21,6 @@ from pcfix.report.text import Plain, RowTable, aligned, filled, wrapped
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from pcfix.compare.figures import Comparison
-
 TIMES = (("before", "uncorrected", BEFORE), ("after", "corrected", AFTER))
 FURTHER = ("#6a3d9a", "#33804d", "#c51b7d", "#8c6d1f", "#5f6b73")
 """Colours of further clouds, in turn."""
@@ -90,17 +88,17 @@ _FACTS: RowTable = (
 )  # fmt: skip
 
 
-def comparison_text(c: Comparison) -> str:
+def comparison_text(compared: Plain) -> str:
     """Return the summary of a comparison; metres throughout."""
-    plain, n, is_checks = c.as_dict(), c.counts, c.measured_at == "reference"
-    in_reference = n.reference - n.reference_excluded
-    rows = filled(_FACTS, plain | {
+    counts, is_checks = compared["counts"], compared["measured_at"] == "reference"
+    in_reference = counts["reference"] - counts["reference_excluded"]
+    rows = filled(_FACTS, compared | {
         "is_checks": is_checks, "in_reference": in_reference,
-        "in_all": in_reference if is_checks else n.cloud,
+        "in_all": in_reference if is_checks else counts["cloud"],
     })  # fmt: skip
-    head = f"Compared {c.cloud} with {c.reference} in {c.seconds:.1f} s"
-    tables = [line for table in _tables(plain) for line in ("", *table.lines())]
-    notes = [wrapped("", f"Note: {note}") for note in c.notes]
+    head = "Compared {cloud} with {reference} in {seconds:.1f} s".format_map(compared)
+    tables = [line for table in _tables(compared) for line in ("", *table.lines())]
+    notes = [wrapped("", f"Note: {note['message']}") for note in compared["notes"]]
     return "\n".join([aligned(head, rows), *tables, *notes])
 
 
@@ -125,13 +123,10 @@ def _tables(compared: Plain) -> list[Table]:
 
     header, rows = [""], []
     for one in errors_of(compared, "c2c", "c2c_from_reference"):
-        s, bands = one.found["statistics"], one.found["shares"]
-        header = ["", "mean (m)", "std.dev. (m)", "classes"]
-        header += [f"{band['low_m']:g} to {band['high_m']:g} m" for band in bands]
-        classes = str(len(one.found["histogram"]["counts"]))
-        row = [one.title, f"{s['mean_m']:.6f}", f"{s['sd_m']:.6f}", classes]
-        rows.append([*row, *(f"{100 * band['share']:.1f} %" for band in bands)])
-    tables.append(Table("C2C, normal distribution", header, rows))
+        if bands := one.found["shares"]:
+            header = ["", *(f"{band['low_m']:g} to {band['high_m']:g} m" for band in bands)]
+            rows.append([one.title, *(f"{100 * band['share']:.1f} %" for band in bands)])
+    tables.append(Table("Shares of the distances", header, rows))
 
     rows = [
         [name, f"{fit['slope']:.4f}", f"{fit['intercept_m']:+z.3f}", f"{fit['r2']:.4f}"]

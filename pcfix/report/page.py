@@ -97,12 +97,11 @@ class Table:
 
     title: str
     header: list[str]
-    rows: list[list[str]]
+    rows: Sequence[Sequence[str]]
 
     def lines(self) -> list[str]:
         """Return the table for the terminal, with its columns aligned to the right."""
-        rows = [[self.title if self.header[0] == "" else self.header[0], *self.header[1:]]]
-        rows += self.rows
+        rows = [[self.header[0] or self.title, *self.header[1:]], *self.rows]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         return [
             "  ".join([f"  {row[0]:<{widths[0]}}", *map(str.rjust, row[1:], widths[1:])]).rstrip()

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Plain = dict[str, Any]
-FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras")
-"""Those that are shown where they are there, the first four of them."""
+FIRST_FIGURES = ("section_1", "depth_bins", "uncertainty", "cameras")
+"""They come before the others, of which the page shows as many as make four."""
 
 
 class RunMaps(NamedTuple):
@@ -83,13 +83,14 @@ def run_report(
     rows = summary_rows(s, compared.get("tvu"))
     notes = notes_of(s, maps.heights, compared)
     head = [
-        ["Images", date or "date not stated"],
-        ["CRS", maps.crs or "not stated by the cloud"],
-        ["Heights", maps.heights or "vertical datum not stated by the cloud"],
-        ["Points", f"{s.points:,}"],
-        *(list(row) for row in rows if row[0] in ("Submerged", "Cameras", "Water", "")),
+        ("Images", date or "date not stated"),
+        ("CRS", maps.crs or "not stated by the cloud"),
+        ("Heights", maps.heights or "vertical datum not stated by the cloud"),
+        ("Points", f"{s.points:,}"),
+        *(row for row in rows if row[0] in ("Submerged", "Cameras", "Water", "")),
     ]
-    depths = f"{depth['min']:.2f} to {depth['max']:.2f} m", f"{depth['mean']:.2f} m"
+    depths = [("range", f"{depth['min']:.2f} to {depth['max']:.2f} m")]
+    depths += [("mean", f"{depth['mean']:.2f} m")]
     # the rows of the terminal, and why the method was chosen
     facts = [("Input cloud", name_of(s.input)), ("Points", f"{s.points:,}"), *rows]
     facts += [("Reconstruction", s.reconstruction["because"])] if s.reconstruction else []
@@ -107,7 +108,7 @@ def run_report(
         lead=lead + verdict,
         head=Table("The project", [], head),
         tiles=[
-            Tile("Depth", figures=list(zip(("range", "mean"), depths, strict=True))),
+            Tile("Depth", figures=depths),
             accuracy_tile(s, compared),
             Tile("Warnings", notes=notes[:3] or ["None."]),
         ],
@@ -119,7 +120,7 @@ def run_report(
         tables=list(tables),
         files=files,
         provenance=[
-            Table("In short", [], [list(row) for row in facts]),
+            Table("In short", [], facts),
             Table("Settings", ["setting", "value"], settings),
             *inputs,
             Table("Software", ["name", "version"], versions),

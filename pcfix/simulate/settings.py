@@ -24,23 +24,18 @@ class Optics:
     """
 
     lens: Lens
+    pinhole: Lens
     reach: float
 
     def to_image(self, ideal: FloatArray) -> FloatArray:
         """Return image pixels of ideal pixels, shape (m, 2); NaN beyond the fold of the lens."""
         if not self.lens.radial:
             return ideal
-        principal = [self.lens.principal_x, self.lens.principal_y]
-        plane = (ideal - principal) / self.lens.focal
-        return project(self.lens, np.column_stack([plane, np.ones(len(plane))]))
+        return project(self.lens, unproject(self.pinhole, ideal))
 
     def to_ideal(self, image: FloatArray) -> FloatArray:
         """Return ideal pixels of image pixels, shape (m, 2)."""
-        if not self.lens.radial:
-            return image
-        rays = unproject(self.lens, image)
-        principal = [self.lens.principal_x, self.lens.principal_y]
-        return np.asarray(self.lens.focal * rays[:, :2] / rays[:, 2:] + principal)
+        return project(self.pinhole, unproject(self.lens, image)) if self.lens.radial else image
 
 
 class SceneSettings(SceneOptions):
@@ -89,14 +84,15 @@ class SceneSettings(SceneOptions):
         """The lens of the camera; where it folds the image, nothing is seen."""
         width, height = self.sensor_px
         middle = np.array([width / 2.0, height / 2.0])
-        lens = Lens(self.focal_mm / self.sensor_mm[0] * width, width, height, *middle.tolist())
+        pinhole = Lens(self.focal_mm / self.sensor_mm[0] * width, width, height, *middle.tolist())
+        lens = pinhole
         if any(self.distortion):
             lens = replace(lens, radial=self.distortion[:3], tangential=self.distortion[3:])
         along = np.linspace(-1.0, 1.0, 41)
         side = np.ones_like(along)
         edges = [(along, side), (along, -side), (side, along), (-side, along)]
         rays = unproject(lens, np.hstack(edges).T * middle + middle)
-        return Optics(lens, float(np.nanmax(np.hypot(*(rays[:, :2] / rays[:, 2:]).T))))
+        return Optics(lens, pinhole, float(np.nanmax(np.hypot(*(rays[:, :2] / rays[:, 2:]).T))))
 
     @property
     def base_and_spacing_m(self) -> tuple[float, float]:
