@@ -138,8 +138,6 @@ def _offsets(position: FloatArray) -> FloatArray:
     return np.asarray((mixed >> np.uint64(11)) / 2.0**53 - 0.5)
 
 
-PART_CELLS, PART_MARGINS = 64, 8
-"""Side of a part, cells: small triangulations take half the time per point."""
 SLACK_CELLS = 1.5
 """Rims k + 1 cells apart enclose k empty ones; circles through their corners are a bit wider."""
 
@@ -160,7 +158,7 @@ def fill_holes(height: FloatArray, window: Window, around: Window, widest: float
     from scipy.ndimage import binary_erosion
 
     margin = margin_cells(widest)
-    side = max(PART_CELLS, PART_MARGINS * margin)
+    side = max(64, 8 * margin)  # small triangulations take half the time per point
     filled = np.empty((window.height, window.width))
 
     def fill(part: Window) -> None:

@@ -24,9 +24,6 @@ FEATHER = 0.01
 """Images are mixed within this difference of tangents from nadir (15 px at f = 1500 px)."""
 SPARE_SHARE = 0.15
 """Of the frame: a straight ray may end so far outside it while the refracted ray ends inside."""
-BLACK = 3
-"""Pixels up to this value (of 255) over an area of `BLACK_PX` squared have no picture."""
-BLACK_PX = 7
 REMAP_COLUMNS = 1024
 
 
@@ -72,9 +69,9 @@ def blank_in(pixels: npt.NDArray[Any]) -> BoolArray:
     """Return the black areas of an image without water, and the pixels next to them."""
     import cv2
 
-    limit = BLACK * (257 if pixels.dtype == np.uint16 else 1)
+    limit = 3 * (257 if pixels.dtype == np.uint16 else 1)  # 3 of 255
     dark = (pixels.max(axis=2) <= limit).astype(np.uint8)
-    square = np.ones((BLACK_PX, BLACK_PX), np.uint8)
+    square = np.ones((7, 7), np.uint8)
     wide = cv2.morphologyEx(
         dark, cv2.MORPH_OPEN, square, borderType=cv2.BORDER_REPLICATE
     )  # single dark pixels are shadows

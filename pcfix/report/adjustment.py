@@ -63,7 +63,7 @@ def adjustment_page(d: Plain) -> str:
     how = "without refraction" if d["water"] is None else "with refraction at the water"
     how = "with refraction at the housing port" if d["port"] else how
     lead = f"{_head(d)}, {how}. Residuals: {_residuals(d)} (RMS of a coordinate)."
-    head = Table("In short", [], [list(row) for row in _facts(d)])
+    head = Table("In short", [], _facts(d))
     tables = [_change_table(d), _residual_table(d), _survey_table(d)]
     tables = [table for table in tables if table.rows]
     return render(Report("Refractive bundle adjustment", lead, head, all_notes(d), tables))

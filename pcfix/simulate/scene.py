@@ -12,8 +12,7 @@ from pcfix.lens.rotations import from_yaw_pitch_roll
 from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterPlane
 from pcfix.options.declare import taken
 from pcfix.options.scenes import SceneOptions
-from pcfix.simulate.settings import Optics, SceneSettings
-from pcfix.simulate.terrain import Terrain
+from pcfix.simulate.settings import Optics, SceneSettings, Terrain
 from pcfix.simulate.tracing import (
     anchors_and_normals,
     piercing_points_of_planes,

@@ -13,7 +13,7 @@ from pcfix.grid import shoreline
 from pcfix.grid.shoreline import NearWater
 from pcfix.io.scenes import write_scene
 from pcfix.simulate.scene import ORIGIN_M
-from pcfix.simulate.terrain import Terrain
+from pcfix.simulate.settings import Terrain
 
 LEVEL_M, SIGMA_M = 0.37, 0.03
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.simulate.settings import SceneSettings
-from pcfix.simulate.terrain import STEPS
+from pcfix.simulate.settings import STEPS, SceneSettings
 from tests.utils.codes import refused
 from tests.utils.twins import image_slowly
 
