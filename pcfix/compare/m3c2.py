@@ -67,8 +67,7 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
     known = np.isfinite(distance)
     if not known.any():
         sentence = f"M3C2: no points within {max_distance_m:.3g} m. Check that the clouds overlap."
-        values = {"radius_m": cylinder, "max_distance_m": max_distance_m}
-        raise GeometryError("reference.no_overlap", sentence, **values)
+        raise GeometryError("reference.no_overlap", sentence, max_distance_m=max_distance_m)
     distance, detection = distance[known], detection[known]
     certain = np.isfinite(detection)
     beyond = np.abs(distance[certain]) > detection[certain]

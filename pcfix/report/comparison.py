@@ -102,11 +102,6 @@ def comparison_text(compared: Plain) -> str:
     return "\n".join([aligned(head, rows), *tables, *notes])
 
 
-def signed(value_m: float) -> str:
-    """Return metres with their sign, which is plus for what rounds to zero."""
-    return f"{round(value_m, 3) + 0.0:+.3f} m"
-
-
 # Tables
 
 

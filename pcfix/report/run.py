@@ -14,7 +14,7 @@ from pcfix.grid.lattice import Lattice
 from pcfix.grid.maps import DEPTH, DIFFERENCE, UNCERTAINTY, contours, depth_interval
 from pcfix.model import Cameras, FloatArray
 from pcfix.refract.tally import ORDERS, largest_tvu_m
-from pcfix.report.comparison import measured_of, signed
+from pcfix.report.comparison import measured_of
 from pcfix.report.page import (
     AFTER,
     BEFORE,
@@ -239,9 +239,9 @@ def accuracy_tile(s: Summary, compared: Plain) -> Tile:
     ]
     if compared["land"]:
         land = compared["land"]["after"]
-        notes.append(f"Land: bias {signed(land['mean_m'])}, RMSE {land['rmse_m']:.3f} m.")
+        notes.append(f"Land: bias {land['mean_m']:+z.3f} m, RMSE {land['rmse_m']:.3f} m.")
     figures = [
-        ("bias", signed(after["mean_m"])), ("RMSE", f"{after['rmse_m']:.3f} m"),
+        ("bias", f"{after['mean_m']:+z.3f} m"), ("RMSE", f"{after['rmse_m']:.3f} m"),
         ("95 % within", f"{after['within_95_m']:.3f} m"),
     ]  # fmt: skip
     of = "bed" if compared["bed"] else "cloud (bed and land are not separated)"

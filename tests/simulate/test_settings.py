@@ -71,14 +71,6 @@ def test_beds():
     assert 4.5 < depth.max() <= 5.0 + 1e-9
 
 
-def test_tilt_corrected():
-    scene = pcfix.simulate_scene(400, tilt_percent=0.5, lidar_per_m2=0)
-    ours = pcfix.correct_points(scene.xyz, scene.cameras, scene.water, views=scene.views)
-    deep = scene.depth_m(scene.true_xyz) > 2.0
-    error = (ours.xyz - scene.true_xyz)[deep]
-    assert np.abs(error.mean(axis=0)).max() < 0.05
-
-
 def test_brown():
     """The simulated lens against Brown's formula, term by term."""
     optics = SceneSettings(distortion=(-0.08, 0.03, -0.006, 0.0007, -0.0005)).optics
