@@ -63,7 +63,6 @@ _CORRECTED: RowTable = (
      "water_fit"),
     ("", "accepted {water_fit[accepted]} of {water_fit[points]} points", "water_fit[points]"),
     ("Uncertainty", "{uncertainty[tvu_95_m][mean]:.3f} m at 95 % (predicted)", "uncertainty"),
-    ("Uncertainty", "not known: without cameras there are no rays", "no_uncertainty"),
     ("Measured", "{measured[tvu_95_m]:.3f} m at 95 %, at {measured[count]:,} points of the bed",
      "measured"),
     ("IHO S-44", "{order}", "order"),
@@ -299,8 +298,6 @@ def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
         "corrected_words": "all corrected" if s.corrected == s.submerged else corrected,
         "method": method,
         "rays_per_point": s.rays / max(s.corrected, 1),
-        "no_uncertainty": s.uncertainty is None and s.settings["dimensions"] == "all"
-        and not s.cameras,
         "measured": measured,
         "order": order_sentence(s, measured),
         "check": check,
