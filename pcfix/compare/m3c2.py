@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -21,9 +19,12 @@ MAX_CORE_POINTS = 100_000
 
 
 def load_py4dgeo() -> Any:
-    """Import py4dgeo; InputError ``library.missing`` if it is not installed."""
-    with _silence():
-        return optional_library("py4dgeo", "m3c2", "M3C2")
+    """Import py4dgeo; InputError ``library.missing`` if it is not installed.
+
+    It no longer writes its progress to stdout and to a log file in the working folder.
+    """
+    logging.getLogger("py4dgeo").disabled = True
+    return optional_library("py4dgeo", "m3c2", "M3C2")
 
 
 def sample_rows(count: int, most: int) -> IntArray:
@@ -53,16 +54,15 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
     max_distance_m = (max(pieces, 1) - 1e-6) * cylinder
     core = xyz[sample_rows(len(xyz), MAX_CORE_POINTS)]
     origin = np.floor(reference.min(axis=0))
-    with _silence():
-        cloud = py4dgeo.Epoch(xyz - origin)
-        distance, uncertainty = py4dgeo.M3C2(
-            epochs=(py4dgeo.Epoch(reference - origin), cloud),
-            corepoints=core - origin,
-            normal_radii=[normal],
-            cyl_radius=cylinder,
-            max_distance=max_distance_m,
-            cloud_for_normals=cloud,
-        ).run()
+    cloud = py4dgeo.Epoch(xyz - origin)
+    distance, uncertainty = py4dgeo.M3C2(
+        epochs=(py4dgeo.Epoch(reference - origin), cloud),
+        corepoints=core - origin,
+        normal_radii=[normal],
+        cyl_radius=cylinder,
+        max_distance=max_distance_m,
+        cloud_for_normals=cloud,
+    ).run()
     detection = uncertainty["lodetection"]
     known = np.isfinite(distance)
     if not known.any():
@@ -81,14 +81,3 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
         cylinder_radius_m=cylinder,
         max_distance_m=max_distance_m,
     )
-
-
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Keep py4dgeo's progress from stdout and from a log file in the working folder."""
-    logger = logging.getLogger("py4dgeo")
-    before, logger.disabled = logger.disabled, True
-    try:
-        yield
-    finally:
-        logger.disabled = before

@@ -76,12 +76,11 @@ def grid_dsm(
     output : path
         The name ends in ``.tif`` or ``.tiff``.
     options, progress
-        See `pcfix.correct_file`. The bounds of the raster are
-        multiples of the resolution (m), by default that of `pcfix.grid.lattice.round_resolution`; a
-        point on an edge belongs to the cell east or north of it. The method "tin" uses Delaunay
-        triangles, and fill is the diameter of the widest circle without a point, by default five
-        times the spacing of the points and at least three cells. Withheld points and noise (classes
-        7 and 18) are not used.
+        See `pcfix.correct_file`. The bounds of the raster are multiples of the resolution (m), by
+        default that of `pcfix.grid.lattice.round_resolution`; a point on an edge belongs to the
+        cell east or north of it. The method "tin" uses Delaunay triangles, and fill is the diameter
+        of the widest circle without a point, by default five times the spacing of the points and at
+        least three cells. Withheld points and noise (classes 7 and 18) are not used.
     """
     given = taken(DsmOptions, options, keywords, "grid_dsm")
     rules, files = given.part(DsmRules), cloud_of(input)

@@ -38,7 +38,8 @@ def grid_window(
     code = row[inner] * window.width + column[inner]
     cells = cell_statistics(code, points[inner, 2], window.height * window.width)
     if method == "tin":
-        height = triangulated(lattice.positions(points), points[:, 2], window, reach, spacing)
+        away = np.column_stack([points[:, 0] - lattice.left_m, lattice.top_m - points[:, 1]])
+        height = triangulated(away / lattice.resolution_m, points[:, 2], window, reach, spacing)
     else:
         height = cells[method]
     counts, spread = cells["points"].reshape(shape), cells["spread"].reshape(shape)

@@ -105,11 +105,6 @@ class Lattice:
         corner = np.array([self.left_m, self.top_m, 0.0])
         return corner + first * self.resolution_m, corner + last * self.resolution_m
 
-    def positions(self, xyz: FloatArray) -> FloatArray:
-        """Return columns and rows of points, shape (n, 2), cells from the top left corner."""
-        away = np.column_stack([xyz[:, 0] - self.left_m, self.top_m - xyz[:, 1]])
-        return np.asarray(away / self.resolution_m)
-
     def cells(self, xyz: FloatArray) -> IntArray:
         """Return the column and row of points, shape (n, 2), counted from the top left corner."""
         first = np.array([self.first_column, self.first_row])

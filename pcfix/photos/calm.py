@@ -125,6 +125,7 @@ def register(places: FloatArray) -> tuple[FloatArray, FloatArray]:
         off = np.hypot(*np.moveaxis(on[:, counted] - mean, 2, 0))
         # by the median of Rayleigh's distribution, but at least the precision of tracking
         scatter = np.maximum(np.nanmedian(off, axis=0) / 1.1774, 0.1)
+        # inverse variance, and less for what is off by more than twice its scatter (Huber)
         weight = np.minimum(1.0, 2.0 * scatter / np.maximum(off, 1e-9)) / scatter**2
         for one, there, each in zip(homographies, places[:, counted], weight, strict=True):
             known = np.isfinite(each)
@@ -144,6 +145,7 @@ def _fitted(one: FloatArray, other: FloatArray, weight: FloatArray) -> FloatArra
     """Return the homography between places by weighted least squares, linear: it is near 1."""
     middle, size = one.mean(axis=0), one.std() + 1e-9
     (x, y), (u, v) = ((one - middle) / size).T, ((other - middle) / size).T
+    # u (g x + h y + 1) = a x + b y + c and the same for v, linear in a to h
     zero, full = np.zeros(len(x)), np.ones(len(x))
     of_u = np.column_stack([x, y, full, zero, zero, zero, -u * x, -u * y])
     of_v = np.column_stack([zero, zero, zero, x, y, full, -v * x, -v * y])

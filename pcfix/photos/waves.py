@@ -231,6 +231,7 @@ class _Shell:
     ) -> None:
         self._local, self._weight, self._time_s = nodes.local, weight, time_s
         cell_m, self._height = nodes.lattice.resolution_m, nodes.lattice.height
+        # padded to twice the size, so that waves twice as long as the raster have a number
         rows, columns = 2 * nodes.lattice.height, 2 * nodes.lattice.width
         x = 2.0 * np.pi * np.fft.fftfreq(columns, cell_m)
         y = -2.0 * np.pi * np.fft.fftfreq(rows, cell_m)  # rows go south
@@ -252,6 +253,7 @@ class _Shell:
 
     def energy(self, slope: FloatArray) -> FloatArray:
         """Return the energy of slopes, shape (f, n, 2), at each wave number."""
+        # turned back by each frame's phase, so that a wave of the right frequency adds up
         turn = np.exp(1j * self._time_s[:, None] * self.frequency)
         return np.abs((self._transformed(slope, self._weight) * turn).sum(axis=0)) ** 2
 
@@ -285,6 +287,7 @@ class _Shell:
 
         Returns the amplitudes of the slope, their covariance, and the residuals.
         """
+        # slopes lie along the wave number: a wave of unit slope has its two components `along`
         along = np.tile(self.number[chosen] / self._size[chosen, None], (2, 1))
         gram, right = np.zeros((len(along), len(along))), np.zeros(len(along))
         used = np.flatnonzero((self._weight > 0.0).any(axis=0))

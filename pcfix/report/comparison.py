@@ -64,13 +64,6 @@ def errors_of(compared: Plain, *kinds: str) -> list[Errors]:
     return rows
 
 
-def measured_of(compared: Plain) -> Plain:
-    """Return the statistics of the vertical errors of the bed, or else of all, before and after."""
-    if compared["bed"] is not None:
-        return dict(compared["bed"])
-    return {when: of and of["statistics"] for when, of in compared["vertical"].items()}
-
-
 # Words
 
 _FACTS: RowTable = (

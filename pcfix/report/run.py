@@ -14,7 +14,6 @@ from pcfix.grid.lattice import Lattice
 from pcfix.grid.maps import DEPTH, DIFFERENCE, UNCERTAINTY, contours, depth_interval
 from pcfix.model import Cameras, FloatArray
 from pcfix.refract.tally import ORDERS, largest_tvu_m
-from pcfix.report.comparison import measured_of
 from pcfix.report.page import (
     AFTER,
     BEFORE,
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
 
 Plain = dict[str, Any]
 FIRST_FIGURES = ("section_1", "depth_bins", "uncertainty", "cameras")
-"""They come before the others, of which the page shows as many as make four."""
+"""They come before the others; the page shows four and folds the rest."""
 
 
 class RunMaps(NamedTuple):
@@ -231,7 +230,10 @@ def accuracy_tile(s: Summary, compared: Plain) -> Tile:
         ]  # fmt: skip
         why = "No reference was given. The prediction follows from assumed errors without a bias."
         return Tile(title, "predicted", figures, [why])
-    after, before = measured_of(compared)["after"], measured_of(compared)["before"]
+    pair = compared["bed"] or {
+        when: of and of["statistics"] for when, of in compared["vertical"].items()
+    }
+    after, before = pair["after"], pair["before"]
     notes = [
         f"At {after['count']:,} points against {name_of(compared['reference'])}, whose noise is"
         " included"
@@ -268,8 +270,6 @@ def notes_of(s: Summary, heights: str, compared: Plain) -> list[str]:
         notes.append(
             "The vertical datum is not known: water level, cloud and reference must share it."
         )
-    if s.water_unknown:
-        notes.append(f"{s.water_unknown:,} points have no known water surface above them.")
     notes += [one["message"] for one in s.warnings]
     notes += [one["message"] for one in compared.get("notes", ())]
     return [note[:1].upper() + note[1:] for note in notes]

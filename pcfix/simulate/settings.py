@@ -21,9 +21,9 @@ from pcfix.water.index import index_of
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """A lens, and the tangent of the angle from its axis to the farthest corner of the frame.
+    """A lens, the same without distortion, and the tangent of the most oblique ray in the frame.
 
-    *Ideal* pixels are those of a pinhole camera, *image* pixels those of the real lens.
+    *Ideal* pixels are those of the pinhole camera, *image* pixels those of the real lens.
     """
 
     lens: Lens

@@ -59,6 +59,7 @@ def _root_of_snell(
         air, water = np.hypot(x, height), np.hypot(rest, depth)
         value = x / air - n * rest / water
         low, high = np.where(value < 0.0, x, low), np.where(value < 0.0, high, x)
+        # Newton by the derivative of the difference, or a bisection where that leaves the bracket
         step = value / (height**2 / air**3 + n * depth**2 / water**3)
         following = x - step
         following = np.where((following < low) | (following > high), (low + high) / 2.0, following)
@@ -96,6 +97,7 @@ def triangulate(
         seen, z = project(points[owner], cameras, camera, lens)
         offset = (seen - [lens.principal_x, lens.principal_y]) / lens.focal
         scale = (lens.focal / z)[:, None]
+        # the gradients of both image coordinates by the place of the point
         u, v = (scale * (rows[:, i] - offset[:, i : i + 1] * rows[:, 2]) for i in (0, 1))
         residual = pixels - seen
         products = u[:, :, None] * u[:, None] + v[:, :, None] * v[:, None]
