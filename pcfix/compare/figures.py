@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -299,13 +300,10 @@ class Section:
 
 def parse_line(text: str) -> SectionLine:
     """Parse ``x1,y1,x2,y2``; SettingError ``option.section`` if that is no line."""
-    try:
-        x1, y1, x2, y2 = (float(part) for part in text.split(","))
-        line = SectionLine(x1, y1, x2, y2)
+    with suppress(ValueError, TypeError):  # no numbers, or not four
+        line = SectionLine(*map(float, text.split(",")))
         if 0.0 < line.length_m < np.inf:
             return line
-    except ValueError:
-        pass
     sentence = "is not x1,y1,x2,y2, two different points. Give them in the CRS of the cloud."
     raise SettingError("option.section", f"section '{text}' {sentence}", value=text)
 

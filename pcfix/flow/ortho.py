@@ -101,7 +101,6 @@ def _write(
         check_kind(block.paths[row], pixels, first)
         return picture_of(pixels, shrunk, blanks=given.water is None)
 
-    side = lattice.resolution_m
     colours = {1: ("gray",), 3: ("red", "green", "blue")}
     names = colours.get(bands, tuple(f"band {b + 1}" for b in range(bands)))
     covered = ground = done = 0
@@ -110,10 +109,7 @@ def _write(
         path, lattice, block.crs, layers, dtype=str(dtype), nodata=None
     ) as target:  # fmt: skip
         for window in lattice.window.parts(512):
-            # the centres of the cells that have a height
-            x = lattice.left_m + (np.arange(window.column, window.column_stop) + 0.5) * side
-            y = lattice.top_m - (np.arange(window.row, window.row_stop) + 0.5) * side
-            xy = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x))])
+            xy = lattice.centres(window)
             z = block.scene.ground.heights_at(xy)
             known = np.isfinite(z)
             xyz = np.column_stack([xy, z])[known]

@@ -98,6 +98,12 @@ class Lattice:
         """The whole raster."""
         return Window(0, self.height, 0, self.width)
 
+    def centres(self, window: Window) -> FloatArray:
+        """Return x and y of the centres of the cells of a window, shape (n, 2), row by row."""
+        row, column = np.divmod(np.arange(window.height * window.width), window.width)
+        x = self.left_m + (column + window.column + 0.5) * self.resolution_m
+        return np.column_stack([x, self.top_m - (row + window.row + 0.5) * self.resolution_m])
+
     def box(self, window: Window) -> tuple[FloatArray, FloatArray]:
         """Return the least and largest x, y and z of a window, and of a cell more on each side."""
         first = np.array([window.column - 1, -window.row_stop - 1, -np.inf])

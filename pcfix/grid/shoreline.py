@@ -34,11 +34,7 @@ class Shoreline:
     xy: FloatArray  # (n, 2), world frame, metres; closed for an island or a pool
     level_m: float  # mean height of the water along it
     sigma_m: float  # standard error in plan across the line, root mean square along it
-
-    @property
-    def length_m(self) -> float:
-        """Length in plan."""
-        return float(np.hypot(*np.diff(self.xy, axis=0).T).sum())
+    length_m: float  # in plan
 
 
 @dataclass(frozen=True)
@@ -49,17 +45,14 @@ class NearWater(Sums):
     every: int = 1  # one point in this number is used
 
     @classmethod
-    def of(
-        cls, xyz: FloatArray, above_m: FloatArray, sigma_z_m: FloatArray | None = None
-    ) -> NearWater:
+    def of(cls, xyz: FloatArray, above_m: FloatArray, sigma_z_m: FloatArray) -> NearWater:
         """Return those of n points, shape (n, 3), world frame, metres.
 
         `above_m` is the height above the water surface, NaN if unknown, and `sigma_z_m` the
         standard error of the heights, zero if unknown; both have the shape (n,).
         """
         rows = np.flatnonzero(np.abs(above_m) <= 2.0)  # metres
-        sigma = np.zeros(len(xyz)) if sigma_z_m is None else sigma_z_m
-        return cls((np.column_stack([xyz, above_m, sigma])[rows],))
+        return cls((np.column_stack([xyz, above_m, sigma_z_m])[rows],))
 
     def __add__(self, other: NearWater) -> NearWater:
         """Return the points of both; every second is dropped while there are too many."""
@@ -94,7 +87,7 @@ class NearWater(Sums):
             weight = np.append(step, 0.0) + np.append(0.0, step)
             sigma = math.sqrt(float(np.average((height_m / slope) ** 2, weights=weight)))
             level = float(np.nanmean(_at(field, field.water_m, xy)))
-            found.append(Shoreline(xy, level, sigma))
+            found.append(Shoreline(xy, level, sigma, float(step.sum())))
         least_m = 12.0 * field.cell_m  # shorter lines are noise
         long = [one for one in found if one.length_m >= max(least_m, 4.0 * one.sigma_m)]
         return sorted(long, key=lambda one: -one.length_m)

@@ -110,9 +110,7 @@ def nodes_of(view: View, cell_m: float | None) -> Nodes:
     west = int(np.floor((low[0] - beyond) / cell))
     north = int(np.ceil((high[1] + beyond) / cell))
     lattice = Lattice(cell, west, -north, columns, rows)
-    x = lattice.left_m + (np.arange(columns) + 0.5) * cell
-    y = lattice.top_m - (np.arange(rows) + 0.5) * cell
-    xy = np.column_stack([np.tile(x, rows), np.repeat(y, columns)])
+    xy = lattice.centres(lattice.window)
     pixel = view.photo.pixels(np.column_stack([xy, np.full(len(xy), view.level_m)]))
     inside = ((pixel > 0.0) & (pixel < [lens.width, lens.height])).all(axis=1)
     return Nodes(lattice, xy, np.asarray(inside))

@@ -74,7 +74,7 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
     "correct": ("Corrected {input} -> {output}      {points:,} points in {seconds:.1f} s",
                 _CORRECTED),
     "label": ("Labelled {input} -> {output}      {points:,} points in {seconds:.1f} s", (
-            ("Class 40", "{submerged:,} points ({submerged:of points})", ""),
+        ("Class 40", "{submerged:,} points ({submerged:of points})", ""),
         ("Formerly", "{stale:,} points of class 40 are not submerged; their class stays", "stale"),
         _NO_SURFACE,
         *_LABELLING,
@@ -92,7 +92,7 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
     )),
     "dsm": ("Gridded {input} -> {output}      {points_used:,} of {points:,} points"
             " ({is_bed:?bed, class 40|land and bed}) in {seconds:.1f} s", (
-            ("Raster", "{width:,} x {height:,} cells of {settings[resolution]:g} m"
+        ("Raster", "{width:,} x {height:,} cells of {settings[resolution]:g} m"
          " ({settings[method]})", ""),
         ("Values", "{what} {values[min]:.4g} to {values[max]:.4g}, mean {values[mean]:.4g}"
          "{is_tvu:? m at 95 % (predicted)|}", "values"),
