@@ -175,7 +175,7 @@ def _view(given: CalmOptions, frames: Frames) -> tuple[View, str | None]:
         cameras=given.cameras, sensor=given.sensor, angles=given.angles, water=level,
         cameras_crs=given.cameras_crs, cameras_offset=given.cameras_offset,
     ).block(crs)  # fmt: skip
-    first = frames.names[0] if frames.photographs else frames.path.stem
+    first = frames.names[0]
     rows = [row for row, label in enumerate(cameras.labels) if Path(label).stem == first]
     rows = [0] if len(cameras.labels) == 1 else rows
     if len(rows) != 1 or cameras.rotations is None or cameras.lenses is None:
