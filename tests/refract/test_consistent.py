@@ -55,8 +55,8 @@ def nadir_block(rng, lens=PLAIN):
 def oblique_block(rng, lens=PLAIN):
     """Return a nadir block with obliques of 35 degrees from four sides."""
     nadir, every = nadir_block(rng, lens), np.arange(16) // 4
-    x, y = np.tile(np.meshgrid([-20.0, 20.0], [-20.0, 20.0]), 4).reshape(2, 16)
-    turn = Rotation.from_euler("z", 90.0 * every, degrees=True)
+    x, y = np.tile(np.reshape(np.meshgrid([-20.0, 20.0], [-20.0, 20.0]), (2, 4)), 4)
+    turn = Rotation.from_euler("z", 90.0 * every[:, None], degrees=True)
     back = turn.apply([-HEIGHT_M * np.tan(np.radians(35.0)), 0.0, 0.0])
     centres = np.column_stack([x, y, np.full(16, HEIGHT_M)]) + back
     oblique = looking(centres, np.full(16, 35.0), 90.0 * every, lens)
