@@ -32,7 +32,7 @@ from pcfix import version
 from pcfix.errors import InputError, PcfixError, PcfixWarning, SettingError
 from pcfix.flow.raster import raster_outputs, raster_writer
 from pcfix.io import files
-from pcfix.io.files import all_or_none, write_text
+from pcfix.io.files import all_or_none, write_bytes, write_text
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix, corrected_identity, las_writer
 from pcfix.io.rasters import check_tif
