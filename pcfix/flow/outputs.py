@@ -32,7 +32,7 @@ from pcfix.options.declare import File
 from pcfix.options.steps import DsmOptions
 from pcfix.report.adjustment import adjustment_sentence
 from pcfix.report.comparison import evaluation
-from pcfix.report.page import Table, extent_of, render
+from pcfix.report.page import Table, render
 from pcfix.report.run import RunMaps, run_report
 from pcfix.report.styles import Symbol, limits_of, vector_style
 from pcfix.report.text import Plain, Summary
@@ -268,9 +268,8 @@ def report_run(
         maps = _read_maps(folder, names, *crs_words(stated_crs(source)))
     more: Plain = {"verdict": "", "compared": compared.get("figures", {})}
     if compared:
-        extent = extent_of(maps.lattice)
         more["pictures"], more["tables"] = evaluation(
-            compared["figures"], compared["sections"], maps.difference_m, extent
+            compared["figures"], compared["sections"], maps.lattice, maps.difference_m
         )
     if first["why"]:
         how = "not adjusted:" if first["model"] is None else "adjusted first, as"

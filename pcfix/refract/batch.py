@@ -24,7 +24,8 @@ from pcfix.options.correct import ScienceOptions
 from pcfix.water.surface import Field, SurfaceAbove
 
 if TYPE_CHECKING:
-    from pcfix.refract.matcher import Bed, Matcher
+    from pcfix.refract.fusion import Bed
+    from pcfix.refract.matcher import Matcher
     from pcfix.refract.occlusion import Occluder
     from pcfix.refract.regression import DepthRegression
 

@@ -5,19 +5,14 @@ All text is derived from the plain values of `adjustment_dict`, which a resumed 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-import numpy as np
+import math
 
 from pcfix.adjust.parameters import words_of
 from pcfix.adjust.result import Plain
 from pcfix.report.page import Report, Table, render
 from pcfix.report.text import Rows, RowTable, filled, share, wrapped
 
-TITLE = "Refractive bundle adjustment"
 WHERE = (("land", "on land"), ("water", "under water"))
-MOST_LISTED = 12
-"""Surveyed points in the text; the page has all of them."""
 _FACTS: RowTable = (
     ("Water", "{water[surface]}", "water"),
     ("Port", "--port {port[surface]}", "port"),
@@ -59,7 +54,7 @@ def adjustment_text(d: Plain) -> str:
     lines = [_head(d), *_change_table(d).lines()]
     lines += [wrapped(f"  {label:<29} ", words) for label, words in _facts(d)]
     if (surveyed := _survey_table(d)).rows:
-        lines += surveyed.lines()[: 1 + MOST_LISTED]
+        lines += surveyed.lines()[:13]  # a header and twelve points; the page has all of them
     return "\n".join([*lines, *(wrapped("", f"Note: {note}") for note in all_notes(d))])
 
 
@@ -68,10 +63,10 @@ def adjustment_page(d: Plain) -> str:
     how = "without refraction" if d["water"] is None else "with refraction at the water"
     how = "with refraction at the housing port" if d["port"] else how
     lead = f"{_head(d)}, {how}. Residuals: {_residuals(d)} (RMS of a coordinate)."
-    head = Table("In short", [], [list(row) for row in _facts(d)])
+    head = Table("In short", [], _facts(d))
     tables = [_change_table(d), _residual_table(d), _survey_table(d)]
     tables = [table for table in tables if table.rows]
-    return render(Report(TITLE, lead, head, all_notes(d), tables))
+    return render(Report("Refractive bundle adjustment", lead, head, all_notes(d), tables))
 
 
 def _head(d: Plain) -> str:
@@ -110,13 +105,6 @@ def _facts(d: Plain) -> Rows:
     })  # fmt: skip
 
 
-def _surface(d: Plain) -> Iterator[tuple[str, Plain]]:
-    """Yield the parameters of water or port by name."""
-    for name, row in (d["water"] or d["port"] or {}).items():
-        if isinstance(row, dict):
-            yield name, row
-
-
 # Tables
 
 
@@ -124,34 +112,26 @@ def _change_table(d: Plain) -> Table:
     """Return lens, water, residuals and centres before and after."""
     unit, rows = d["image_unit"], list[list[str]]()
     several = len({row["sensor"] for row in d["lens"]}) > 1
-
-    def add(name: str, row: Plain, of_lens: str = "") -> None:
-        """Add an unknown with its standard error."""
+    unknowns = [(row["name"], row, f", {row['sensor']}" * several) for row in d["lens"]]
+    surface = d["water"] or d["port"] or {}
+    unknowns += [
+        (name, row, "") for name, row in surface.items() if isinstance(row, dict) and row["free"]
+    ]
+    for name, row, of_lens in unknowns:
         label, of_unit = words_of(name)
         of_unit = unit if name in ("f", "cx", "cy", "b1", "b2") else of_unit.strip()
         label = label.capitalize() + of_lens + (f" ({of_unit})" if of_unit else "")
         before, after = f"{row['before']:.6g}", f"{row['after']:.6g}"
         rows.append([label, before, after, f"{row['sigma']:.2g}"])
-
-    for row in d["lens"]:
-        add(row["name"], row, f", {row['sensor']}" if several else "")
-    for name, row in _surface(d):
-        if row["free"]:
-            add(name, row)
     for key, where in WHERE:
         r = d["residuals"][key]
         if r["points"]:
             before, after = fixed(r["rms_before_px"], 3), fixed(r["rms_px"], 3)
             rows.append([f"Residuals {where} ({unit})", before, after, ""])
-    if (gnss := d["gnss"]) is not None:
-        before, after = (fixed(_length(gnss[name]), 3) for name in ("rms_before_m", "rms_m"))
-        rows.append(["Centres minus GNSS (m)", before, after, ""])
+    if (gnss := d["gnss"]) is not None:  # the lengths of vectors, of their known components
+        lengths = (math.hypot(*filter(None, gnss[name])) for name in ("rms_before_m", "rms_m"))
+        rows.append(["Centres minus GNSS (m)", *(fixed(one, 3) for one in lengths), ""])
     return Table("Before and after", ["", "before", "after", "standard error"], rows)
-
-
-def _length(values: list[float | None]) -> float:
-    """Return the length of a vector, of its known components."""
-    return float(np.sqrt(sum(value**2 for value in values if value is not None)))
 
 
 def _survey_table(d: Plain) -> Table:
