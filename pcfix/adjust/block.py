@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pcfix.adjust.parameters import Unknowns
-from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.errors import GeometryError
 from pcfix.lens.imaging import straight_images, unproject
 from pcfix.model import (
     BoolArray,
@@ -42,11 +41,6 @@ LEAST_DETERMINANT = 1e-5
 
 TIE_POINTS = 150_000
 """At most; more reduce only the noise, which is no longer the largest error then."""
-
-LEAST_GNSS_SIGMA_M = 0.02
-MOST_OFFSET_M, MOST_OFFSET_SIGMAS = 1.0, 10.0
-"""Mean offset between GNSS and projection centres that indicates another datum, if it exceeds
-both."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,6 +195,19 @@ def _with_control(block: Block, control: GroundControl, level_sigma_m: float) ->
     )
 
 
+def used_as_dry(
+    control: GroundControl, water: WaterSurface, level_sigma_m: float = 0.0
+) -> list[str]:
+    """Return the names of points below the water that are not marked as under water.
+
+    Their images show them too high, so an adjustment without water that used them is wrong.
+    """
+    level = surface_above(water, control.xyz).height_m
+    least = level - 3.0 * np.hypot(control.sigma_m[:, 2], level_sigma_m)
+    deep = (control.xyz[:, 2] < least) & ~control.under_water
+    return [control.names[i] for i in np.flatnonzero(deep)]
+
+
 def marks_of(control: GroundControl) -> tuple[TiePoints, FloatArray]:
     """Return surveyed points and their marks as tie points, and the marks' standard deviations.
 
@@ -234,10 +241,9 @@ def true_start(
 
 def some_ties(ties: TiePoints, rows: IntArray) -> TiePoints:
     """Return some of the tie points, in the given order."""
-    first, counts = ties.views.start[rows], np.diff(ties.views.start)[rows]
-    begin = np.cumsum(counts) - counts
-    where = np.repeat(first - begin, counts) + np.arange(counts.sum())
-    return TiePoints(ties.xyz[rows], ties.views.take(rows), ties.image_xy[where])
+    of_observations = Views(ties.views.start, np.arange(len(ties.image_xy)))
+    observations = of_observations.take(rows).camera
+    return TiePoints(ties.xyz[rows], ties.views.take(rows), ties.image_xy[observations])
 
 
 def usable_ties(ties: TiePoints, cameras: Cameras, most: int = TIE_POINTS) -> TiePoints:
@@ -249,14 +255,12 @@ def usable_ties(ties: TiePoints, cameras: Cameras, most: int = TIE_POINTS) -> Ti
     seen = np.diff(ties.views.start) >= LEAST_VIEWS
     rows = np.flatnonzero(np.isfinite(ties.xyz).all(axis=1) & seen)
     some = some_ties(ties, rows)
-    owner = np.repeat(np.arange(len(rows)), np.diff(some.views.start))
-    ray = cameras.centres[some.views.camera] - some.xyz[owner]
+    first, counts = some.views.start[:-1], np.diff(some.views.start)
+    ray = cameras.centres[some.views.camera] - np.repeat(some.xyz, counts, axis=0)
     ray /= np.linalg.norm(ray, axis=1)[:, None]
-    mean = np.zeros((len(rows), 3))
-    np.add.at(mean, owner, ray)
+    mean = np.add.reduceat(ray, first)
     mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
-    cosine = np.full(len(rows), 1.0)
-    np.minimum.at(cosine, owner, np.einsum("oi,oi->o", ray, mean[owner]))
+    cosine = np.minimum.reduceat((ray * np.repeat(mean, counts, axis=0)).sum(axis=1), first)
     angle_deg = 2.0 * np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     rows = rows[angle_deg >= LEAST_ANGLE_DEG]
     if len(rows) > most:
@@ -267,23 +271,24 @@ def usable_ties(ties: TiePoints, cameras: Cameras, most: int = TIE_POINTS) -> Ti
 def with_places(ties: TiePoints, cameras: Cameras) -> TiePoints:
     """Return tie points in which those without coordinates are intersected by straight rays.
 
-    The sum of squared distances from the rays is minimised, which is good enough as a start.
+    The sum of squared distances from the rays is minimised, which is good enough as a start:
+    sum (I - r r') (Q - C) = 0 for unit rays r from the centres C.
     """
-    lost = np.flatnonzero(~np.isfinite(ties.xyz).all(axis=1) & (np.diff(ties.views.start) >= 2))
+    seen = np.diff(ties.views.start) >= LEAST_VIEWS
+    lost = np.flatnonzero(~np.isfinite(ties.xyz).all(axis=1) & seen)
     rotations, lenses = np.asarray(cameras.rotations), cameras.lenses or ()
     some = some_ties(ties, lost)
-    owner, camera = np.repeat(np.arange(len(lost)), np.diff(some.views.start)), some.views.camera
-    ray = np.full((len(owner), 3), np.nan)
+    first, camera = some.views.start[:-1], some.views.camera
+    ray = np.full((len(camera), 3), np.nan)
     for c in np.unique(camera):
         ray[camera == c] = unproject(lenses[c], some.image_xy[camera == c]) @ rotations[c]
     across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
     middle = cameras.centres.mean(axis=0)
-    normal, right = np.zeros((len(lost), 3, 3)), np.zeros((len(lost), 3))
-    np.add.at(normal, owner, across)
-    np.add.at(right, owner, np.einsum("oij,oj->oi", across, cameras.centres[camera] - middle))
-    known = np.linalg.det(normal) > LEAST_DETERMINANT  # NaN is not
+    right = np.einsum("oij,oj->oi", across, cameras.centres[camera] - middle)
+    across, right = np.add.reduceat(across, first), np.add.reduceat(right, first)
+    known = np.linalg.det(across) > LEAST_DETERMINANT  # NaN is not
     xyz = ties.xyz.copy()
-    xyz[lost[known]] = np.linalg.solve(normal[known], right[known][:, :, None])[:, :, 0] + middle
+    xyz[lost[known]] = np.linalg.solve(across[known], right[known][:, :, None])[:, :, 0] + middle
     return replace(ties, xyz=xyz)
 
 
@@ -339,78 +344,3 @@ def some_cameras(cameras: Cameras, rows: IntArray) -> Cameras:
         lenses=None if cameras.lenses is None else tuple(cameras.lenses[i] for i in rows),
         gnss=None,
     )
-
-
-# Checks of surveys
-
-
-def check_datum(block: Block, unknowns: Unknowns, reason: str = "") -> None:
-    """Check that GNSS, control points, fixed poses or a free network give a datum.
-
-    `reason` is why GNSS positions are not used.
-    """
-    if unknowns.free_network or unknowns.poses == "fixed":
-        return
-    gnss = int((block.gnss_weights > 0.0).all(axis=1).sum())
-    is_control = (block.survey[1] > 0.0).any(axis=1) & (np.diff(block.start) >= LEAST_VIEWS)
-    control = int(is_control.sum())
-    if gnss + control >= 3:
-        return
-    words = (
-        f"Position, orientation and scale of the block are undetermined: {gnss} GNSS positions,"
-        f" {control} control points in two or more images. Give --gnss or --gcps with three points"
-        " or more, or --datum free to keep the mean of the original projection centres."
-        + (f" {reason}" if reason else "")
-    )
-    raise GeometryError("adjust.no_datum", words, gnss=gnss, control=control)
-
-
-def used_as_dry(
-    control: GroundControl, water: WaterSurface, level_sigma_m: float = 0.0
-) -> list[str]:
-    """Return the names of points below the water that are not marked as under water.
-
-    Their images show them too high, so an adjustment without water that used them is wrong.
-    """
-    level = surface_above(water, control.xyz).height_m
-    least = level - 3.0 * np.hypot(control.sigma_m[:, 2], level_sigma_m)
-    deep = (control.xyz[:, 2] < least) & ~control.under_water
-    return [control.names[i] for i in np.flatnonzero(deep)]
-
-
-def gnss_with_sigma(
-    centres: FloatArray, found: GnssPositions, name: str, sigma_m: float | None
-) -> tuple[GnssPositions | None, list[PcfixWarning]]:
-    """Return GNSS positions with standard deviations (infinite for unknown ones), and warnings.
-
-    They are in the frame of the centres, shape (k, 3), metres; `name` is their file. Positions that
-    state no standard deviation get `sigma_m`, or None estimates it from their scatter about the
-    centres.
-    """
-    known = np.isfinite(found.xyz)
-    if not known.any():
-        return None, []
-    sigma = np.where(known, found.sigma_m, np.inf)
-    silent = known & ~np.isfinite(found.sigma_m)
-    off, notes = np.where(known, centres - found.xyz, np.nan), []
-    if silent.any() and sigma_m is None:
-        rest = off - np.nanmedian(off, axis=0)
-        sigma_m = max(1.4826 * float(np.nanmedian(np.abs(rest))), LEAST_GNSS_SIGMA_M)
-        words = (
-            f"The GNSS positions have no standard deviations; {sigma_m:.2f} m is assumed, from"
-            " their scatter about the projection centres. Give --gnss-sigma if you know it."
-        )
-        notes.append(PcfixWarning("gnss.no_sigma", words, sigma_m=sigma_m))
-    if silent.any():
-        sigma[silent] = sigma_m
-    mean = np.nan_to_num(np.nanmean(off, axis=0))
-    typical = float(np.median(sigma[np.isfinite(sigma)]))
-    if np.abs(mean).max() > max(MOST_OFFSET_M, MOST_OFFSET_SIGMAS * typical):
-        x, y, z = (-mean).tolist()
-        words = (
-            f"{name}: the GNSS positions are on average {x:.2f}, {y:.2f}, {z:.2f} m (x, y, z) from"
-            " the projection centres, so they have another datum or CRS (ellipsoidal heights?)."
-            " Name it with --gnss-crs, or transform the positions or the model."
-        )
-        raise GeometryError("gnss.offset", words, path=name, offset_m=[x, y, z])
-    return GnssPositions(found.xyz, sigma, None), notes

@@ -174,7 +174,7 @@ def weak_lens_parameters(problem: Problem, found: Solution, precision: Precision
     None are returned if all of them moved further together than chance allows.
     """
     names = [NAMES[code] for code in problem.given.code.tolist()]
-    sigma = np.array([row.sigma for row in precision.shared[: len(names)]])
+    sigma = precision.shared_sigma[: len(names)]
     by_px = zip(names, sigma * problem.lens_effects, strict=True)
     weak = list(dict.fromkeys(name for name, by in by_px if name != "f" and by > WEAK_PX))
     rows = np.flatnonzero(np.isin(names, weak))

@@ -7,7 +7,7 @@ surveyed points, standard deviations of lens, water and index.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from pcfix.adjust.parameters import (
     WATER_NAMES,
     Unknowns,
     effect_at_corner,
+    lens_parameter,
     sensor_groups,
     similarity_gradients,
     usable_codes,
@@ -66,6 +67,7 @@ class Problem:
     given: Given  # what the kernels need
     lens_unknowns: list[tuple[int, int]]  # of each the first image of its sensor, and the code
     names: list[str]  # of the g shared unknowns
+    start_values: FloatArray  # (g,), heights in the world frame
 
     @property
     def fixed(self) -> int:
@@ -129,6 +131,10 @@ def prepare(
         for i, code in lens_unknowns
     ]
     names += [name for name, one in zip((*WATER_NAMES, *plane_names), is_free, strict=True) if one]
+    numbers = np.concatenate([numbers, planes])
+    world = numbers.copy()  # the level, and the position of each plane along its axis
+    world[[0, *range(PLANES, len(numbers), 3)]] += origin[axis]
+    start_values = [lens_parameter(lenses[i], code) for i, code in lens_unknowns]
     row, table = lens_table(lenses)
     centres = cameras.centres - origin
     surveyed_xyz, surveyed_weight = block.survey
@@ -156,10 +162,11 @@ def prepare(
         axis=axis,
         tests=np.zeros((0, 2, SHARED + len(names))),
     )
-    problem = Problem(block, unknowns, origin, given, lens_unknowns, names)
+    values = np.append(start_values, world[is_free])
+    problem = Problem(block, unknowns, origin, given, lens_unknowns, names, values)
     state = State(
         centres, np.ascontiguousarray(cameras.rotations, np.float64), table, block.xyz - origin,
-        np.concatenate([numbers, planes]), port_row(block.port),
+        numbers, port_row(block.port),
     )  # fmt: skip
     return problem, Solution(state, lenses, np.zeros(len(names)))
 
@@ -363,40 +370,18 @@ STEPS = 10
 CLOSE_M = 1e-4
 
 
-class Intersected(NamedTuple):
-    """Points and how well they fit their images."""
-
-    xyz: FloatArray  # (m, 3), metres, world frame
-    residual_px: FloatArray  # (o, 2), measured minus computed; NaN if the intersection failed
-    start: IntArray  # (m + 1,), the residuals of point i are start[i]:start[i + 1]
-
-    @property
-    def redundancy(self) -> IntArray:
-        """Measured coordinates minus the three of the point, shape (m,)."""
-        return np.asarray(2 * np.diff(self.start) - 3)
-
-    def sums(self, values: FloatArray) -> FloatArray:
-        """Return sums over the observations of each point, shape (m,)."""
-        owner = np.repeat(np.arange(len(self.xyz)), np.diff(self.start))
-        return np.asarray(np.bincount(owner, values, len(self.xyz)), np.float64)
-
-    @property
-    def squares(self) -> FloatArray:
-        """Sum of squared residuals of each point, px2, shape (m,)."""
-        return self.sums((self.residual_px**2).sum(axis=1))
-
-
-def intersect_fixed(block: Block) -> Intersected:
+def intersect_fixed(block: Block) -> tuple[FloatArray, FloatArray]:
     """Intersect the points of a block by least squares, with fixed poses, lens and water.
 
-    It fails for a point that needs more than `STEPS` Gauss-Newton steps.
+    Returns the points, shape (m, 3), metres, world frame, and their residuals, measured minus
+    computed, shape (o, 2). Both are NaN for points that need more than `STEPS` Gauss-Newton steps.
     """
     problem, start = prepare(block, Unknowns(poses="fixed", lens=()))
     state, step = intersected(problem, start.state)
-    r = residuals(state, problem.given)
-    converged = np.asarray((np.abs(step) < CLOSE_M).all(axis=1))
-    r[~converged[block.owner]] = np.nan
-    return Intersected(state.xyz + problem.origin, r, np.asarray(block.start))
+    xyz, residual_px = state.xyz + problem.origin, residuals(state, problem.given)
+    failed = np.asarray(~(np.abs(step) < CLOSE_M).all(axis=1))
+    xyz[failed], residual_px[failed[block.owner]] = np.nan, np.nan
+    return xyz, residual_px
 
 
 def intersected(problem: Problem, state: State) -> tuple[State, FloatArray]:

@@ -15,16 +15,20 @@ from pcfix.adjust.block import (
     LEAST_VIEWS,
     WATER,
     block_of,
-    check_datum,
-    gnss_with_sigma,
     some_ties,
     ties_of_cloud,
     usable_ties,
     with_places,
 )
-from pcfix.adjust.methods import adjust_block, check_control, check_marks
+from pcfix.adjust.methods import (
+    adjust_block,
+    check_control,
+    check_datum,
+    check_marks,
+    gnss_with_sigma,
+)
 from pcfix.adjust.parameters import Unknowns, default_lens
-from pcfix.adjust.result import Adjusted, adjustment_dict, before_of
+from pcfix.adjust.result import Adjusted, adjustment_dict
 from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.diagnosis import flags_of, water_word
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
@@ -300,7 +304,7 @@ def _write(folder: Path, found: Adjusted, model: str) -> None:
             write_water_raster(draft / WATER_FILE, found.water, found.cameras.crs)
         if found.precision.members is not None:
             write_members(draft, found.precision.members)
-        summary = {"model": model, **adjustment_dict(found, before_of(found))}
+        summary = {"model": model, **adjustment_dict(found)}
         text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
         write_text(draft / SUMMARY, text, overwrite=False)
         write_text(draft / "report.html", adjustment_page(summary), overwrite=False)

@@ -42,7 +42,7 @@ def diagnose_inputs(
     """Look for signs in a cloud, its cameras with their tie points, and surveys, if given."""
     control = None if gcps is None else read_ground_control(gcps, cameras).surveyed
     return diagnosed(
-        cameras, water, index, ties=ties_of(inputs, view.crs), view=view, control=control,
+        cameras, water, index, view, ties=ties_of(inputs, view.crs), control=control,
         gnss=_gnss_of(cameras, str(inputs.cameras)), reference=reference, in_passing=in_passing,
     )  # fmt: skip
 
@@ -76,8 +76,8 @@ def diagnose_in_passing(
     neighbours = neighbours_sign(*seen[-1][0], is_fused=seen[-1][1]) if seen else None
     try:
         diagnosis = diagnosed(
-            cameras, plan.found.surface, n, ties=ties, gnss=_gnss_of(cameras, name),
-            view=plan.view, neighbours=neighbours, in_passing=True,
+            cameras, plan.found.surface, n, plan.view, ties=ties, gnss=_gnss_of(cameras, name),
+            neighbours=neighbours, in_passing=True,
         )  # fmt: skip
     except (PcfixError, OSError) as error:  # this check stops no correction
         return found | {"words": f"not checked for absorbed refraction: {error}"}, None

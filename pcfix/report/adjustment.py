@@ -5,8 +5,6 @@ All text is derived from the plain values of `adjustment_dict`, which a resumed 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from pcfix.adjust.parameters import words_of
@@ -19,8 +17,8 @@ WHERE = (("land", "on land"), ("water", "under water"))
 MOST_LISTED = 12
 """Surveyed points in the text; the page has all of them."""
 _FACTS: RowTable = (
-    ("Water", "{water[surface]}", "water"),
-    ("Port", "--port {port[surface]}", "port"),
+    ("Water", "{water}", "water"),
+    ("Port", "--port {port}", "port"),
     ("Poses", "{poses_words}", "images"),
     ("", "centres moved by {poses[moved_rms_m]:.3f} m, rotated by {poses[turned_rms_deg]:.4f} deg"
      " (RMS)", "moved"),
@@ -48,8 +46,8 @@ def all_notes(d: Plain) -> list[str]:
 
 def adjustment_sentence(d: Plain) -> str:
     """Return an adjustment in a line."""
-    rows = [row for row in d["lens"] if row["name"] == "f"]
-    facts = [f"focal length {row['before']:.6g} -> {row['after']:.6g}" for row in rows]
+    lengths = [row for name, row in d["shared"].items() if name.partition(" ")[0] == "f"]
+    facts = [f"focal length {row['before']:.6g} -> {row['after']:.6g}" for row in lengths]
     moved = f"centres moved by {d['poses']['moved_rms_m']:.3f} m (RMS)"
     return "; ".join([*facts, moved, f"residuals: {_residuals(d)}"])
 
@@ -110,34 +108,19 @@ def _facts(d: Plain) -> Rows:
     })  # fmt: skip
 
 
-def _surface(d: Plain) -> Iterator[tuple[str, Plain]]:
-    """Yield the parameters of water or port by name."""
-    for name, row in (d["water"] or d["port"] or {}).items():
-        if isinstance(row, dict):
-            yield name, row
-
-
 # Tables
 
 
 def _change_table(d: Plain) -> Table:
     """Return lens, water, residuals and centres before and after."""
     unit, rows = d["image_unit"], list[list[str]]()
-    several = len({row["sensor"] for row in d["lens"]}) > 1
-
-    def add(name: str, row: Plain, of_lens: str = "") -> None:
-        """Add an unknown with its standard error."""
+    for name, row in d["shared"].items():
         label, of_unit = words_of(name)
-        of_unit = unit if name in ("f", "cx", "cy", "b1", "b2") else of_unit.strip()
-        label = label.capitalize() + of_lens + (f" ({of_unit})" if of_unit else "")
+        in_image = name.partition(" ")[0] in ("f", "cx", "cy", "b1", "b2")
+        of_unit = unit if in_image else of_unit.strip()
+        label = label[:1].upper() + label[1:] + (f" ({of_unit})" if of_unit else "")
         before, after = f"{row['before']:.6g}", f"{row['after']:.6g}"
         rows.append([label, before, after, f"{row['sigma']:.2g}"])
-
-    for row in d["lens"]:
-        add(row["name"], row, f", {row['sensor']}" if several else "")
-    for name, row in _surface(d):
-        if row["free"]:
-            add(name, row)
     for key, where in WHERE:
         r = d["residuals"][key]
         if r["points"]:

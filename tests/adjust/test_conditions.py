@@ -106,9 +106,9 @@ def test_waterline():
     data, on = put(data, {"water": (rows, at_level(data))})
     block = block_with(data, on, water=WaterPlane(data.water.a + 0.2), control=True)
     _, found, precision = adjusted(block, LEVEL)
-    sigma = precision.sigma_of("level")
+    sigma = precision.shared["level"].sigma
     assert abs(found.shared[0] + 0.2) < 3.5 * sigma
-    assert sigma < 0.9 * adjusted(without_surfaces(block), LEVEL)[2].sigma_of("level")
+    assert sigma < 0.9 * adjusted(without_surfaces(block), LEVEL)[2].shared["level"].sigma
     redundancies = [
         redundancy_of(prepare(one, LEVEL)[0]) for one in (block, without_surfaces(block))
     ]
@@ -132,11 +132,11 @@ def test_parallel(parallel):
     if "water" in parallel:
         assert (floor[1:] == found.state.water[1:3]).all()
         assert problem.names == ["tilt_x", "tilt_y", "level of floor", "level of deck"]
-        sigma = precision.sigma_of("tilt_x")
-        assert sigma < separate.sigma_of("tilt_x")
+        sigma = precision.shared["tilt_x"].sigma
+        assert sigma < separate.shared["tilt_x"].sigma
     else:
-        sigma = precision.sigma_of("tilt_x of floor")
-        assert sigma < min(separate.sigma_of(f"tilt_x of {name}") for name in ("floor", "deck"))
+        sigma = precision.shared["tilt_x of floor"].sigma
+        assert sigma < min(separate.shared[f"tilt_x of {name}"].sigma for name in ("floor", "deck"))
     assert abs(floor[1] - b) < 3.5 * sigma
 
 
@@ -164,7 +164,7 @@ def test_same_as_scipy():
         assert abs((twin.residuals(x) ** 2).sum() - found.cost) < 1e-6
         np.testing.assert_allclose(found.state.xyz, xyz, atol=1e-5)  # m
         sigma = np.sqrt(np.diag(twin.covariance(x)))[: len(problem.names)]
-        np.testing.assert_allclose([row.sigma for row in precision.shared], sigma, rtol=2e-3)
+        np.testing.assert_allclose(precision.shared_sigma, sigma, rtol=2e-3)
         for name, value in added.items():
-            row = next(row for row in precision.shared if row.name == name)
-            assert abs(row.added - value) < 1e-3 * row.sigma
+            row = precision.shared[name]
+            assert abs(row.after - row.before - value) < 1e-3 * row.sigma

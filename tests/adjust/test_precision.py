@@ -63,7 +63,7 @@ def test_same_as_twin(poses, tilt):
     g = twin.poses + len(found.shared)
     wanted = np.sqrt(np.diag(covariance)[twin.poses : g])
     # 0.2 percent: what differences of an ill-conditioned Jacobian are good to
-    np.testing.assert_allclose([row.sigma for row in precision.shared], wanted, rtol=2e-3)
+    np.testing.assert_allclose(precision.shared_sigma, wanted, rtol=2e-3)
     shared = covariance[twin.poses : g, twin.poses : g]
     np.testing.assert_allclose(precision.correlation, shared / np.outer(wanted, wanted), atol=2e-3)
     points = np.sqrt(np.diag(covariance)[g:].reshape(-1, 3))
@@ -139,7 +139,7 @@ def test_sloping_bed():
     assert found["level"] == "tilt_x"
     assert found["index"] in ("level", "tilt_x")
     for name in ("level", "index"):
-        assert every.sigma_of(name) > 2.0 * sigma[name].sigma_of(name)
+        assert every.shared[name].sigma > 2.0 * sigma[name].shared[name].sigma
     assert not any("correlated_with" in one.values for one in undetermined(sigma["level"]))
 
 
@@ -194,4 +194,4 @@ def test_members_scatter():
     np.testing.assert_allclose(np.sqrt(squares.mean(axis=0)), wanted, rtol=0.4)
     assert np.sqrt(squares.mean() / (wanted**2).mean()) == pytest.approx(1.0, abs=0.1)
     f = np.sqrt((members.lens[:, 0, 0] ** 2).mean())
-    assert f == pytest.approx(precision.sigma_of("f"), rel=0.3)
+    assert f == pytest.approx(precision.shared["f"].sigma, rel=0.3)

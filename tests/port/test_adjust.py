@@ -102,19 +102,18 @@ def test_port_from_noisy_images(tmp_path, port, free):
             gnss=tmp_path / "gnss.csv", index=data.refractive_index, lens_unknowns=(),
         )  # fmt: skip
     summary = json.loads((tmp_path / "out" / "adjustment.json").read_text())
-    written = summary["port"]
-    again = port_of_text(written["surface"])  # to 0.1 um
+    again = port_of_text(summary["port"])  # to 0.1 um
     np.testing.assert_allclose(coefficients(again), coefficients(found.port), atol=1e-7)
     names = ("distance",) if is_flat else ("centre_x", "centre_y", "centre_z")
     true = dict(zip(names, (port.distance_m,) if is_flat else port.centre_m, strict=True))
     for name, value in true.items():
-        row = written[name]
+        row = summary["shared"][name]
         assert abs(row["after"] - value) < 3.5 * row["sigma"]
         assert abs(row["before"] - value) > 0.0 or value == 0.0
-    assert f"--port {written['surface']}" in " ".join(adjustment_text(summary).split())
+    assert f"--port {summary['port']}" in " ".join(adjustment_text(summary).split())
     options = AdjustOptions(port=port, free=(free,))
     words = correct_words(found, "model", tmp_path / "out", options)
-    assert words.endswith(f"--port {written['surface']}")
+    assert words.endswith(f"--port {summary['port']}")
 
 
 @pytest.mark.parametrize(
