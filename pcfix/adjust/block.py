@@ -43,6 +43,12 @@ TIE_POINTS = 150_000
 """At most; more reduce only the noise, which is no longer the largest error then."""
 
 
+NO_CONTROL = GroundControl(
+    (), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.bool_), np.zeros(0, np.bool_),
+    np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0),
+)  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """Images, points and measurements."""
@@ -59,7 +65,7 @@ class Block:
     water: WaterSurface | None = None
     refractive_index: float = 1.0
     port: Port | None = None  # a housing port as the refracting surface, instead of water
-    control: GroundControl | None = None  # its points are the last ones; check points do not count
+    control: GroundControl = NO_CONTROL  # its points are the last ones; check points do not count
     # parallel planes on which control points lie, perhaps with `WATER`
     parallel: tuple[str, ...] = ()
 
@@ -71,25 +77,20 @@ class Block:
     @property
     def tie_points(self) -> int:
         """Number of tie points."""
-        return len(self.xyz) - (0 if self.control is None else len(self.control.names))
+        return len(self.xyz) - len(self.control.names)
 
     @property
     def is_check(self) -> BoolArray:
         """Check points, shape (m,)."""
-        checks = np.zeros(len(self.xyz), np.bool_)
-        if self.control is not None:
-            checks[self.tie_points :] = self.control.is_check
-        return checks
+        return np.append(np.zeros(self.tie_points, np.bool_), self.control.is_check)
 
     @property
     def survey(self) -> tuple[FloatArray, FloatArray]:
         """Coordinates of control points and their inverse variances, both (m, 3), else zero."""
-        xyz, weight = np.zeros((2, *self.xyz.shape))
-        if (control := self.control) is not None:
-            sigma_m = np.where(control.is_check[:, None], np.inf, control.sigma_m)
-            weight[self.tie_points :] = inverse_variances(control.xyz, sigma_m)
-            xyz[self.tie_points :] = np.nan_to_num(control.xyz)
-        return xyz, weight
+        control, none = self.control, np.zeros((self.tie_points, 3))
+        sigma_m = np.where(control.is_check[:, None], np.inf, control.sigma_m)
+        weight = inverse_variances(control.xyz, sigma_m)
+        return np.vstack([none, np.nan_to_num(control.xyz)]), np.vstack([none, weight])
 
     @property
     def gnss_weights(self) -> FloatArray:
@@ -105,7 +106,7 @@ class Block:
         point lies on a surface.
         """
         control = self.control
-        if control is None or not any(control.on):
+        if not any(control.on):
             return (), np.zeros(0, np.int64), np.zeros(0)
         names = tuple(dict.fromkeys(name for name in control.on if name and name != WATER))
         number = {"": -1, WATER: 0} | {name: i for i, name in enumerate(names, start=1)}
@@ -115,8 +116,7 @@ class Block:
 
 def inverse_variances(values: FloatArray, sigma: FloatArray) -> FloatArray:
     """Return inverse variances; zero where the value or its standard deviation is unknown."""
-    known = np.isfinite(values) & np.isfinite(sigma)
-    return np.where(known, 1.0 / np.where(known, sigma, 1.0) ** 2, 0.0)
+    return np.where(np.isfinite(values), np.nan_to_num(1.0 / sigma**2), 0.0)
 
 
 def plain_block(
@@ -142,7 +142,7 @@ def block_of(
     refractive_index: float,
     *,
     inside: Callable[[FloatArray, FloatArray], BoolArray] | None = None,
-    control: GroundControl | None = None,
+    control: GroundControl = NO_CONTROL,
     level_sigma_m: float = 0.0,
 ) -> Block:
     """Return the block of tie points and control points.
@@ -154,7 +154,7 @@ def block_of(
     wet = np.ones(len(ties.xyz), np.bool_) if inside is None else inside(*ties.xyz[:, :2].T)
     begin = replace(ties, xyz=true_start(ties.xyz, water, refractive_index, wet))
     block = plain_block(cameras, begin, water, refractive_index, wet)
-    return block if control is None else _with_control(block, control, level_sigma_m)
+    return _with_control(block, control, level_sigma_m)
 
 
 def _with_control(block: Block, control: GroundControl, level_sigma_m: float) -> Block:
@@ -246,12 +246,21 @@ def some_ties(ties: TiePoints, rows: IntArray) -> TiePoints:
     return TiePoints(ties.xyz[rows], ties.views.take(rows), ties.image_xy[observations])
 
 
-def usable_ties(ties: TiePoints, cameras: Cameras, most: int = TIE_POINTS) -> TiePoints:
+def well_observed(ties: TiePoints, kept: BoolArray, least: int = LEAST_VIEWS) -> TiePoints:
+    """Return tie points with some of their observations, without points in too few images."""
+    start = np.append(0, np.cumsum(kept))[ties.views.start]
+    views = Views(start, np.asarray(ties.views.camera)[kept])
+    rows = np.flatnonzero(np.diff(start) >= least)
+    return some_ties(TiePoints(ties.xyz, views, ties.image_xy[kept]), rows)
+
+
+def usable_ties(ties: TiePoints, cameras: Cameras) -> TiePoints:
     """Return the tie points that can be adjusted; a random part of them if there are very many.
 
-    They have coordinates, two images or more, and a sufficient angle between their rays: twice the
-    largest angle between a ray and the mean ray of its point.
+    They have two images or more, and a sufficient angle between their rays: twice the largest angle
+    between a ray and the mean ray of its point. Those without coordinates are intersected.
     """
+    ties = with_places(ties, cameras)
     seen = np.diff(ties.views.start) >= LEAST_VIEWS
     rows = np.flatnonzero(np.isfinite(ties.xyz).all(axis=1) & seen)
     some = some_ties(ties, rows)
@@ -263,8 +272,8 @@ def usable_ties(ties: TiePoints, cameras: Cameras, most: int = TIE_POINTS) -> Ti
     cosine = np.minimum.reduceat((ray * np.repeat(mean, counts, axis=0)).sum(axis=1), first)
     angle_deg = 2.0 * np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     rows = rows[angle_deg >= LEAST_ANGLE_DEG]
-    if len(rows) > most:
-        rows = np.sort(np.random.default_rng(0).choice(rows, most, replace=False))
+    if len(rows) > TIE_POINTS:
+        rows = np.sort(np.random.default_rng(0).choice(rows, TIE_POINTS, replace=False))
     return some_ties(ties, rows)
 
 
@@ -300,12 +309,9 @@ def ties_of_cloud(
     The views say which cameras contributed to them, or have them in their frame.
     """
     owner = np.repeat(np.arange(len(xyz)), np.diff(views.start))
-    image = straight_images(xyz[owner], np.asarray(views.camera), cameras)
-    seen = np.isfinite(image).all(axis=1)
-    counts = np.bincount(owner[seen], minlength=len(xyz))
-    start = np.concatenate([[0], np.cumsum(counts)])
-    tracks = Views(start, np.asarray(views.camera)[seen])
-    return some_ties(TiePoints(xyz, tracks, image[seen]), np.flatnonzero(counts >= least))
+    image_xy = straight_images(xyz[owner], np.asarray(views.camera), cameras)
+    is_imaged = np.asarray(np.isfinite(image_xy).all(axis=1))
+    return well_observed(TiePoints(xyz, views, image_xy), is_imaged, least)
 
 
 # Some of the images
@@ -322,11 +328,10 @@ def restricted(block: Block, rows: IntArray) -> Block:
     place = np.full(len(block.cameras), -1)
     place[rows] = np.arange(len(rows))
     is_left, gnss = place[block.camera] >= 0, block.gnss
-    counts = np.bincount(block.owner[is_left], minlength=len(block.xyz))
     return replace(
         block,
         cameras=some_cameras(block.cameras, rows),
-        start=np.concatenate([[0], np.cumsum(counts)]),
+        start=np.append(0, np.cumsum(is_left))[block.start],
         camera=place[block.camera[is_left]],
         image_xy=block.image_xy[is_left],
         sigma_px=block.sigma_px[is_left],

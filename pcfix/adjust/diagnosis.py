@@ -86,7 +86,7 @@ class Sign:
     """One statistic."""
 
     name: str  # one of `ORDER`
-    speaks: bool | None  # whether it says that refraction was absorbed; None if not significant
+    absorbed: bool | None  # whether it says that refraction was absorbed; None if not significant
     words: str  # what was found
     share: float | None = None  # what is compared with a limit, and its standard error
     sigma_share: float | None = None
@@ -102,19 +102,19 @@ class Diagnosis:
     @property
     def decided_by(self) -> Sign | None:
         """The first sign with evidence."""
-        return next((sign for sign in self.signs if sign.speaks is not None), None)
+        return next((sign for sign in self.signs if sign.absorbed is not None), None)
 
     @property
     def absorbed(self) -> bool | None:
         """Whether the poses have absorbed the refraction; None if unknown."""
-        return None if self.decided_by is None else self.decided_by.speaks
+        return None if self.decided_by is None else self.decided_by.absorbed
 
     @property
     def likely_error_m(self) -> float | None:
         """The error that land shows, else that of the sign that decides; None if none is likely."""
         if self.decided_by is None or not self.absorbed:
             return None
-        land = [sign for sign in self.signs if sign.name == "heights of land" and sign.speaks]
+        land = [sign for sign in self.signs if sign.name == "heights of land" and sign.absorbed]
         return (land or [self.decided_by])[-1].error_m
 
     def sentence(self, command: str) -> str:
@@ -134,16 +134,7 @@ class Diagnosis:
         return {
             "absorbed": self.absorbed,
             "likely_error_m": self.likely_error_m,
-            "signs": [
-                {
-                    "name": sign.name,
-                    "absorbed": sign.speaks,
-                    "words": sign.words,
-                    "share": sign.share,
-                    "sigma_share": sign.sigma_share,
-                }
-                for sign in self.signs
-            ],
+            "signs": [{**vars(sign)} for sign in self.signs],
         }
 
 
@@ -223,8 +214,8 @@ def tie_point_sign(
         f"tie points under water have residuals of {s_px:.2f} px with straight rays and"
         f" {r_px:.2f} px with refraction, so {_absorbed_words(share, sigma)}"
     )
-    speaks = None if sigma > MOST_SIGMA else _exceeds(share, sigma, SHARE)
-    return Sign("tie points", speaks, words, share, sigma), apparent
+    absorbed = None if sigma > MOST_SIGMA else _exceeds(share, sigma, SHARE)
+    return Sign("tie points", absorbed, words, share, sigma), apparent
 
 
 # GNSS
@@ -260,8 +251,8 @@ def gnss_sign(cameras: Cameras, gnss: GnssPositions, undone: Undone) -> Sign:
         f" their pattern {_absorbed_words(share, sigma)}"
     )
     is_useful = share <= MOST_SHARE and sigma <= MOST_SIGMA
-    speaks = _exceeds(share, sigma, SHARE) if is_useful else None
-    return Sign("GNSS positions", speaks, words, share, sigma, undone.error_m)
+    absorbed = _exceeds(share, sigma, SHARE) if is_useful else None
+    return Sign("GNSS positions", absorbed, words, share, sigma, undone.error_m)
 
 
 # Surveys, and the cloud itself
@@ -279,8 +270,8 @@ def land_sign(higher_m: FloatArray, gsd_m: float) -> Sign | None:
         f"land of the cloud is {abs(bias):.3f} m too {side} ({len(found):,} places, spread"
         f" {spread:.3f} m, limit {limit:.3f} m)"
     )
-    speaks = True if abs(bias) > limit else None
-    return Sign("heights of land", speaks, words, error_m=abs(bias))
+    absorbed = True if abs(bias) > limit else None
+    return Sign("heights of land", absorbed, words, error_m=abs(bias))
 
 
 def _median_of(values: FloatArray) -> tuple[float, float, float]:
@@ -319,8 +310,8 @@ def neighbours_sign(share: float, sigma: float, *, is_fused: bool) -> Sign:
         f" corrected bed (standard error {100.0 * sigma:.0f} %, limit 50 %; filtering and meshing"
         " also leave some)"
     )
-    speaks = _exceeds(share, sigma, 0.5) if is_fused or share < 0.5 else None
-    return Sign("neighbouring points", speaks, words, share, sigma)
+    absorbed = _exceeds(share, sigma, 0.5) if is_fused or share < 0.5 else None
+    return Sign("neighbouring points", absorbed, words, share, sigma)
 
 
 # All signs
@@ -362,9 +353,9 @@ def _signs_of_rays(
 ) -> list[Sign]:  # fmt: skip
     """Look at tie points and at the GNSS, and predict the error if they say that it is there."""
     sign, apparent = (None, None) if ties is None else tie_point_sign(cameras, water, n, ties)
-    signs, speaks = ([], None) if sign is None else ([sign], sign.speaks)
+    signs, absorbed = ([], None) if sign is None else ([sign], sign.absorbed)
     is_known = gnss is not None and np.isfinite(gnss.xyz).sum() >= LEAST_COORDINATES
-    if not speaks and (not is_known or (in_passing and speaks is False)):
+    if not absorbed and (not is_known or (in_passing and absorbed is False)):
         return signs
     if len(cameras) > (QUICK_IMAGES if in_passing else MOST_IMAGES):
         return signs

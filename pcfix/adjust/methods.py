@@ -94,9 +94,7 @@ def adjust_block(
     if cloud is None:
         found = adjust_ties(block, unknowns, choose_lens=choose_lens)
     else:
-        original, apparent = some_cameras(cloud[0], rows), cloud[1]
-        if block.control is not None:
-            apparent = np.vstack([apparent, block.control.xyz])
+        original, apparent = some_cameras(cloud[0], rows), np.vstack([cloud[1], block.control.xyz])
         found = adjust_cloud(block, original, apparent, unknowns, choose_lens=choose_lens)
 
     # 3. What its user should know
@@ -227,11 +225,8 @@ def check_control(found: Adjusted, name: str) -> None:
     The adjustment distributes a gross error over the coordinates of the point and its marks, so
     both count: the coordinates as they appear in the images.
     """
-    control = found.block.control
-    if control is None:
-        return
+    control, errors = found.block.control, []
     focal = float(np.median([lens.focal for lens in found.cameras.lenses or ()]))
-    errors = []
     for row in found.control:
         i = control.names.index(row.name)
         off_m = np.array([row.dx_m, row.dy_m, row.dz_m])

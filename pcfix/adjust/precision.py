@@ -366,11 +366,9 @@ class Members:
     def aligned(self, cameras: Cameras) -> Members | None:
         """Return the members in the order of their cameras, in any CRS; None for other cameras."""
         row = {label: i for i, label in enumerate(self.labels)}
-        if len(row) < len(self.labels) or sorted(cameras.labels) != sorted(self.labels):
+        if sorted(cameras.labels) != sorted(row) or cameras.lenses is None:
             return None
         rows = np.array([row[label] for label in cameras.labels])
-        if cameras.rotations is None or cameras.lenses is None:
-            return None
         focal = np.array([lens.focal for lens in cameras.lenses])
         if np.abs(focal / self.focal[rows] - 1.0).max() >= SAME_FOCAL:
             return None
@@ -421,14 +419,13 @@ def drawn(covariance: FloatArray, count: int = MEMBERS) -> FloatArray:
     correlation /= sigma[:, None]
     correlation[np.diag_indices(len(sigma))] += TINY
     few = min(AXES, count, len(sigma) - 1)
-    found = eigsh(correlation, few, v0=np.ones(len(sigma))) if few > 0 else None
+    values, axes = np.zeros(0), np.zeros((len(sigma), 0))
+    if few > 0:
+        values, axes = eigsh(correlation, few, v0=np.ones(len(sigma)))
     factor = cholesky(correlation, lower=True, overwrite_a=True)
     draws = rng.standard_normal((count, len(sigma))) @ factor.T
-    if found is not None:
-        values, axes = found
-        even = np.linalg.qr(draws @ axes)[0] * np.sqrt(count * values)
-        draws += (even - draws @ axes) @ axes.T
-    return np.asarray(draws * sigma)
+    even = np.linalg.qr(draws @ axes)[0] * np.sqrt(count * values)
+    return np.asarray((draws + (even - draws @ axes) @ axes.T) * sigma)
 
 
 def members_of(problem: Problem, found: Solution, steps: FloatArray) -> Members:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pcfix.adjust.block import WATER, Block
-from pcfix.adjust.collinearity import POINT, SHARED, Given, State
+from pcfix.adjust.collinearity import SHARED, Given, State
 from pcfix.adjust.normal import UNDAMPED, cost_of, linearised, point_steps, residuals
 from pcfix.adjust.parameters import (
     INDEX,
@@ -105,17 +105,14 @@ class Solution:
     cost: float = np.inf  # sum of weighted squares, including prior knowledge
 
 
-def prepare(
-    block: Block, unknowns: Unknowns, origin: FloatArray | None = None
-) -> tuple[Problem, Solution]:
-    """Return a problem and its start; the origin is the rounded mean of the cameras by default."""
+def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
+    """Return a problem and its start."""
     cameras, water, lenses = block.cameras, block.water, block.cameras.lenses or ()
-    origin = np.round(cameras.centres.mean(axis=0)) if origin is None else origin
+    origin = np.round(cameras.centres.mean(axis=0))
     group = sensor_groups(lenses)
     first_images = np.unique(group, return_index=True)[1].tolist()
     codes = [usable_codes(lenses[i], unknowns.lens) for i in first_images]
-    pairs = zip(first_images, codes, strict=True)
-    lens_unknowns = [(i, code) for i, of_sensor in pairs for code in of_sensor]
+    lens_unknowns = [(i, code) for i, of in zip(first_images, codes, strict=True) for code in of]
     numbers = surface_numbers(block, origin)
     planes, plane_names, axis, alike = _planes(block, origin, numbers)
     # columns of the shared unknowns: lenses, then surface and planes
@@ -155,7 +152,7 @@ def prepare(
         code=np.array([code for _, code in lens_unknowns], np.int64),
         column=column,
         shared=len(names),
-        surveyed_xyz=np.where(surveyed_weight > 0.0, surveyed_xyz - origin, 0.0),
+        surveyed_xyz=surveyed_xyz - origin,
         surveyed_weight=surveyed_weight,
         on=on,
         on_weight=np.where(on >= 0, 1.0 / on_sigma_m, 0.0),
@@ -346,21 +343,12 @@ def cost_at(problem: Problem, found: Solution, loss: int) -> float:
 
 def survey_cost(problem: Problem, found: Solution) -> float:
     """Return the weighted squares of all observations that are no images."""
-    given, left = problem.given, prior_rows(problem, found)[1]
-    off = given.surveyed_weight * (given.surveyed_xyz - found.state.xyz) ** 2
-    off_surfaces = _off_surfaces(problem, found.state)
-    return float(off.sum() + left @ left + off_surfaces @ off_surfaces)
-
-
-def _off_surfaces(problem: Problem, state: State) -> FloatArray:
-    """Return surface minus point, in standard deviations, of points that lie on surfaces.
-
-    Points that their rays and surface do not fix are missing.
-    """
-    if not len(problem.given.on):
-        return np.zeros(0)
-    rows = linearised(state, problem.given, UNDAMPED, problem.block.tie_points, len(state.xyz))
-    return rows.r[~rows.is_image & rows.columns[:, 0, POINT:SHARED].any(axis=1), 0]
+    given, state, left = problem.given, found.state, prior_rows(problem, found)[1]
+    cost = (given.surveyed_weight * (given.surveyed_xyz - state.xyz) ** 2).sum() + left @ left
+    if len(given.on):  # distances from surfaces; zero for points that their rays do not fix
+        rows = linearised(state, given, UNDAMPED, problem.block.tie_points, len(state.xyz))
+        cost += (rows.r[~rows.is_image] ** 2).sum()
+    return float(cost)
 
 
 # Intersection with fixed poses

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import LEAST_VIEWS, Block
+from pcfix.adjust.block import LEAST_VIEWS, NO_CONTROL, Block
 from pcfix.adjust.normal import residuals
 from pcfix.adjust.parameters import INDEX, Unknowns
 from pcfix.adjust.precision import Precision
@@ -126,8 +126,6 @@ def adjusted_of(
 
 def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlRow]:
     rows, control = list[ControlRow](), block.control
-    if control is None:
-        return rows
     names = zip(control.names, control.is_check, control.xyz, strict=True)
     for p, (name, check, surveyed) in enumerate(names, block.tie_points):
         marks = r[block.start[p] : block.start[p + 1]]
@@ -150,7 +148,7 @@ def residuals_before(adjusted: Adjusted) -> FloatArray:
     survey; observations that the adjustment excluded have no weight.
     """
     sigma_px = np.where(adjusted.used, adjusted.block.sigma_px, np.inf)
-    return intersect_fixed(replace(adjusted.block, sigma_px=sigma_px, control=None))[1]
+    return intersect_fixed(replace(adjusted.block, sigma_px=sigma_px, control=NO_CONTROL))[1]
 
 
 def mean(values: FloatArray) -> FloatArray:

@@ -138,9 +138,8 @@ def transfer_of(original: Cameras, adjusted: Cameras, place: IntArray) -> CloudT
 def renumbered(views: Views, row: IntArray) -> tuple[Views, IntArray]:
     """Return views with other camera numbers, without negative ones, and the entries that stay."""
     camera = row[np.asarray(views.camera)]
-    stays = camera >= 0
-    entry = np.flatnonzero(stays)
-    start = np.concatenate([[0], np.cumsum(stays)])[views.start]
+    entry = np.flatnonzero(camera >= 0)
+    start = np.append(0, np.cumsum(camera >= 0))[views.start]
     weight = None if views.weight is None else views.weight[entry]
     return Views(start, camera[entry], weight, views.kind), entry
 

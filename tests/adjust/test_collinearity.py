@@ -54,7 +54,7 @@ def given_of(**changes):
     cameras = Cameras(("a",), np.zeros((1, 3)), DOWN[None], (PLAIN,))
     ties = TiePoints(np.zeros((1, 3)), Views(np.array([0, 1]), np.array([0])), np.zeros((1, 2)))
     block = plain_block(cameras, ties, WaterPlane(-60.0), 1.34, np.array([True]))
-    return prepare(block, Unknowns(lens=()), np.zeros(3))[0].given._replace(**changes)
+    return prepare(block, Unknowns(lens=()))[0].given._replace(**changes)
 
 
 def pose(seed: int):

@@ -11,7 +11,6 @@ from pcfix.adjust.problem import prepare
 from pcfix.adjust.result import redundancy_of
 from pcfix.model import WaterPlane
 from tests.utils import tie_blocks
-from tests.utils.adjust_twin import Twin
 from tests.utils.curved_water import under_curved_water
 from tests.utils.tie_blocks import block_of
 from tests.utils.tie_points import simulate_tie_points
@@ -51,8 +50,6 @@ def block_with(data, on, **how):
     """Return a block in which all points are control points, most of them without coordinates."""
     block = block_of(data, **how)
     m, control = len(on), block.control
-    if control is None:
-        control = replace(data.control, names=(), xyz=np.zeros((0, 3)), sigma_m=np.zeros((0, 3)))
     on = (*on, *[""] * len(control.names))
     control = replace(
         control, names=tuple(f"P{i}" for i in range(len(on))), is_check=np.zeros(len(on), bool),
@@ -138,33 +135,3 @@ def test_parallel(parallel):
         sigma = precision.shared["tilt_x of floor"].sigma
         assert sigma < min(separate.shared[f"tilt_x of {name}"].sigma for name in ("floor", "deck"))
     assert abs(floor[1] - b) < 3.5 * sigma
-
-
-def test_same_as_scipy():
-    data = simulate_tie_points(
-        20, seed=2, area_m=(25, 20), greatest_depth_m=6, position_noise_m=0.05,
-        attitude_noise_deg=0.05, forward_overlap=0.6, side_overlap=0.5, obliques_deg=25,
-        oblique_directions=2, oblique_share=0.3, tilt_percent=1.0,
-    )  # fmt: skip
-    data, on = put(data, {
-        "water": (np.arange(4), at_level(data, data.water.b, data.water.c)),
-        "floor": (np.arange(4, 10), at_level(data, 0.01, 0.0, 1.0)),
-    })  # fmt: skip
-    block = block_with(data, on, cameras=data.true_cameras, gnss=False)
-    for parallel in ((), ("water", "floor")):
-        # the twin has no word for points that are never wet: a waterline that it meets from above
-        block = replace(block, wet=np.ones(len(block.wet), bool), parallel=parallel)
-        unknowns = Unknowns(poses="fixed", lens=(), surface={"level": FREE, "tilt": FREE})
-        problem, found, precision = adjusted(block, unknowns)
-        twin = Twin(block, tuple(problem.names), free_poses=False)
-        x = twin.solve()
-        _, _, added, xyz = twin.parts(x)
-        # the twin's planes are told as a whole, ours as what was added to a fitted start
-        added = {name: value for name, value in added.items() if " of " not in name}
-        assert abs((twin.residuals(x) ** 2).sum() - found.cost) < 1e-6
-        np.testing.assert_allclose(found.state.xyz, xyz, atol=1e-5)  # m
-        sigma = np.sqrt(np.diag(twin.covariance(x)))[: len(problem.names)]
-        np.testing.assert_allclose(precision.shared_sigma, sigma, rtol=2e-3)
-        for name, value in added.items():
-            row = precision.shared[name]
-            assert abs(row.after - row.before - value) < 1e-3 * row.sigma

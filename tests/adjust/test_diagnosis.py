@@ -35,18 +35,18 @@ def test_right_poses(poses):
     true = block()
     cameras = true.cameras if poses == "true" else true.adjusted(true.cameras, LENS, WATER)
     by_ties, by_gnss, _ = signs(true, cameras)
-    assert by_ties.speaks is False
+    assert by_ties.absorbed is False
     # 50 blocks with true poses gave 0.01 to 0.07
     assert abs(by_ties.share) < 0.15
-    assert by_gnss.speaks is not True
+    assert by_gnss.absorbed is not True
     assert abs(by_gnss.share) < 4.0 * by_gnss.sigma_share
 
 
 def test_absorbed():
     true = block()
     by_ties, by_gnss, apparent = signs(true, true.adjusted(true.cameras, LENS))
-    assert by_ties.speaks is True
-    assert by_gnss.speaks is True
+    assert by_ties.absorbed is True
+    assert by_gnss.absorbed is True
     # what the land is off in truth: the straight intersection against the true points; the
     # prediction does not know the GNSS, which placed the block as a whole, hence a third
     land = true.xyz[:, 2] > 0.5
@@ -58,12 +58,12 @@ def test_random_errors():
     true, rng = block(4), np.random.default_rng(4)
     centres = true.cameras.centres + rng.normal(0.0, 0.1, true.cameras.centres.shape)
     by_ties, by_gnss, _ = signs(true, replace(true.cameras, centres=centres))
-    assert by_ties.speaks is not True
-    assert by_gnss.speaks is not True
+    assert by_ties.absorbed is not True
+    assert by_gnss.absorbed is not True
 
 
 def test_bed():
     true = np.linspace(2.0, 8.0, 40)
-    assert bed_sign(true / 1.4, true, N).speaks is False
-    assert bed_sign(0.97 * true, true, N).speaks is True
+    assert bed_sign(true / 1.4, true, N).absorbed is False
+    assert bed_sign(0.97 * true, true, N).absorbed is True
     assert bed_sign(0.97 * true[:2], true[:2], N) is None

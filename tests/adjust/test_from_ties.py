@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.adjust.block import block_of
+from pcfix.adjust.block import NO_CONTROL, block_of
 from pcfix.adjust.from_ties import adjust_ties
 from pcfix.adjust.parameters import Unknowns, default_lens
 from pcfix.flow.adjust import adjust_cameras
@@ -27,7 +27,7 @@ def scene(image_px=0.5, **settings):
     )  # fmt: skip
 
 
-def block(data, ties=None, gnss=True, control=None):
+def block(data, ties=None, gnss=True, control=NO_CONTROL):
     ties = data.ties if ties is None else ties
     found = block_of(data.cameras, ties, data.water, data.refractive_index, control=control)
     return replace(found, gnss=data.cameras.gnss) if gnss else found

@@ -55,7 +55,7 @@ def block_of(
         gnss=GnssPositions(place if gnss else nowhere, positions.sigma_m, None),
         water=scene.water if water is None else water,
         refractive_index=scene.refractive_index if index is None else index,
-        control=surveyed if len(rows) else None,
+        control=surveyed,
     )
 
 
