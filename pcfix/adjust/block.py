@@ -295,7 +295,7 @@ def with_places(ties: TiePoints, cameras: Cameras) -> TiePoints:
     middle = cameras.centres.mean(axis=0)
     right = np.einsum("oij,oj->oi", across, cameras.centres[camera] - middle)
     across, right = np.add.reduceat(across, first), np.add.reduceat(right, first)
-    known = np.linalg.det(across) > LEAST_DETERMINANT  # NaN is not
+    known = np.linalg.det(np.nan_to_num(across)) > LEAST_DETERMINANT
     xyz = ties.xyz.copy()
     xyz[lost[known]] = np.linalg.solve(across[known], right[known][:, :, None])[:, :, 0] + middle
     return replace(ties, xyz=xyz)

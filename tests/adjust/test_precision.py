@@ -1,7 +1,6 @@
 """What is undetermined, precision of large blocks, and members of the ensemble."""
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -13,22 +12,10 @@ from pcfix.adjust.problem import solved_cameras, water_of
 from pcfix.adjust.solve import moved_by
 from pcfix.water.surface import surface_above
 from tests.utils.codes import refused
-from tests.utils.tie_blocks import adjusted, block_of
+from tests.utils.tie_blocks import adjusted, block_of, tiny_scene
 from tests.utils.tie_points import simulate_tie_points
 
 FREE = np.inf
-
-
-TINY = {
-    "area_m": (25, 20), "greatest_depth_m": 6, "forward_overlap": 0.6, "side_overlap": 0.5,
-    "obliques_deg": 25, "oblique_directions": 2, "oblique_share": 0.3, "position_noise_m": 0.05,
-    "attitude_noise_deg": 0.05,
-}  # fmt: skip
-
-
-@cache
-def tiny(points=14, **settings):
-    return simulate_tie_points(points, **(TINY | {"seed": 2} | settings))
 
 
 def without_image(block):
@@ -61,7 +48,7 @@ def dry(block):
     ids=["no datum", "no datum, water free", "dry", "dry, shape free", "image without points"],
 )  # fmt: skip
 def test_undetermined(change, given, unknowns, wanted):
-    block = block_of(tiny(), **given)
+    block = block_of(tiny_scene(), **given)
     block = block if change is None else change(block)
     if wanted.get("images"):
         wanted = wanted | {"images": [block.cameras.labels[int(i)] for i in wanted["images"]]}
@@ -97,7 +84,7 @@ def test_sloping_bed():
 
 
 def test_large_block(monkeypatch):
-    data = tiny()
+    data = tiny_scene()
     block = block_of(data, control=True)
     problem, found = adjusted(block, Unknowns(lens=("f",), surface={"level": FREE}))
     whole = precision_of(problem, found)
@@ -112,7 +99,7 @@ def test_large_block(monkeypatch):
 @pytest.mark.parametrize("shape", [{}, {"shape": 0.01}], ids=["plane", "curved"])
 def test_member(shape):
     unknowns = Unknowns(lens=("f", "k1"), surface={"level": 0.1, "tilt": 0.01} | shape)
-    problem, found = adjusted(block_of(tiny(), control=True), unknowns)
+    problem, found = adjusted(block_of(tiny_scene(), control=True), unknowns)
     free = 6 * len(found.lenses) + len(problem.names)
     steps = np.random.default_rng(2).normal(0.0, 1e-3, (3, free))
     members = members_of(problem, found, steps)
@@ -140,7 +127,7 @@ def test_member(shape):
 
 
 def test_members_scatter():
-    problem, found = adjusted(block_of(tiny()), Unknowns(lens=("f",)))
+    problem, found = adjusted(block_of(tiny_scene()), Unknowns(lens=("f",)))
     precision = precision_of(problem, found, sigma0=2.0)
     members = precision.members
     squares = np.einsum("mki,kij->mkj", members.shift_m, found.state.rotations) ** 2

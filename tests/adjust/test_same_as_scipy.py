@@ -10,39 +10,30 @@ from pcfix.adjust.precision import precision_of
 from tests.adjust.test_conditions import at_level, block_with, put
 from tests.utils.adjust_twin import Twin
 from tests.utils.curved_water import under_curved_water
-from tests.utils.tie_blocks import adjusted, block_of
-from tests.utils.tie_points import simulate_tie_points
+from tests.utils.tie_blocks import adjusted, block_of, tiny_scene
 
 FREE = np.inf
 INDEX_SIGMA = 0.01
 WATER = {"level": FREE, "tilt": FREE}
 
 
-def scene(points, **settings):
-    return simulate_tie_points(
-        points, seed=2, area_m=(25, 20), greatest_depth_m=6, position_noise_m=0.05,
-        attitude_noise_deg=0.05, forward_overlap=0.6, side_overlap=0.5, obliques_deg=25,
-        oblique_directions=2, oblique_share=0.3, **settings,
-    )  # fmt: skip
-
-
 def free_poses():
-    return block_of(scene(11, tilt_percent=2.0), control=True), WATER | {"index": INDEX_SIGMA}
+    return block_of(tiny_scene(11, tilt_percent=2.0), control=True), WATER | {"index": INDEX_SIGMA}
 
 
 def fixed_poses():
-    return block_of(scene(14), control=True, gnss=False), WATER | {"index": INDEX_SIGMA}
+    return block_of(tiny_scene(14), control=True, gnss=False), WATER | {"index": INDEX_SIGMA}
 
 
 def curved_water():
-    data = scene(14)
+    data = tiny_scene(14)
     curved = under_curved_water(data, np.array([4.8e-4, -2.4e-4, -3.6e-4]))
     block = block_of(curved, control=True, cameras=data.true_cameras, gnss=False)
     return block, WATER | {"shape": FREE}
 
 
 def on_surfaces(parallel=()):
-    data = scene(20, tilt_percent=1.0)
+    data = tiny_scene(20, tilt_percent=1.0)
     data, on = put(data, {
         "water": (np.arange(4), at_level(data, data.water.b, data.water.c)),
         "floor": (np.arange(4, 10), at_level(data, 0.01, 0.0, 1.0)),

@@ -22,7 +22,6 @@ from pcfix.options.correct import RunOptions
 from tests.utils.block_kinds import GSD_M, write_kind
 from tests.utils.clouds import write_las
 from tests.utils.codes import refused, warned
-from tests.utils.program import run_pcfix
 
 
 def first_step(scene, folder, **options):
@@ -175,10 +174,3 @@ def test_water_dimension(scene, tmp_path):
 def test_conflicts(tmp_path, words):
     with refused("option.conflict", value=words["adjust"]):
         run("cloud.las", tmp_path / "out", cameras="cameras.csv", water="0", **words)
-
-
-def test_command_line(scene, tmp_path):
-    words = ["run", f"{scene.folder}/cloud.las", str(tmp_path / "out"), "--water", "0"]
-    words += ["--cameras", f"{scene.folder}/model", "--adjust", "no", "--gnss", scene.gnss]
-    assert run_pcfix(*words).code == "option.conflict"
-    assert run_pcfix(*words, "--adjust", "maybe").returncode == 2
