@@ -12,6 +12,6 @@
 6. Diagnosis (`diagnosis`): have poses absorbed the refraction?
 7. Transfer (`transfer`): a cloud of the original poses as it would be with the adjusted ones.
 
-The theory is that of Triggs et al. 2000 (Bundle adjustment: a modern synthesis), the refraction that
-of Mulsow 2024.
+The theory is that of Triggs et al. 2000 (Bundle adjustment: a modern synthesis), the refraction
+that of Mulsow 2024.
 """
