@@ -75,6 +75,7 @@ def _transfer(
     most = most_between(span, start)
     image, who = np.empty((most, 2)), np.empty(most, np.int64)
     for i in range(*span):
+        # where the original cameras image the point, by straight rays
         count = 0
         for j in range(start[i], start[i + 1]):
             c = camera[j]
@@ -104,6 +105,7 @@ def _intersect(
             u, v, by_u, by_v = image_in_world(lens, cameras.rotations[c], ahead)
             m, b = plus_square(m, by_u), plus(b, scaled(image[j, 0] - u, by_u))
             m, b = plus_square(m, by_v), plus(b, scaled(image[j, 1] - v, by_v))
+        # nearly parallel rays do not fix the point
         det, step = solved(m, b)
         if not det > LEAST_CONDITION * m[0] * m[3] * m[5]:
             return False
