@@ -60,7 +60,6 @@ class Adjusted:
     redundancy: int  # observations, with those of the unknowns, minus unknowns
     source: Source  # what was observed: tie points, or images of the apparent cloud
     precision: Precision
-    gnss_residual_m: FloatArray  # (k, 3), adjusted centres minus GNSS positions; NaN if unknown
     control: list[ControlRow]
     notes: list[PcfixWarning]
     port: Port | None = None  # adjusted
@@ -102,7 +101,6 @@ def adjusted_of(
     none = -np.inf if block.port is None else np.inf  # behind a port everything is under water
     level = np.full(len(xyz), none) if water is None else surface_above(water, xyz).height_m
     cameras = solved_cameras(problem, now)
-    off = cameras.centres - block.gnss.xyz
     return Adjusted(
         block=block,
         unknowns=problem.unknowns,
@@ -117,7 +115,6 @@ def adjusted_of(
         redundancy=redundancy_of(problem),
         source=source,
         precision=precision,
-        gnss_residual_m=np.where(block.gnss_weights > 0.0, off, np.nan),
         control=_control_rows(block, xyz, r),
         notes=notes,
         port=port_of(block, state.water),
@@ -241,10 +238,12 @@ def _poses(a: Adjusted) -> Plain:
 
 
 def _gnss(a: Adjusted) -> Plain | None:
-    known = np.isfinite(a.gnss_residual_m).any(axis=1)
+    """Return centres minus GNSS positions; None if there is none."""
+    is_used = a.block.gnss_weights > 0.0
+    known = is_used.any(axis=1)
     if not known.any():
         return None
-    off = a.gnss_residual_m[known]
+    off = np.where(is_used, a.cameras.centres - a.block.gnss.xyz, np.nan)[known]
     return {
         "images": known.sum(),
         "mean_m": mean(off),

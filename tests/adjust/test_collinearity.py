@@ -70,9 +70,7 @@ def state_of(q, centre, rotation, lens, water, port=None):
 
 
 def at(q, centre, rotation, lens, water, given, port=None):
-    state = state_of(q, centre, rotation, lens, water, port)
-    work = workspace(given)
-    return np.array(image_and_all_gradients(state, given, 0, 0, work, work.own))
+    return gradients(q, centre, rotation, lens, water, given, port)[0]
 
 
 def gradients(q, centre, rotation, lens, water, given, port=None):

@@ -170,13 +170,8 @@ def test_wrong_marks_on_surfaces(files, tmp_path, role, more, code):
 def test_written(files, written):
     out, found = written
     names = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
-    assert {
-        "colmap/images.bin",
-        "cameras.csv",
-        "sensor.csv",
-        "adjustment.json",
-        "report.html",
-    } <= names
+    wanted = {"colmap/images.bin", "cameras.csv", "sensor.csv", "adjustment.json", "report.html"}
+    assert wanted <= names
     for name in ("colmap", "cameras.csv"):
         read = pcfix.read_cameras(out / name)
         order = [read.labels.index(label) for label in found.cameras.labels]

@@ -39,6 +39,11 @@ def cameras(focal=FOCAL, shift=(0.0, 0.0, 0.0)):
     )  # fmt: skip
 
 
+AFTER = cameras(1002.0, (0.0, 0.0, 0.3))
+OFF_M = np.array([[0.01, 0.02, 0.03], [0.05, -0.02, 0.09], [np.nan] * 3])
+"""Adjusted centres minus GNSS positions."""
+
+
 def points(m=24):
     """Return m points under the cameras: a third on land, the others down to 3.5 m of depth."""
     rng = np.random.default_rng(3)
@@ -64,7 +69,7 @@ def make_block(xyz, images, before, refractive_index=1.34):
     m, k = len(xyz), 3
     return Block(
         before, xyz, np.arange(m + 1) * k, np.tile(np.arange(k), m), images, np.full(m * k, 0.3),
-        np.ones(m, bool), GnssPositions(before.centres + 0.01, np.full((k, 3), 0.03), None),
+        np.ones(m, bool), GnssPositions(AFTER.centres - OFF_M, np.full((k, 3), 0.03), None),
         WaterPlane(LEVEL), refractive_index,
     )  # fmt: skip
 
@@ -84,7 +89,7 @@ def adjusted(monkeypatch):
 
     Before the adjustment these were 1.2 and 2.4 px.
     """
-    xyz, after, before = points(), cameras(1002.0, (0.0, 0.0, 0.3)), cameras()
+    xyz, before = points(), cameras()
     is_wet = xyz[:, 2] < LEVEL
     residual = np.where(is_wet, 0.4, 0.3).repeat(3)[:, None] * np.array([1.0, -1.0])
     used = np.ones(72, bool)
@@ -95,15 +100,14 @@ def adjusted(monkeypatch):
         ControlRow("G2", "control", 0.010, 0.020, -0.050, 0.7, 2),
         ControlRow("C1", "check", -0.040, 0.000, 0.060, 0.8, 3),
     ]
-    gnss = np.array([[0.01, 0.02, 0.03], [0.05, -0.02, 0.09], [np.nan] * 3])
     monkeypatch.setattr(
         "pcfix.adjust.result.residuals_before",
         lambda _: np.where(is_wet, 2.4, 1.2).repeat(3)[:, None] * np.ones(2),
     )
     return Adjusted(
-        make_block(xyz, pinhole(xyz, before), before), Unknowns(surface={"level": 0.1}), after,
+        make_block(xyz, pinhole(xyz, before), before), Unknowns(surface={"level": 0.1}), AFTER,
         WaterPlane(LEVEL + 0.02), 1.34, xyz, residual, used, is_wet, 1.234, 60, "tie points",
-        make_precision(len(xyz)), gnss, control,
+        make_precision(len(xyz)), control,
         [PcfixWarning("adjust.lens", "something <decided>")],
     )  # fmt: skip
 
@@ -150,10 +154,11 @@ def test_values(adjusted):
 
 def bare(adjusted):
     """Return what is least: no water, nothing beside the images, one step."""
-    block = replace(adjusted.block, water=None)
+    unknown = np.full((3, 3), np.nan)
+    block = replace(adjusted.block, water=None, gnss=GnssPositions(unknown, unknown, None))
     return replace(
         adjusted, block=block, water=None, is_wet=np.zeros(len(adjusted.xyz), bool), control=[],
-        gnss_residual_m=np.full((3, 3), np.nan), notes=[],
+        notes=[],
         unknowns=Unknowns(poses="fixed", lens=()),
     )  # fmt: skip
 
