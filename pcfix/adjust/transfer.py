@@ -188,6 +188,29 @@ class TransferCounts(Sums):
         not_moved, squares = int((~step.moved).sum()), float((shift**2).sum())
         return cls(len(shift), not_moved, land, float(shift[:, 2].sum()), squares)
 
+    def check(self, name: str) -> None:
+        """Refuse a cloud that the original cameras do not see."""
+        if self.points == 0 and self.not_moved:
+            words = (
+                f"{name}: no point could be transferred to the adjusted cameras, because fewer than"
+                " two original cameras image them. Check that --adjusted-from is the model of the"
+                " cloud, in its CRS."
+            )
+            raise GeometryError("adjusted_from.no_overlap", words, path=name)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, metres."""
+        count = max(self.points, 1)
+        return {
+            "points": self.points,
+            "land": self.land,
+            "not_transferred": self.not_moved,
+            "shift_m": {
+                "mean_z": round(self.sum_z_m / count, 4),
+                "rms": round(float(np.sqrt(self.sum_squares_m2 / count)), 4),
+            },
+        }
+
 
 @dataclass(frozen=True, eq=False)
 class CloudTransfer:
@@ -226,29 +249,6 @@ class CloudTransfer:
                 " --cameras-offset, which count for the file that has no CRS."
             )
             raise GeometryError("adjusted_from.too_far", words, distance_m=off_m, height_m=height)
-
-    def check(self, name: str, counts: TransferCounts) -> None:
-        """Refuse a cloud that the original cameras do not see."""
-        if counts.points == 0 and counts.not_moved:
-            words = (
-                f"{name}: no point could be transferred to the adjusted cameras, because fewer than"
-                " two original cameras image them. Check that --adjusted-from is the model of the"
-                " cloud, in its CRS."
-            )
-            raise GeometryError("adjusted_from.no_overlap", words, path=name)
-
-    def as_dict(self, counts: TransferCounts) -> dict[str, Any]:
-        """Return the statistics as plain values, metres."""
-        count = max(counts.points, 1)
-        return {
-            "points": counts.points,
-            "land": counts.land,
-            "not_transferred": counts.not_moved,
-            "shift_m": {
-                "mean_z": round(counts.sum_z_m / count, 4),
-                "rms": round(float(np.sqrt(counts.sum_squares_m2 / count)), 4),
-            },
-        }
 
     def provenance(self) -> dict[str, Any]:
         """Return the record of the transfer for the output file."""

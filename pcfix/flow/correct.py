@@ -131,7 +131,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
 
     Warns of what is uncertain.
     """
-    options, figures, transfer = plan.options, tally.figures, plan.transfer
+    options, figures = plan.options, tally.figures
     water_notes = _check_counts(plan, tally, tally.views)
     counts, uncertainty = figures.as_dict(), figures.uncertainty(plan.reconstruction)
     tested, poses, absorbed = None, None, None
@@ -175,7 +175,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         water=water,
         water_fit=plan.found.as_dict(),
         uncertainty=uncertainty,
-        transfer=transfer.as_dict(tally.transfer) if transfer and tally.transfer else None,
+        transfer=None if tally.transfer is None else tally.transfer.as_dict(),
         reconstruction=reconstruction,  # its type, and why
         # other notes on the cloud, also in `warnings`
         notes=[
@@ -196,8 +196,8 @@ def _check_counts(plan: Plan, tally: CloudTally, report: ViewReport | None) -> l
     if report is not None:
         for note in report.notes():
             warnings.warn(note, stacklevel=2)
-    if plan.transfer is not None and tally.transfer is not None:
-        plan.transfer.check(name, tally.transfer)
+    if tally.transfer is not None:
+        tally.transfer.check(name)
     plan.labelling.check(name, tally.labels)
     water_notes, water = list[str](), plan.found.surface
     if tally.water is not None:
