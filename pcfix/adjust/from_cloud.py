@@ -172,6 +172,7 @@ def _trial(
     marks, weight = problem.used & (owner >= m), problem.given.weight
     r = residuals(found.state, problem.given)[marks]
     in_images = float((r * r * weight[marks][:, None] ** 2).sum())
+    # observations with noise, minus the coordinates of the surveyed points
     surveyed = problem.given.surveyed_weight > 0.0
     count = int((block.gnss_weights > 0.0).sum()) + 2 * int(marks.sum()) + int(surveyed.sum())
     count -= 3 * int(surveyed.any(axis=1).sum())
@@ -247,7 +248,7 @@ def undo_absorption(
     shown = ties_of_cloud(xyz, in_frame, cameras, least).views.camera
     row = np.flatnonzero(np.bincount(shown, minlength=len(cameras)) >= LEAST_POINTS)
     if len(row) < LEAST_IMAGES:
-        raise _unsolved(f"only {len(row)} images have {LEAST_POINTS} points of the cloud")
+        raise _unsolved(f"{len(row)} images have {LEAST_POINTS} points, {LEAST_IMAGES} are needed")
     cameras = some_cameras(cameras, row)
     ties = ties_of_cloud(xyz, views_in_frame(xyz, cameras), cameras, least)
     wet = is_submerged(ties.xyz[:, 2], surface_above(water, ties.xyz))

@@ -1,4 +1,4 @@
-"""Poses that absorbed the refraction are told from true ones."""
+"""Detect poses that absorbed the refraction, and no others."""
 
 from dataclasses import replace
 from functools import cache

@@ -158,8 +158,7 @@ def bare(adjusted):
     block = replace(adjusted.block, water=None, gnss=GnssPositions(unknown, unknown, None))
     return replace(
         adjusted, block=block, water=None, is_wet=np.zeros(len(adjusted.xyz), bool), control=[],
-        notes=[],
-        unknowns=Unknowns(poses="fixed", lens=()),
+        notes=[], unknowns=Unknowns(poses="fixed", lens=()),
     )  # fmt: skip
 
 
