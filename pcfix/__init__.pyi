@@ -15,8 +15,8 @@ from pcfix.flow.dsm import grid_dsm as grid_dsm
 from pcfix.flow.label import label_file as label_file
 from pcfix.flow.ortho import ortho_photo as ortho_photo
 from pcfix.flow.photos import map_photos as map_photos
+from pcfix.flow.photos import rebuild_rounds as rebuild_rounds
 from pcfix.flow.plan import plan_flight as plan_flight
-from pcfix.flow.rebuild import rebuild_rounds as rebuild_rounds
 from pcfix.flow.restore import restore_file as restore_file
 from pcfix.flow.run import RunResults as RunResults
 from pcfix.flow.run import open_run as open_run

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
 
-from pcfix.errors import PcfixError, SettingError, show_warning
+from pcfix.errors import PcfixError, SettingError, plain, show_warning
 from pcfix.io.pdal import NAME, Dimensions, PdalCloud, Results, metadata_of
 from pcfix.model import LOW_NOISE, WaterDimension, WaterSurface
 from pcfix.options.correct import RasterOutputs
@@ -160,7 +160,7 @@ def _clean(namespace: dict[str, Any], ins: Dimensions, outs: Dimensions) -> None
         outs["Classification"] = np.where(noise, LOW_NOISE, cloud.classes).astype(np.uint8)
         outs.update(cloud.flags())
     seconds = round(time.perf_counter() - started, 3)
-    summary = {**found.as_dict(), "input": NAME, "output": NAME, "seconds": seconds}
+    summary = plain({**found, "input": NAME, "output": NAME, "seconds": seconds})
     write_summary(options, summary)
     namespace["out_metadata"] = metadata_of(summary)
 

@@ -18,11 +18,11 @@ PACKAGE = Path(kernels.__file__).parent
 PROGRAM = """
 import numpy as np
 from pcfix import kernels
-from pcfix.lens import imaging
+from pcfix.lens import formulas
 table = np.zeros(40)
-table[imaging.LARGEST_RADIUS] = 3.0
-imaging.angle(table, 0.1)
-stats = imaging.angle.stats
+table[formulas.LARGEST_RADIUS] = 3.0
+formulas.angle(table, 0.1)
+stats = formulas.angle.stats
 print(kernels.cache_folder(), sum(stats.cache_hits.values()))
 """
 

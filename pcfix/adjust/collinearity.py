@@ -18,7 +18,7 @@ import numpy as np
 
 from pcfix.adjust.parameters import B1, B2, CX, CY, FOCAL, INDEX, K1, P1, PLANES, PORT, SHAPE
 from pcfix.kernels import device
-from pcfix.lens import imaging as formulas
+from pcfix.lens import formulas
 from pcfix.lens.algebra import (
     Vector,
     beyond,
@@ -29,9 +29,10 @@ from pcfix.lens.algebra import (
     transposed_times,
     vector,
 )
-from pcfix.lens.imaging import distorted, image_and_gradients, plane_and_gradients, undistorted
+from pcfix.lens.formulas import distorted, plane_and_gradients, undistorted
+from pcfix.lens.imaging import image_and_gradients
 from pcfix.model import BoolArray, FloatArray, IntArray
-from pcfix.port.light import BY_PORT, through_port
+from pcfix.port.light import BY_PORT, NO_PORT, Window, through_port
 from pcfix.refract.rays import direction, lay, light_and_gradients, light_path, plane_at, settle
 
 if TYPE_CHECKING:
@@ -43,11 +44,11 @@ class State(NamedTuple):
 
     centres: FloatArray  # (k, 3)
     rotations: FloatArray  # (k, 3, 3), world to camera
-    lenses: FloatArray  # (l, ...), coefficients of `pcfix.lens.imaging.lens_table`
+    lenses: FloatArray  # (l, ...), coefficients of `pcfix.lens.formulas.lens_table`
     xyz: FloatArray  # (m, 3), true points
     # (11 + 3 p,), the parameters of `WATER_NAMES`, then height and two slopes of each of p planes
     water: FloatArray
-    port: FloatArray  # (7,), coefficients of a housing port with these; empty without one
+    port: Window  # the housing port with these, or none
 
 
 class Given(NamedTuple):
@@ -221,14 +222,14 @@ def image_and_all_gradients(
     x = times(r, column_of(light, 0))
     ahead[0], ahead[1], ahead[2] = x
     behind = work.behind_port
-    if state.port.size:
-        through_port(state.port, water[INDEX], *x, behind)
+    if state.port.kind != NO_PORT:
+        through_port(state.port, water[INDEX], x, behind)
         ahead[0], ahead[1], ahead[2] = column_of(behind, 0)
     u, v, both = image_and_gradients(state.lenses[given.lens_row[c]], ahead[0], ahead[1], ahead[2])
     for row in range(2):
         g = both[3 * row], both[3 * row + 1], both[3 * row + 2]
         by_index = 0.0
-        if state.port.size:
+        if state.port.kind != NO_PORT:
             # chain rule through the port: its own parameters first, then g by the direction before
             by_index = dot(g, column_of(behind, 4))
             out[row, SURFACE + PORT] = dot(g, column_of(behind, BY_PORT))

@@ -29,7 +29,7 @@ from pcfix.adjust.parameters import (
     usable_codes,
 )
 from pcfix.errors import GeometryError
-from pcfix.lens.imaging import lens_table
+from pcfix.lens.formulas import lens_table
 from pcfix.model import (
     BoolArray,
     Cameras,
@@ -41,7 +41,7 @@ from pcfix.model import (
     WaterRaster,
     WaterSurface,
 )
-from pcfix.port.light import coefficients as port_coefficients
+from pcfix.port.light import window_of
 from pcfix.port.shapes import DomePort, FlatPort, Port
 from pcfix.water.surface import build_field, build_tin
 
@@ -163,7 +163,7 @@ def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
     problem = Problem(block, unknowns, origin, given, lens_unknowns, names, values)
     state = State(
         centres, np.ascontiguousarray(cameras.rotations, np.float64), table, block.xyz - origin,
-        numbers, port_row(block.port),
+        numbers, window_of(block.port),
     )  # fmt: skip
     return problem, Solution(state, lenses, np.zeros(len(names)))
 
@@ -249,11 +249,6 @@ def port_of(block: Block, numbers: FloatArray) -> Port | None:
             x, y, z = numbers[PORT + 1 : PORT + 4].tolist()
             return replace(block.port, centre_m=(x, y, z))
     return None
-
-
-def port_row(port: Port | None) -> FloatArray:
-    """Return the coefficients of a port for kernels; none without a port."""
-    return np.zeros(0) if port is None else port_coefficients(port)
 
 
 def water_of(problem: Problem, state: State) -> WaterSurface | None:

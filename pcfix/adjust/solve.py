@@ -17,10 +17,11 @@ from scipy.spatial.transform import Rotation
 from pcfix.adjust.collinearity import State
 from pcfix.adjust.normal import SQUARES, UNDAMPED, Rule, normal_equations, point_steps, residuals
 from pcfix.adjust.parameters import INDEX, moved_lens, words_of
-from pcfix.adjust.problem import Problem, Solution, cost_at, port_of, port_row, prior_rows
+from pcfix.adjust.problem import Problem, Solution, cost_at, port_of, prior_rows
 from pcfix.errors import GeometryError, PcfixError
-from pcfix.lens.imaging import lens_table
+from pcfix.lens.formulas import lens_table
 from pcfix.model import FloatArray, Lens
+from pcfix.port.light import window_of
 from pcfix.running import current
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8
@@ -118,7 +119,7 @@ def moved_by(
         now,
         state=State(
             state.centres + poses[:, 3:], np.ascontiguousarray(rotations),
-            np.ascontiguousarray(table), state.xyz + points, water, port_row(port),
+            np.ascontiguousarray(table), state.xyz + points, water, window_of(port),
         ),
         lenses=lenses,
         shared=now.shared + shared,

@@ -22,7 +22,7 @@ from pcfix.adjust.block import some_cameras
 from pcfix.errors import GeometryError
 from pcfix.kernels import Span, device, in_tiles, kernel, most_between
 from pcfix.lens.algebra import dot, minus, plus, plus_square, row_of, scaled, solved, times, vector
-from pcfix.lens.imaging import image_in_world, image_of
+from pcfix.lens.imaging import image_and_slopes, image_of
 from pcfix.model import BoolArray, Cameras, Correction, FloatArray, IntArray, Outcome, Views
 from pcfix.refract.batch import Optics, optics_of
 from pcfix.refract.choice import views_in_frame
@@ -102,7 +102,7 @@ def _intersect(
             c = who[j]
             ahead = minus(plus(point, moved), row_of(centres, c))
             lens = cameras.lenses[cameras.row[c]]
-            u, v, by_u, by_v = image_in_world(lens, cameras.rotations[c], ahead)
+            u, v, by_u, by_v = image_and_slopes(lens, None, cameras.rotations[c], ahead)
             m, b = plus_square(m, by_u), plus(b, scaled(image[j, 0] - u, by_u))
             m, b = plus_square(m, by_v), plus(b, scaled(image[j, 1] - v, by_v))
         # nearly parallel rays do not fix the point

@@ -105,9 +105,6 @@ class Tiles:
     low: FloatArray  # (t, 3), bounding box of the points of each tile
     high: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.start) - 1
-
     def pieces(self, size: int) -> Iterator[slice]:
         """Yield all places, at most `size` at a time and of one tile."""
         for first, last in pairwise(self.start):

@@ -79,22 +79,25 @@ def flag_neighbours(name: str, cloud: Cloud, rules: CleanRules) -> dict[str, flo
 
     Each reports the number of points of each piece that it has done; see `pcfix.running.Run`.
     """
-    nearest = max(LEAST_NEIGHBOURS, rules.nearest)
-    on_bed = rules.bed_neighbours if rules.below_or_floating and cloud.submerged.any() else 0
-    for rows, least, what, remedy in (
-        (cloud.used, nearest, "points that are neither withheld nor noise",
-         "Use fewer neighbours, or skip the cleaning."),
-        (cloud.submerged, on_bed, "submerged points",
-         "Use fewer bed-neighbours, or switch off the tests below and floating."),
-    ):  # fmt: skip
-        count = int(rows.sum())
-        if least and count < least + 1:
-            sentence = f"has {count:,} {what}, too few for a neighbourhood of {least}. {remedy}"
-            raise bad_file(name, "cloud.too_few_points", sentence, points=count, least=least + 1)
+    on_bed = rules.below_or_floating and cloud.submerged.any()
+    what = "points that are neither withheld nor noise"
+    remedy = "Use fewer neighbours, or skip the cleaning."
+    _require(name, cloud.used, max(LEAST_NEIGHBOURS, rules.nearest), what, remedy)
+    if on_bed:
+        remedy = "Use fewer bed-neighbours, or switch off the tests below and floating."
+        _require(name, cloud.submerged, rules.bed_neighbours, "submerged points", remedy)
     distances = flag_sparse(cloud, rules) if rules.nearest else {}
     if on_bed:
         flag_off_bed(cloud, rules)
     return distances
+
+
+def _require(name: str, rows: BoolArray, least: int, what: str, remedy: str) -> None:
+    """Raise InputError if there are no more points than neighbours are needed."""
+    count = int(rows.sum())
+    if count <= least:
+        sentence = f"has {count:,} {what}, too few for a neighbourhood of {least}. {remedy}"
+        raise bad_file(name, "cloud.too_few_points", sentence, points=count, least=least + 1)
 
 
 def flag_sparse(cloud: Cloud, rules: CleanRules) -> dict[str, float]:

@@ -136,7 +136,7 @@ def compare(cloud: str, reference: str, /, *, options: CompareOptions, quiet: bo
     from pcfix.report.comparison import comparison_text
 
     result = pcfix.compare_clouds(cloud, reference, options=options)
-    say(comparison_text(result), quiet)
+    say(comparison_text(result.as_dict()), quiet)
 
 
 @command(

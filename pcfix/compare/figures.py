@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -69,16 +70,6 @@ def _csv(rows: Iterable[Iterable[Any]]) -> str:
     return "".join(",".join(map(field, row)) + "\n" for row in rows)
 
 
-BINS, TAIL_PERCENT = 64, 0.5
-"""Of the histogram of vertical errors: its classes, and what it leaves out on either side."""
-POINTS_PER_SQUARE = 3.0
-"""Of the squares by which the spacing of a cloud is measured, on average."""
-SPARSER = 2.0
-"""Ratio of the spacings of two clouds from which one is called sparse."""
-MIN_REACH_M, REACH_FACTOR = 1.0, 1.5
-"""M3C2 searches along the normal as far as 1.5 times the 99th percentile of the differences."""
-
-
 def figures_of(
     match: Match, lines: Sequence[SectionLine], others: Mapping[str, Match]
 ) -> Comparison:
@@ -91,24 +82,19 @@ def figures_of(
     c2c, c2c_from_reference = found = c2c_of(match)
     notes = sparse_notes(match, *found)
     pairs = vertical = residuals = None
-    by_depth: dict[str, Any] = {
-        "bed": None, "land": None,  # vertical errors of submerged places and of the others
-        "depth": None,  # against reference depth, if water is known
-        "depth_bins": [],
-        "tvu": None,  # of all submerged places
-    }  # fmt: skip
+    by_depth: dict[str, Any] = {**dict.fromkeys(("bed", "land", "depth", "tvu")), "depth_bins": []}
     if not rules.c2c_only:
         pairs = _pairs(match)
-        vertical = both(lambda p: distribution_of(p.error_m, BINS, (), TAIL_PERCENT), pairs)
+        # 64 classes; half a percent on either side is left out
+        vertical = both(lambda p: distribution_of(p.error_m, 64, (), 0.5), pairs)
         by_depth |= _by_depth(match, pairs, notes)
         if reference.sparse:
             after = pairs.after
             residuals = np.column_stack([after.xy, after.reference_m, after.error_m])
     also = []
     for name, other in others.items():
-        measures = zip(("c2c", "c2c_from_reference"), c2c_of(other), strict=True)
-        distances = {key: None if one is None else one.after for key, one in measures}
-        also.append(Figures(name=name, cloud=other.survey.name, **distances))
+        to, back = (pair and pair.after for pair in c2c_of(other))
+        also.append(Figures(name=name, cloud=other.survey.name, c2c=to, c2c_from_reference=back))
     counts = Figures(
         cloud=len(survey) + survey.excluded,
         cloud_excluded=survey.excluded,
@@ -131,6 +117,8 @@ def figures_of(
         c2c_from_reference=c2c_from_reference,
         also=also,  # further clouds
         vertical=vertical,  # signed, along the vertical
+        # if water is known: vertical errors of submerged places (bed), of the others (land), and by
+        # depth; depth against reference depth; and the uncertainty of all submerged places (tvu)
         **by_depth,
         m3c2=_m3c2(match, pairs) if rules.m3c2 else None,
         sections=_sections(match, lines, others),
@@ -175,12 +163,12 @@ def sparse_notes(match: Match, to: Figures | None, back: Figures | None) -> list
         return []
     spacings = {}
     for name, xyz in ("reference", match.reference.xyz), ("cloud", match.asked.xyz):
-        side = POINTS_PER_SQUARE**0.5 * mean_spacing_m(xyz)
+        side = 3.0**0.5 * mean_spacing_m(xyz)  # of squares with three points, on average
         spacings[name] = spacing_m(xyz, max(side, 1e-9))
     notes = []
     for pair, sparse, dense in zip((to, back), spacings, reversed(spacings), strict=True):
         spacing, times = spacings[sparse], spacings[sparse] / max(spacings[dense], 1e-9)
-        if pair is None or times < SPARSER or spacing < (mean := pair.after.statistics.mean_m):
+        if pair is None or times < 2.0 or spacing < (mean := pair.after.statistics.mean_m):
             continue
         remedy = f"Give --direction {'from' if sparse == 'reference' else 'to'}-reference."
         if match.reference.raster:
@@ -199,10 +187,7 @@ def _pairs(match: Match) -> Figures:
     name = match.survey.name if sparse else match.reference.name
     count = len(match.cloud if sparse else match.reference.xyz)
     if count < k:
-        sentence = (
-            f"{name}: {count} points are too few for planes through {k} neighbours. Give more"
-            " points (at least 6, with --neighbours 6)."
-        )
+        sentence = f"{name}: {count} points are too few for {k} neighbours. Give more points."
         code = f"{'cloud' if sparse else 'reference'}.too_few_points"
         raise GeometryError(code, sentence, path=name, points=count, least=k)
 
@@ -216,7 +201,7 @@ def _pairs(match: Match) -> Figures:
 
 
 def _by_depth(match: Match, pairs: Figures, notes: list[PcfixWarning]) -> dict[str, Any]:
-    """Return the figures of submerged places, and of the others, by the names of `Comparison`."""
+    """Return the figures of submerged places and of the others by name; none without water."""
     after, rules = pairs.after, match.settings
     surface = match.water_at(after.xy)
     if surface is None:
@@ -250,11 +235,12 @@ def _by_depth(match: Match, pairs: Figures, notes: list[PcfixWarning]) -> dict[s
 
 
 def _m3c2(match: Match, pairs: Figures | None) -> Figures:
+    """Return M3C2 distances, along normals as far as 1.5 times nearly all of the differences."""
     if pairs is None:
         far = nearest_distance(*match.facing(match.cloud.xyz))
     else:
         far = mapped(np.abs, (pairs.before or pairs.after).error_m)
-    reach = max(MIN_REACH_M, REACH_FACTOR * float(np.percentile(far, 99)))
+    reach = max(1.0, 1.5 * float(np.percentile(far, 99)))
     return both(lambda xyz: m3c2_distances(xyz, match.reference.xyz, reach), match.cloud)
 
 
@@ -277,9 +263,6 @@ def _sections(
 
 
 # Cross-sections
-
-STATIONS = 200
-"""Maximum number of stations; they are at least a quarter of the corridor's width apart."""
 
 
 class SectionLine(NamedTuple):
@@ -317,13 +300,10 @@ class Section:
 
 def parse_line(text: str) -> SectionLine:
     """Parse ``x1,y1,x2,y2``; SettingError ``option.section`` if that is no line."""
-    try:
-        x1, y1, x2, y2 = (float(part) for part in text.split(","))
-        line = SectionLine(x1, y1, x2, y2)
+    with suppress(ValueError, TypeError):  # no numbers, or not four
+        line = SectionLine(*map(float, text.split(",")))
         if 0.0 < line.length_m < np.inf:
             return line
-    except ValueError:
-        pass
     sentence = "is not x1,y1,x2,y2, two different points. Give them in the CRS of the cloud."
     raise SettingError("option.section", f"section '{text}' {sentence}", value=text)
 
@@ -334,7 +314,7 @@ def section_along(line: SectionLine, layers: dict[str, FloatArray], half_width_m
     Each is the median of the points within a positive `half_width_m` across the line, and within
     that or the distance of the stations along it.
     """
-    step = max(line.length_m / STATIONS, 0.5 * half_width_m)
+    step = max(line.length_m / 200, 0.5 * half_width_m)  # 201 stations at most
     stations = np.linspace(0.0, line.length_m, max(round(line.length_m / step), 1) + 1)
     window, heights = max(step, half_width_m), {}
     east, north = (line.x2 - line.x1) / line.length_m, (line.y2 - line.y1) / line.length_m

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -18,15 +16,15 @@ from pcfix.model import FloatArray, IntArray
 from pcfix.sums import Figures
 
 MAX_CORE_POINTS = 100_000
-SPACING_SAMPLE = 10_000
-NORMAL_SPACINGS, CYLINDER_SPACINGS = 6.0, 3.0
-"""Radii in point spacings of the sparser cloud: a cylinder holds about 28 points."""
 
 
 def load_py4dgeo() -> Any:
-    """Import py4dgeo; InputError ``library.missing`` if it is not installed."""
-    with _silence():
-        return optional_library("py4dgeo", "m3c2", "M3C2")
+    """Import py4dgeo; InputError ``library.missing`` if it is not installed.
+
+    It no longer writes its progress to stdout and to a log file in the working folder.
+    """
+    logging.getLogger("py4dgeo").disabled = True
+    return optional_library("py4dgeo", "m3c2", "M3C2")
 
 
 def sample_rows(count: int, most: int) -> IntArray:
@@ -46,35 +44,30 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
     py4dgeo = load_py4dgeo()
     spacing = 1e-3  # median distance to the nearest other point, of the sparser cloud
     for one in xyz, reference:
-        sample = one[sample_rows(len(one), SPACING_SAMPLE)]
+        sample = one[sample_rows(len(one), 10_000)]
         near, _ = Neighbours(make_tiles(one), 3).nearest(sample, min(2, len(one)))
         spacing = max(spacing, float(np.median(near[:, -1])))
-    normal, cylinder = NORMAL_SPACINGS * spacing, CYLINDER_SPACINGS * spacing
+    normal, cylinder = 6.0 * spacing, 3.0 * spacing  # radii; a cylinder holds about 28 points
     # py4dgeo cuts a cylinder into lengths of its radius: an odd number of them, as a core point on
     # the border of two would count twice, once or not at all
     pieces = 2 * math.ceil((max_distance_m / cylinder - 1.0) / 2.0) + 1
     max_distance_m = (max(pieces, 1) - 1e-6) * cylinder
     core = xyz[sample_rows(len(xyz), MAX_CORE_POINTS)]
     origin = np.floor(reference.min(axis=0))
-    with _silence():
-        cloud = py4dgeo.Epoch(xyz - origin)
-        distance, uncertainty = py4dgeo.M3C2(
-            epochs=(py4dgeo.Epoch(reference - origin), cloud),
-            corepoints=core - origin,
-            normal_radii=[normal],
-            cyl_radius=cylinder,
-            max_distance=max_distance_m,
-            cloud_for_normals=cloud,
-        ).run()
+    cloud = py4dgeo.Epoch(xyz - origin)
+    distance, uncertainty = py4dgeo.M3C2(
+        epochs=(py4dgeo.Epoch(reference - origin), cloud),
+        corepoints=core - origin,
+        normal_radii=[normal],
+        cyl_radius=cylinder,
+        max_distance=max_distance_m,
+        cloud_for_normals=cloud,
+    ).run()
     detection = uncertainty["lodetection"]
     known = np.isfinite(distance)
     if not known.any():
-        sentence = (
-            f"M3C2: no cylinder of {cylinder:.3g} m radius contains points of both clouds within"
-            f" {max_distance_m:.3g} m. Check that they overlap."
-        )
-        values = {"radius_m": cylinder, "max_distance_m": max_distance_m}
-        raise GeometryError("reference.no_overlap", sentence, **values)
+        sentence = f"M3C2: no points within {max_distance_m:.3g} m. Check that the clouds overlap."
+        raise GeometryError("reference.no_overlap", sentence, max_distance_m=max_distance_m)
     distance, detection = distance[known], detection[known]
     certain = np.isfinite(detection)
     beyond = np.abs(distance[certain]) > detection[certain]
@@ -88,14 +81,3 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
         cylinder_radius_m=cylinder,
         max_distance_m=max_distance_m,
     )
-
-
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Keep py4dgeo's progress from stdout and from a log file in the working folder."""
-    logger = logging.getLogger("py4dgeo")
-    before, logger.disabled = logger.disabled, True
-    try:
-        yield
-    finally:
-        logger.disabled = before

@@ -14,8 +14,6 @@ from pcfix.running import blocks, distinct, grouped, mapped
 from pcfix.sums import Figures
 
 PERCENTILES = (5, 25, 50, 75, 95)
-NMAD_FACTOR = 1.4826
-"""The median absolute deviation times this is the standard deviation of a normal sample."""
 MAX_BINS = 10_000
 
 
@@ -33,7 +31,7 @@ def statistics_of(values: FloatArray) -> Figures:
         sd_m=float(values.std()),
         # in one thread, unlike np.dot
         rmse_m=math.sqrt(np.einsum("i,i", values, values) / len(values)),
-        nmad_m=float(NMAD_FACTOR * np.median(np.abs(values - median))),
+        nmad_m=float(1.4826 * np.median(np.abs(values - median))),  # the sd of a normal sample
         median_m=median,
         min_m=marks[-2],
         max_m=marks[-1],

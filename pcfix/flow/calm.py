@@ -24,23 +24,13 @@ from pcfix.io.rasters import new_raster, write_bands
 from pcfix.model import FloatArray, Lens, WaterRaster
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import CalmOptions
-from pcfix.photos.calm import LEAST_CORNERS, corners_in, covered, median_of, register, warped
+from pcfix.photos.calm import corners_in, covered, median_of, register, warped
 from pcfix.photos.mapping import Photo
 from pcfix.photos.waves import Nodes, View, displacements, fit_waves, nodes_of, slopes_of
 from pcfix.running import release, threads
 from pcfix.sums import Figures
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
-
-DOWN = np.diag([1.0, -1.0, -1.0])
-FAR_PX = 1e5
-"""Focal length of a camera with nearly parallel rays, in pixels per pixel of the image."""
-PASSES = 2
-"""Over the surface: the height of the piercing points follows from the first."""
-SORTED_BYTES = 200_000_000
-"""Of the frames of a strip of rows at once, in single precision."""
-LEAST_EXPLAINED = 0.5
-"""Share of the slopes; if waves explain less, there is a warning."""
 
 
 def calm_frames(
@@ -104,7 +94,7 @@ def calm_frames(
             water.folder = str(folder)
             with temporary_output(folder, is_folder=True) as draft:
                 _write_waters(draft, found.names, view.level_m, nodes.lattice, waters, crs)
-            if water.explained < LEAST_EXPLAINED:
+            if water.explained < 0.5:
                 words = (
                     f"Waves explain only {100 * water.explained:.0f} % of the slopes (a current,"
                     " glints, a wrong interval or depth). Do not rely on the surfaces."
@@ -141,10 +131,7 @@ def _registered(frames: Burst, images: Iterable[Any]) -> tuple[FloatArray, Float
     lost = np.flatnonzero(~np.isfinite(homographies).all(axis=(1, 2)))
     if len(lost):
         names = [frames.names[row] for row in lost]
-        sentence = (
-            f"{frames.path}: {len(lost)} frames share fewer than {LEAST_CORNERS} corners with the"
-            f" first, such as {names[0]}. Remove them, or start with another frame."
-        )
+        sentence = f"{', '.join(names[:3])}: do not match the first frame. Omit these frames."
         raise InputError("frames.no_overlap", sentence, frames=names)
     return homographies, scatter
 
@@ -163,7 +150,7 @@ def _median(
     shape = stack.shape[1:3]
     median = np.empty(stack.shape[1:], stack.dtype)
     spread = np.empty(shape, np.float32)
-    at_once = max(1, SORTED_BYTES // (4 * stack[:, 0].size))
+    at_once = max(1, 50_000_000 // stack[:, 0].size)  # rows whose values take 200 MB to sort
     for top in range(0, shape[0], at_once):
         bottom = min(top + at_once, shape[0])
         known = np.stack([covered(one, shape, top, bottom) for one in homographies])
@@ -178,15 +165,16 @@ def _view(given: CalmOptions, frames: Burst) -> tuple[View, str | None]:
     index, level = index_of(given.index, given.index_formula)[0], given.level
     size = frames.columns, frames.rows
     if given.gsd is not None:
-        lens = Lens(FAR_PX * max(size), *size, 0.5 * size[0], 0.5 * size[1])
+        # a camera so far away that its rays are nearly parallel
+        lens = Lens(1e5 * max(size), *size, 0.5 * size[0], 0.5 * size[1])
         centre = given.gsd * np.array([0.5 * size[0], -0.5 * size[1], lens.focal])
         centre[2] += level
-        return View(Photo("gsd", centre, DOWN, lens), level, index, bed), crs
+        return View(Photo("gsd", centre, np.diag([1.0, -1.0, -1.0]), lens), level, index, bed), crs
     cameras, _ = Inputs(
         cameras=given.cameras, sensor=given.sensor, angles=given.angles, water=level,
         cameras_crs=given.cameras_crs, cameras_offset=given.cameras_offset,
     ).block(crs)  # fmt: skip
-    first = frames.names[0] if frames.photographs else frames.path.stem
+    first = frames.names[0]
     rows = [row for row, label in enumerate(cameras.labels) if Path(label).stem == first]
     rows = [0] if len(cameras.labels) == 1 else rows
     if len(rows) != 1 or cameras.rotations is None or cameras.lenses is None:
@@ -198,8 +186,7 @@ def _view(given: CalmOptions, frames: Burst) -> tuple[View, str | None]:
 
 def _bed(given: CalmOptions) -> tuple[Callable[[FloatArray], FloatArray], str | None]:
     """Return the height of the true bed by place, and the CRS of its raster."""
-    level = given.level
-    depth = np.nan
+    level, depth = given.level, np.nan
     with suppress(ValueError):
         depth = float(given.depth)
     if np.isfinite(depth):
@@ -224,7 +211,7 @@ def _water(
     times, seen = np.arange(len(shifts), dtype=np.float64) * interval_s, nodes.seen
     depth = float(np.nanmedian(view.level_m - view.bed(nodes.xy[seen])))
     heights = np.full(shifts.shape[:2], view.level_m)
-    for _ in range(PASSES):
+    for _ in range(2):  # the heights of the piercing points follow from the first pass
         both = zip(heights, shifts, strict=True)
         slope = np.stack([slopes_of(view, nodes.xy, *one) for one in both])
         weight = np.where(np.isfinite(slope.sum(axis=2)), weights, 0.0)

@@ -66,17 +66,16 @@ def clean_file(
 
 def find_noise(
     options: CleanOptions, view: CloudView, *, has_rays: bool = True
-) -> tuple[BoolArray, Figures]:
+) -> tuple[BoolArray, dict[str, Any]]:
     """Run the tests on a whole cloud of n points.
 
     `has_rays` is False if it was corrected without cameras. Returns which points are noise, shape
-    (n,), and a summary without files and time.
+    (n,), and the summary without files and time.
     """
-    rules, not_run = options.part(CleanRules), list[str]()
+    rules, not_run, water = options.part(CleanRules), list[str](), None
     if rules.weak and not has_rays:
         rules = replace(rules, weak=False)
         not_run.append("weak intersections: the cloud was corrected without cameras")
-    water = None
     if options.water is not None:
         water = find_surface(options.water, WaterOptions(), view).surface
     n, has = view.points, {one for one in WEAK if {"RayCount", one} <= set(view.names)}
@@ -105,25 +104,22 @@ def find_noise(
     distance_m = flag_neighbours(view.name, cloud, rules)
     noise = cloud.reasons != 0
     count = int(noise.sum())
-    return noise, Figures(
-        input="",
-        output="",
-        pcfix=__version__,
-        points=n,
-        set_aside=n - tested,  # withheld or noise before: not tested, not neighbours
-        submerged=submerged,  # tested against the bed
-        noise=count,
-        reasons={
+    return noise, {
+        "pcfix": __version__,
+        "points": n,
+        "set_aside": n - tested,  # withheld or noise before: not tested, not neighbours
+        "submerged": submerged,  # tested against the bed
+        "noise": count,
+        "reasons": {
             str(reason.name).lower(): int(np.count_nonzero(cloud.reasons & np.uint8(reason)))
             for reason in Reason
         },
-        dropped=count if options.drop else 0,
-        neighbour_distance_m=distance_m,  # mean, sd and limit; see `flag_sparse`
-        not_run=not_run,  # tests that could not be run, and why
-        water=None if water is None else str(water),
-        settings=asdict(rules),
-        seconds=0.0,
-    )
+        "dropped": count if options.drop else 0,
+        "neighbour_distance_m": distance_m,  # mean, sd and limit; see `flag_sparse`
+        "not_run": not_run,  # tests that could not be run, and why
+        "water": None if water is None else str(water),
+        "settings": asdict(rules),
+    }
 
 
 class CleanPlan(NamedTuple):
@@ -131,14 +127,13 @@ class CleanPlan(NamedTuple):
 
     noise: BoolArray  # (n,)
     drop: bool
-    summary: Figures
+    found: dict[str, Any]  # see `find_noise`
 
 
 def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask) -> CleanPlan:
     """Find the noise of a whole cloud; large arrays are on the disk of the target."""
-    cloud = task.source
-    view, ours = view_of(cloud, options.jobs, in_metres=options.water is not None), None
-    with open_cloud(cloud) as source, suppress(ValueError):  # a damaged record is reported later
+    view, ours = view_of(task.source, options.jobs, in_metres=options.water is not None), None
+    with open_cloud(task.source) as source, suppress(ValueError):  # a damaged record counts as none
         ours = own_settings(source.vlrs)
     has_rays = not (isinstance(ours, dict) and ours.get("cameras") == 0)
     passed = 0.0
@@ -149,27 +144,25 @@ def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask)
         if progress is not None:
             progress(int(passed) // _PASSES, view.points)
 
-    near = task.target.absolute()
-    if not near.parent.is_dir():  # the folder of many files is made later
-        near = next(one for one in near.parents if one.is_dir()) / near.name
-    with scratch_arrays(near), running(report=count):
-        noise, summary = find_noise(options, view, has_rays=has_rays)
+    # the folder of many files is made later
+    disk = next(one for one in task.target.absolute().parents if one.is_dir())
+    with scratch_arrays(disk / task.target.name), running(report=count):
+        noise, found = find_noise(options, view, has_rays=has_rays)
     if options.drop and noise.all():
         sentence = "every point is noise by these thresholds. Use wider ones, or omit --drop."
-        raise bad_file(cloud, "cloud.all_noise", sentence, points=view.points)
-    return CleanPlan(noise, options.drop, summary)
+        raise bad_file(task.source, "cloud.all_noise", sentence, points=view.points)
+    return CleanPlan(noise, options.drop, found)
 
 
 def _finish(plan: CleanPlan, task: FileTask, count: int) -> Figures:
     """Return the summary of a cloud."""
-    own = {"input": str(task.source), "output": str(task.target), "seconds": task.seconds}
-    return Figures(**vars(plan.summary) | own)
+    files = {"input": str(task.source), "output": str(task.target)}
+    return Figures(**files, **plan.found, seconds=task.seconds)
 
 
 def _cleaning(plan: CleanPlan, source: LasSource) -> FileWork:
     """Return the cleaning of one file: its header with a record of it, and each chunk."""
-    found = plan.summary.as_dict()
-    content = {name: found[name] for name in ("pcfix", "settings", "water", "reasons")}
+    content = {name: plan.found[name] for name in ("pcfix", "settings", "water", "reasons")}
     header = output_header(source, "cleaning", {**content, "drop": plan.drop})
 
     def compute(points: Chunk, row: int) -> tuple[BoolArray, int]:

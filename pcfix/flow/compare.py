@@ -6,7 +6,7 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pcfix.compare.figures import Comparison, bins_table, figures_of, parse_line
 from pcfix.compare.m3c2 import load_py4dgeo
@@ -14,14 +14,11 @@ from pcfix.compare.match import Match, SurveyCloud, match
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
-from pcfix.io.files import all_or_none, check_output, scratch_arrays, write_text
+from pcfix.io.files import all_or_none, check_output, scratch_arrays, write_bytes, write_text
 from pcfix.io.tiles import Clouds, band_of, cloud_of, inputs_of
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CompareOptions, CompareRules
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 DEPTHS = "depth_bins.csv"
 
@@ -85,15 +82,15 @@ def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
     """Raise an error for outputs that cannot be written, before anything is computed."""
     if given.out_dir is not None:
         folder = Path(given.out_dir)
-        if folder.exists() and not folder.is_dir():
-            sentence = f"{folder} is a file. Give a folder."
-            raise SettingError("output.no_folder", sentence, path=folder)
-        if not folder.exists():
-            check_output(folder, overwrite=False)
         if folder.is_dir():
             ours = [*folder.glob("section_*.csv"), folder / "compare.json", folder / DEPTHS]
             for path in ours:
                 check_output(path, overwrite=given.overwrite, inputs=inputs)
+        elif folder.exists():
+            sentence = f"{folder} is a file. Give a folder."
+            raise SettingError("output.no_folder", sentence, path=folder)
+        else:
+            check_output(folder, overwrite=False)
     check_summary(given, inputs)
 
 
@@ -111,12 +108,13 @@ def _write(result: Comparison, given: CompareOptions) -> None:
             for name, content in files.items():
                 write_text(folder / name, content, overwrite=given.overwrite)
 
-        def figure() -> Figure:
-            from pcfix.report.comparison import c2c_figure
+        if given.plot is not None:
+            from pcfix.report.comparison import c2c_figure  # matplotlib is slow to import
+            from pcfix.report.page import png_of
 
-            return c2c_figure(result.as_dict())
-
-        write_summary(given, result.as_dict(), figure)
+            plot = png_of(c2c_figure(result.as_dict()))
+            write_bytes(given.plot, plot, overwrite=given.overwrite)
+        write_summary(given, result.as_dict())
     if folder is not None:
         for path in folder.glob("section_*.csv"):
             if path.name not in files:

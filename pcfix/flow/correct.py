@@ -1,13 +1,19 @@
 """Correct a LAS or LAZ cloud, or arrays, for refraction: two doors to one calculation.
 
-A plan is made for the whole cloud (`pcfix.flow.planning`), each chunk is corrected by it
-(`pcfix.flow.correction`), and the statistics are checked and summarized.
+The story of ``pcfix correct``, in the order of this file:
+
+1. Read the inputs, and make a plan for the whole cloud: `read_inputs` and `plan_correction`.
+2. Correct chunk by chunk by the plan, and write each: `_correcting`. Chunks leave statistics.
+3. Check by the statistics of all points that cloud, water and cameras belong together, before the
+   output appears: `_check_inputs` and `_check_outcomes`, then `_check_fit`, which only warns.
+4. Summarize: `finish`.
+
+Arrays take the same steps in `correct_points`, without files and summary.
 """
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import fields
 from itertools import compress
 from typing import Any
 
@@ -17,7 +23,7 @@ import numpy.typing as npt
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, coded
 from pcfix.flow.correction import CloudTally, Plan, correct_chunk
 from pcfix.flow.diagnosis import diagnose_in_passing, quick_ties
-from pcfix.flow.inputs import CameraInputs, Inputs, paths_in, transfer_between
+from pcfix.flow.inputs import Inputs, paths_in, read_blocks
 from pcfix.flow.planning import plan_correction, plan_of, read_inputs
 from pcfix.flow.plausibility import CloudSample, Plausible, likely_mistake, plausible
 from pcfix.flow.raster import check_heights
@@ -27,12 +33,10 @@ from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header
 from pcfix.io.tiles import Clouds, is_raster
-from pcfix.io.views import ViewReport
 from pcfix.label.labelling import Labelling
-from pcfix.lens.frames import count_outside_frames
+from pcfix.lens.frames import count_visible_cameras
 from pcfix.model import (
     BATHYMETRIC_POINT,
-    NO_CAMERAS,
     Cameras,
     Correction,
     FloatArray,
@@ -131,39 +135,32 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
 
     Warns of what is uncertain.
     """
-    options, figures = plan.options, tally.figures
-    water_notes = _check_counts(plan, tally, tally.views)
-    counts, uncertainty = figures.as_dict(), figures.uncertainty(plan.reconstruction)
-    tested, poses, absorbed = None, None, None
-    if plan.inputs.port is None:
+    view_notes = [] if tally.views is None else tally.views.notes()
+    for note in view_notes:
+        warnings.warn(note, stacklevel=2)
+    water_notes = _check_inputs(plan, tally)
+    _check_outcomes(plan, tally.figures)
+    fit, poses, absorbed = None, None, None
+    if plan.inputs.port is None:  # neither has a model of a port
         ties = quick_ties(plan.inputs, plan.view.crs) if len(plan.cameras) else None
-        tested = check_fit(plan, tally, ties)
+        fit = _check_fit(plan, tally, ties)
         poses, absorbed = diagnose_in_passing(plan, ties)
-        water, moved = str(plan.found.surface), plan.survey.level_offset_m
-        if moved is not None:
-            times = f"{moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
-            water = f"{water}, {times}"
-        by_poses = plan.survey.learned.poses
-        if uncertainty is not None and by_poses is not None:
-            uncertainty["poses_m"] = round(by_poses.middle_m, 4)
-    else:  # no depths, and no orders by depth
-        counts["depth_m"], uncertainty = {}, None
-        water = f"all around, seen through a {plan.inputs.port}"
-    unused = list(compress(plan.cameras.labels, np.logical_not(figures.camera_used)))
-    reconstruction = plan.reconstruction
     notes = [
         *plan.input_notes,
-        *([] if tally.views is None else tally.views.notes()),
-        *(() if tested is None else tested.problems),
+        *view_notes,
+        *([] if fit is None else fit.problems),
         *plan.notes,
         *coded("water.extent", water_notes),
         *([] if absorbed is None else [absorbed]),
     ]
+    figures, reconstruction = tally.figures, plan.reconstruction
+    because = "" if reconstruction is None else reconstruction["because"]
+    unused = list(compress(plan.cameras.labels, ~figures.camera_used))
     return Summary(
         input=str(task.source),
         output=str(task.target),
         pcfix=__version__,
-        **counts,
+        **_figures(plan, figures),
         cameras=len(plan.cameras),
         cameras_used=len(plan.cameras) - len(unused),
         cameras_unused=unused,  # labels of those without corrected points
@@ -171,96 +168,101 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         views=None if tally.views is None else vars(tally.views),
         warnings=[one.as_dict() for one in notes],
         labelling=plan.labelling.report(tally.labels),
-        settings={**options.part(ScienceOptions).as_dict(), **plan.settings},
-        water=water,
+        settings={**plan.options.part(ScienceOptions).as_dict(), **plan.settings},
         water_fit=plan.found.as_dict(),
-        uncertainty=uncertainty,
         transfer=None if tally.transfer is None else tally.transfer.as_dict(),
         reconstruction=reconstruction,  # its type, and why
         # other notes on the cloud, also in `warnings`
-        notes=[
-            one
-            for one in map(str, plan.notes)
-            if reconstruction is None or one not in reconstruction["because"]
-        ],
+        notes=[one for one in map(str, plan.notes) if one not in because],
         poses=poses,  # whether they have absorbed the refraction
-        fit=None if tested is None else tested.as_dict(),
+        fit=None if fit is None else fit.as_dict(),
     )
 
 
-def _check_counts(plan: Plan, tally: CloudTally, report: ViewReport | None) -> list[str]:
-    """Refuse a cloud of which nothing can be corrected; return notes on the extent of the water."""
-    # From the general to the particular: a view list of another cloud, or a mask elsewhere, would
-    # also leave points without cameras.
-    name, figures = plan.view.name, tally.figures
-    if report is not None:
-        for note in report.notes():
-            warnings.warn(note, stacklevel=2)
+def _figures(plan: Plan, figures: Tally) -> dict[str, Any]:
+    """Return counts, depths, water and uncertainty, by their names in the summary."""
+    found = figures.as_dict()
+    if plan.inputs.port is not None:  # no depths, and no orders by depth
+        water = f"all around, seen through a {plan.inputs.port}"
+        return found | {"depth_m": {}, "water": water, "uncertainty": None}
+    water, moved = str(plan.found.surface), plan.survey.level_offset_m
+    if moved is not None:
+        water += f", {moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
+    uncertainty, by_poses = figures.uncertainty(plan.reconstruction), plan.survey.learned.poses
+    if uncertainty is not None and by_poses is not None:
+        uncertainty["poses_m"] = round(by_poses.middle_m, 4)
+    return found | {"water": water, "uncertainty": uncertainty}
+
+
+def _check_inputs(plan: Plan, tally: CloudTally) -> list[str]:
+    """Refuse a water, mask or original model of another place; return notes on the water's extent.
+
+    From the general to the particular: a mask elsewhere would also leave points without cameras.
+    """
+    name, water = plan.view.name, plan.found.surface
     if tally.transfer is not None:
         tally.transfer.check(name)
     plan.labelling.check(name, tally.labels)
-    water_notes, water = list[str](), plan.found.surface
-    if tally.water is not None:
-        check_submerged(tally.water.submerged, name, water, tally.water.heights())
-        if isinstance(water, WaterDimension):
-            refuse_under_water(plan.cameras, figures.lowest_water_m, str(water))
-        water_notes = tally.water.check_reach(name, water, deep=plan.options.deep)
-    elif figures.submerged == 0:
-        raise GeometryError(
-            "cloud.none_submerged", f"{name}: no point is left to correct. Check the mask."
-        )
+    if tally.water is None:  # a port
+        if tally.figures.submerged == 0:
+            words = f"{name}: no point is left to correct. Check the mask."
+            raise GeometryError("cloud.none_submerged", words)
+        return []
+    check_submerged(tally.water.submerged, name, water, tally.water.heights())
+    if isinstance(water, WaterDimension):
+        refuse_under_water(plan.cameras, tally.figures.lowest_water_m, str(water))
+    return tally.water.check_reach(name, water, deep=plan.options.deep)
+
+
+def _check_outcomes(plan: Plan, figures: Tally) -> None:
+    """Refuse a cloud of which no submerged point can be corrected."""
+    name, limit, submerged = plan.view.name, plan.survey.limit_deg, figures.submerged
     flat = int(figures.outcomes[Outcome.FLAT_RAYS])
-    if figures.outcomes[Outcome.NO_CAMERA] + flat == figures.submerged:
-        raise GeometryError(
-            "cameras.max_angle" if flat else "cameras.no_overlap",
-            f"{name}: {_no_visible_camera(plan, figures, flat)}",
-            submerged=figures.submerged,
-            flat=flat,
-        )
-    if not figures.corrected and figures.submerged:
+    if figures.corrected or not submerged:
+        return
+    if figures.outcomes[Outcome.NO_CAMERA] + flat < submerged:
         reasons = {why: n for why, n in figures.uncorrected().items() if n}
         listed = "; ".join(f"{n:,}: {why}" for why, n in reasons.items())
         raise GeometryError(
             "cameras.none_corrected",
-            f"{name}: none of {figures.submerged:,} submerged points can be corrected ({listed})."
+            f"{name}: none of {submerged:,} submerged points can be corrected ({listed})."
             " Check that cameras and cloud belong together.",
             reasons=reasons,
         )
-    return water_notes
-
-
-def _no_visible_camera(plan: Plan, figures: Tally, flat: int) -> str:
-    """Return the sentence for a cloud of which no camera sees a submerged point."""
-    limit = plan.survey.limit_deg
     if flat:
-        return (
-            f"no submerged point has two rays within {limit or 90.0:g} deg of the surface"
-            f" normal; {flat:,} points have rays at larger angles. Increase --max-angle."
+        raise GeometryError(
+            "cameras.max_angle",
+            f"{name}: no submerged point has two rays within {limit or 90.0:g} deg of the surface"
+            f" normal; {flat:,} points have rays at larger angles. Increase --max-angle.",
+            submerged=submerged,
+            flat=flat,
         )
-    middle = (figures.low + figures.high) / 2.0
-    distance = float(np.hypot(*(plan.cameras.centres - middle)[:, :2].T).min())
+    middle, centres = (figures.low + figures.high) / 2.0, plan.cameras.centres
+    distance_m = np.hypot(*(centres - middle)[:, :2].T).min()
     within = f" within {limit:g} degrees" if limit else ""
-    sentence = (
-        f"no image shows a submerged point{within}; the nearest is {distance:,.1f} m in"
-        f" plan from the middle of the {figures.submerged:,} submerged points. Check that cameras"
-        " and cloud have the same CRS, and that pitch 0 is straight down."
+    mistake = likely_mistake(centres, figures.low, figures.high) or ""
+    raise GeometryError(
+        "cameras.no_overlap",
+        f"{name}: no image shows a submerged point{within}; the nearest is {distance_m:,.1f} m in"
+        f" plan from the middle of the {submerged:,} submerged points. Check that cameras and cloud"
+        f" have the same CRS, and that pitch 0 is straight down. {mistake}".strip(),
+        submerged=submerged,
+        flat=0,
     )
-    mistake = likely_mistake(plan.cameras.centres, figures.low, figures.high)
-    return f"{sentence} {mistake or ''}".strip()
 
 
-def check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> Plausible:
+def _check_fit(plan: Plan, tally: CloudTally, ties: TiePoints | None = None) -> Plausible:
     """Test cameras, cloud and water against each other; warn of what does not fit."""
     sample, given = tally.sample or CloudSample(), plan.inputs.cameras
-    problems = () if isinstance(plan.found, WaterProposal) else sample.level_notes()
-    tested = plausible(
-        plan.cameras, sample.rows[:, :3], ties, problems,
-        file="" if isinstance(given, Cameras) else given or "", water_m=sample.water_m,
-        listed=plan.kind is not None,
+    found = plausible(
+        plan.cameras, sample.rows[:, :3], ties, water_m=sample.water_m,
+        file="" if isinstance(given, Cameras) else given or "", listed=plan.kind is not None,
     )  # fmt: skip
-    for warning in tested.problems:
+    if not isinstance(plan.found, WaterProposal):  # else it is the shoreline of the cloud
+        found = found._replace(problems=[*sample.level_notes(), *found.problems])
+    for warning in found.problems:
         warnings.warn(warning, stacklevel=3)
-    return tested
+    return found
 
 
 def correct_points(
@@ -332,48 +334,39 @@ def correct_points(
     given = taken(PointsOptions, options, keywords, "correct_points")
     xyz = checked_points(xyz)
     surface, heights = as_surface(water, len(xyz))
-    values = {one.name: getattr(given, one.name) for one in fields(given)}
-    all_options = CorrectOptions(water=surface, **values)
+    asked = with_index(
+        CorrectOptions(
+            cameras=cameras or None, water=surface, adjusted_from=adjusted_from, **vars(given)
+        )
+    )
     if not cameras:
-        all_options.check_no_cameras()
-        if not (views is None and level_offset_m is None and adjusted_from is None):
+        asked.check_no_cameras()
+        if views is not None or level_offset_m is not None:
             raise SettingError(
                 "option.needs",
-                "views, level_offset_m and adjusted_from have no effect without cameras. Give both,"
-                " or neither.",
+                "views and level_offset_m have no effect without cameras. Give both, or neither.",
                 needs="cameras",
             )
-    cameras = cameras or NO_CAMERAS
-    offset: FloatArray | None = None
-    if level_offset_m is not None:
-        offset = np.ascontiguousarray(level_offset_m, dtype=np.float64)
-        if offset.shape != (len(cameras),) or not np.isfinite(offset).all():
-            sentence = f"level_offset_m must be {len(cameras)} finite numbers, one per camera."
-            raise SettingError("array.shape", sentence, shape=offset.shape)
-    original = cameras if adjusted_from is None else adjusted_from
-    if views is not None:
-        _check_views(views, xyz, original)
     points = Points(xyz, heights, np.zeros(len(xyz), np.uint8), views=views)
     view = CloudView(
         "xyz", None, *corners(*xyz[:, :2].T), len(xyz), lambda water=None: iter([points])
     )
-    transfer = None if adjusted_from is None else transfer_between(adjusted_from, cameras)
-    plan = plan_of(
-        with_index(all_options),
-        Inputs(cameras=cameras, water=surface),
-        view,
-        CameraInputs(cameras, None, original, transfer),
-        FoundSurface(surface),
-        offset,
-        views,
-        Labelling(LandRules()),
-        regression,
-    )
-    plan = plan_correction(plan)
+    blocks = read_blocks(asked.part(Inputs), view)
+    if level_offset_m is not None:
+        offset, k = np.ascontiguousarray(level_offset_m, dtype=np.float64), len(blocks.cameras)
+        if offset.shape != (k,) or not np.isfinite(offset).all():
+            sentence = f"level_offset_m must be {k} finite numbers, one per camera."
+            raise SettingError("array.shape", sentence, shape=offset.shape)
+        blocks = blocks._replace(level_offset_m=offset)
+    if views is not None and cameras:
+        _check_views(views, xyz, adjusted_from or cameras)
+        blocks = blocks._replace(views=views)
+    found, labelling = FoundSurface(surface), Labelling(LandRules())
+    plan = plan_correction(plan_of(asked, view, blocks, found, labelling, regression))
     correction, tally = correct_chunk(plan, points, 0, covariances=True)
     if tally.water is not None:
         tally.water.check_reach("xyz", surface, deep=given.deep)
-    check_fit(plan, tally)
+    _check_fit(plan, tally)
     for note in plan.input_notes:
         warnings.warn(note, stacklevel=2)
     return correction
@@ -393,7 +386,7 @@ def _check_views(views: Views, points: FloatArray, cameras: Cameras) -> None:
         raise SettingError(
             "views.camera", f"views name camera {camera.max()}, but there are {len(cameras)}."
         )
-    counts = count_outside_frames(points, views, cameras)
+    counts = np.diff(views.start) - count_visible_cameras(points, cameras, views)
     if counts.any():
         entries, outside = int(counts.sum()), int(np.count_nonzero(counts))
         sentence = f"views: {entries:,} entries of {outside:,} points are ignored: their cameras"

@@ -12,7 +12,7 @@ import numpy as np
 
 from pcfix.adjust.diagnosis import EXPORT, MOST_STATED_M, Diagnosis, diagnosed, neighbours_sign
 from pcfix.errors import InputError, PcfixError, PcfixWarning
-from pcfix.flow.inputs import Inputs, ties_of
+from pcfix.flow.inputs import Inputs
 from pcfix.flow.surfaces import CloudView
 from pcfix.io.ground_control import gnss_in_frame_of, read_ground_control
 from pcfix.model import Cameras, GnssPositions, TiePoints, WaterSurface
@@ -42,7 +42,7 @@ def diagnose_inputs(
     """Look for signs in a cloud, its cameras with their tie points, and surveys, if given."""
     control = None if gcps is None else read_ground_control(gcps, cameras).surveyed
     return diagnosed(
-        cameras, water, index, view, ties=ties_of(inputs, view.crs), control=control,
+        cameras, water, index, view, ties=inputs.tie_points(view.crs), control=control,
         gnss=_gnss_of(cameras, str(inputs.cameras)), reference=reference, in_passing=in_passing,
     )  # fmt: skip
 
@@ -63,48 +63,47 @@ def diagnose_in_passing(
     The ties are `quick_ties`. Returns for the summary whether the poses absorbed it (None if
     unknown), that as a line, and the signs; and the warning.
     """
-    inputs, cameras = plan.inputs, plan.cameras
-    found: dict[str, Any] = {"absorbed": None, "words": "", "signs": []}
+    inputs, cameras, n = plan.inputs, plan.cameras, plan.options.refractive_index
+
+    def poses(words: str, absorbed: bool | None = None, signs: Any = ()) -> dict[str, Any]:
+        return {"absorbed": absorbed, "words": words, "signs": list(signs)}
+
     if not len(cameras):
-        return found | {"words": "not applicable: no cameras were given"}, None
+        return poses("not applicable: no cameras were given"), None
     if inputs.adjusted_from is not None:
-        words = "adjusted with refraction (--adjusted-from)"
-        return found | {"absorbed": False, "words": words}, None
-    seen = [(one.straight, one.is_fused) for one in plan.verdicts if one.straight is not None]
+        return poses("adjusted with refraction (--adjusted-from)", absorbed=False), None
     name = "cameras" if isinstance(inputs.cameras, Cameras) else str(inputs.cameras)
-    n = plan.options.refractive_index
-    neighbours = neighbours_sign(*seen[-1][0], is_fused=seen[-1][1]) if seen else None
+    neighbours = None
+    for verdict in plan.verdicts:  # the last one that was compared with straight rays counts
+        if verdict.straight is not None:
+            neighbours = neighbours_sign(*verdict.straight, is_fused=verdict.is_fused)
     try:
-        diagnosis = diagnosed(
+        found = diagnosed(
             cameras, plan.found.surface, n, plan.view, ties=ties, gnss=_gnss_of(cameras, name),
             neighbours=neighbours, in_passing=True,
         )  # fmt: skip
     except (PcfixError, OSError) as error:  # this check stops no correction
-        return found | {"words": f"not checked for absorbed refraction: {error}"}, None
+        return poses(f"not checked for absorbed refraction: {error}"), None
+    signs = found.as_dict()["signs"]
+    if found.decided_by is None:
+        words = "not checked for absorbed refraction: no tie points or GNSS positions of the file"
+        return poses(f"{words} show it quickly; {EXPORT}", None, signs), None
+    have = "have" if found.absorbed else "have not"
+    words = f"{have} absorbed the refraction, as {found.decided_by.name} show"
+    if not found.absorbed:
+        return poses(words, found.absorbed, signs), None
     command = adjust_words(
         inputs, plan.view.name, has_datum=has_datum(cameras, name),
         index=None if n == DEFAULT_REFRACTIVE_INDEX else n,
     )  # fmt: skip
-    sentence, decided, warning = diagnosis.sentence(command), diagnosis.decided_by, None
-    if sentence:
-        likely = diagnosis.likely_error_m
-        values = {} if likely is None else {"likely_error_m": likely}
-        warning = PcfixWarning("poses.absorbed", sentence, command=command, **values)
-        warnings.warn(warning, stacklevel=3)
-    words = (
-        "not checked for absorbed refraction: no tie points or GNSS positions of the file show it"
-        f" quickly; {EXPORT}"
-    )
-    if decided is not None:
-        have = "have" if diagnosis.absorbed else "have not"
-        words = f"{have} absorbed the refraction, as {decided.name} show"
-        words += "; see the warning" if sentence else ""
-    signs = diagnosis.as_dict()["signs"]
-    return {"absorbed": diagnosis.absorbed, "words": words, "signs": signs}, warning
+    likely = {} if found.likely_error_m is None else {"likely_error_m": found.likely_error_m}
+    warning = PcfixWarning("poses.absorbed", found.sentence(command), command=command, **likely)
+    warnings.warn(warning, stacklevel=3)
+    return poses(f"{words}; see the warning", found.absorbed, signs), warning
 
 
 def quick_ties(inputs: Inputs, crs: Any) -> TiePoints | None:
-    """Return the tie points of `ties_of` if reading them takes no more than a second or two."""
+    """Return the tie points of the camera file if they are read within a second or two."""
     if isinstance(inputs.cameras, Cameras) or inputs.cameras is None:
         return None
     path = Path(inputs.cameras)
@@ -112,7 +111,7 @@ def quick_ties(inputs: Inputs, crs: Any) -> TiePoints | None:
     try:
         files = [one for one in folder.rglob("*") if one.is_file()] if folder.is_dir() else [path]
         is_quick = sum(one.stat().st_size for one in files) <= QUICK_BYTES
-        return ties_of(inputs, crs) if is_quick else None
+        return inputs.tie_points(crs) if is_quick else None
     except (PcfixError, OSError):  # this check stops no correction
         return None
 

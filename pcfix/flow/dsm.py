@@ -40,19 +40,12 @@ from pcfix.version import __version__
 
 WINDOW_POINTS = 400_000
 """Points that are gridded at once, about."""
-TIN_REACH_SPACINGS = 5.0
-TIN_REACH_CELLS = 3.0
-"""Largest diameter of circles around triangles: the larger of the two, or --fill."""
-
 BLOCK_CELLS = 1024
 """Longest side of a window."""
 BIN_POINTS = 200_000
 """Points of a tile by which they are sorted, on average."""
-SIGMA_Z = "SigmaZ"
-DIMENSIONS = {"height": None, "depth": "WaterDepth", "uncertainty": SIGMA_Z}
+DIMENSIONS = {"height": None, "depth": "WaterDepth", "uncertainty": "SigmaZ"}
 """Where the values of a quantity are."""
-POINTS_A_SQUARE, MOST_SQUARES = 6.0, 4_000_000
-"""Points of a square, if these fill the area, and squares to measure the spacing of points."""
 
 
 def grid_dsm(
@@ -82,12 +75,11 @@ def grid_dsm(
     output : path
         The name ends in ``.tif`` or ``.tiff``.
     options, progress
-        See `pcfix.correct_file`. The bounds of the raster are
-        multiples of the resolution (m), by default that of `pcfix.grid.lattice.round_resolution`; a
-        point on an edge belongs to the cell east or north of it. The method "tin" uses Delaunay
-        triangles, and fill is the diameter of the widest circle without a point, by default five
-        times the spacing of the points and at least three cells. Withheld points and noise (classes
-        7 and 18) are not used.
+        See `pcfix.correct_file`. The bounds of the raster are multiples of the resolution (m), by
+        default that of `pcfix.grid.lattice.round_resolution`; a point on an edge belongs to the
+        cell east or north of it. The method "tin" uses Delaunay triangles, and fill is the diameter
+        of the widest circle without a point, by default five times the spacing of the points and at
+        least three cells. Withheld points and noise (classes 7 and 18) are not used.
     """
     given = taken(DsmOptions, options, keywords, "grid_dsm")
     rules, files = given.part(DsmRules), cloud_of(input)
@@ -113,9 +105,8 @@ def grid_dsm(
             gap_m = _spacing_m(source, used, rules.cell_m)
         lattice = lattice_over(*bounds(used[:, :2]), rules.cell_m, str(task.source))
         tiles = make_tiles(used, points=BIN_POINTS)
-        # the widest circle around a triangle
-        reach = TIN_REACH_SPACINGS * gap_m, TIN_REACH_CELLS * rules.cell_m, rules.fill or 0.0
-        reach_m = max(reach)
+        # diameter of the widest circle around a triangle of a TIN
+        reach_m = max(5.0 * gap_m, 3.0 * rules.cell_m, rules.fill or 0.0)
         paths = {"dsm": task.target, **more}
         tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
         counted = _write_rasters(tiles, lattice, reach_m, gap_m, rules, paths, crs, tags, report)
@@ -171,7 +162,8 @@ def _write_rasters(
     margin = margin_cells(widest) if widest else 0
     # windows have about this number of points if points are everywhere, and are wide for a margin
     side = np.sqrt(WINDOW_POINTS) * spacing or BLOCK_CELLS
-    cells, filled, known, count, total, low, high, done = 0, 0, 0, 0, 0.0, np.inf, -np.inf, 0
+    # numbers of cells: with points, filled, with a height; the heights before filling, their sum
+    sums, low, high, done = np.zeros(5), np.inf, -np.inf, 0
     with ExitStack() as files:
         bands: dict[str, str] = {rules.what: METRE}
         system = crs if rules.what == "height" else plan
@@ -193,18 +185,18 @@ def _write_rasters(
             rasters.write_bands(dsm, [height], window)
             if "counts" in paths:
                 rasters.write_bands(counts, [number, spread], window)
-            cells += int((number > 0).sum())
-            filled += int((~np.isnan(height) & (number == 0)).sum())
-            known += int((~np.isnan(height)).sum())
-            count, total = count + values.size, total + float(values.sum())
+            has_points, known = number > 0, ~np.isnan(height)
+            counts_here = has_points.sum(), (known & ~has_points).sum(), known.sum()
+            sums += [*counts_here, values.size, values.sum()]
             low, high = values.min(initial=low), values.max(initial=high)
             done += height.size
             report(0.5 + 0.5 * done / (lattice.height * lattice.width))
-    found = {"min": low, "mean": total / count, "max": high} if count else {}
+    cells, filled, full, count = sums[:4].astype(int).tolist()
+    found = {"min": low, "mean": sums[4] / count, "max": high} if count else {}
     return {
         "cells": cells,  # with points
         "filled": filled,  # with a height but no points
-        "empty": lattice.width * lattice.height - known,  # without a height
+        "empty": lattice.width * lattice.height - full,  # without a height
         # of the cells, before holes are filled
         "values": {name: round(float(value), 4) for name, value in found.items()},
     }
@@ -221,7 +213,8 @@ def point_spacing_m(cloud: CloudFiles, near: Path) -> float:
 
 def _spacing_m(source: LasSource, xyz: FloatArray, finest_m: float = MIN_RESOLUTION_M) -> float:
     """Return the spacing of points of a cloud by squares of at least a size; see `spacing_m`."""
-    share = max(POINTS_A_SQUARE / len(source), 1.0 / MOST_SQUARES)
+    # squares with six points if these fill the area, but at most 4 million of them
+    share = max(6.0 / len(source), 1.0 / 4_000_000)
     # as the header states it, which need not be right
     area = float(np.prod(source.header.maxs[:2] - source.header.mins[:2]))
     side = np.sqrt(share * area) if np.isfinite(area) and area > 0.0 else 0.0
@@ -232,10 +225,7 @@ def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], Non
     """Read the points to grid, shape (n, 3), the gridded values in the place of z."""
     dimension = DIMENSIONS[rules.what]
     if dimension not in (None, *source.header.point_format.dimension_names):
-        sentence = (
-            f"has no dimension {dimension}, which --what {rules.what} needs. Correct the cloud"
-            " first, with --dimensions all."
-        )
+        sentence = f"has no dimension {dimension}. Correct the cloud first, with --dimensions all."
         raise bad_file(source.path, "cloud.no_dimension", sentence, dimension=dimension)
     result, count, done = empty((len(source), 3)), 0, 0
     for points in source.chunks():
@@ -246,7 +236,7 @@ def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], Non
         is_bed = classes == BATHYMETRIC_POINT
         wanted = is_bed if rules.surface == "bed" else ~np.isin(classes, NOISE_CLASSES)
         wanted &= ~np.asarray(points["withheld"]).astype(bool) & np.isfinite(xyz[:, 2])
-        if dimension == SIGMA_Z:
+        if dimension == "SigmaZ":
             wanted &= xyz[:, 2] > 0.0  # others have none
         xyz = xyz[wanted]
         result[count : count + len(xyz)] = xyz
@@ -254,10 +244,7 @@ def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], Non
         release()
         report(0.5 * done / len(source))
     if count == 0 and rules.surface == "bed":
-        sentence = (
-            f"has no point of class {BATHYMETRIC_POINT} (bed) that is not withheld. Correct the"
-            " cloud first, or use --surface all."
-        )
+        sentence = "has no bed (class 40). Correct the cloud first, or use --surface all."
         raise bad_file(source.path, "dsm.no_bed", sentence)
     if count == 0:
         sentence = "all points are noise (classes 7 and 18) or withheld. Classify it again."

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -21,12 +21,13 @@ from pcfix.errors import GeometryError, InputError, NoTiePointsError, PcfixWarni
 from pcfix.flow.surfaces import CloudView, find_surface
 from pcfix.io.cameras import read_cameras, read_tie_points, takes_sensor
 from pcfix.io.cameras.georeference import Georeference, georeference
+from pcfix.io.crs import LOCAL
 from pcfix.io.tables import match_labels
 from pcfix.io.tides import level_offsets, read_image_times, read_tide
 from pcfix.io.vectors import LAYER_MARK, read_water_polygons
-from pcfix.io.views import ViewList, read_views, track_views
+from pcfix.io.views import ViewList, ViewMatch, read_views, track_views
 from pcfix.label.labelling import Labelling, WaterMask
-from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints
+from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints, Views
 from pcfix.options.declare import File, OptionSet, options_of
 from pcfix.options.shared import InputOptions, LandRules, MaskOption
 from pcfix.port.shapes import port_of
@@ -34,9 +35,6 @@ from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:
     from pyproj import CRS
-
-
-LOCAL = "local"
 
 
 class Inputs(MaskOption, InputOptions):
@@ -73,8 +71,7 @@ class Inputs(MaskOption, InputOptions):
         """Return the water level at each image minus the mean level, shape (k,)."""
         if self.tide is None:
             return None
-        own = self.cameras if self.adjusted_from is None else self.adjusted_from
-        given = own if self.image_times is None else self.image_times
+        given = self.image_times or self.adjusted_from or self.cameras
         if isinstance(given, Cameras):
             sentence = "tide needs image-times, the time of each image."
             raise SettingError("option.needs", sentence, options=["tide", "image_times"])
@@ -127,7 +124,8 @@ class Inputs(MaskOption, InputOptions):
         """
         if isinstance(self.cameras, Cameras):
             return None
-        read = self.read()
+        with warnings.catch_warnings(action="ignore", category=PcfixWarning):
+            read = self.read()  # again: its warnings were shown
         try:
             ties = read_tie_points(self.cameras, read)
         except NoTiePointsError:
@@ -139,32 +137,43 @@ class Inputs(MaskOption, InputOptions):
         known = np.isfinite(ties.xyz).all(axis=1)
         if placed and not known.any():
             return None
-        placement = self._georeferenced(read, cloud_crs)
         xyz = np.full((len(ties.xyz), 3), np.nan)
-        xyz[known] = placement.points(ties.xyz[known])
+        xyz[known] = self._georeferenced(read, cloud_crs).points(ties.xyz[known])
         return replace(ties, xyz=xyz)
 
 
 class CameraInputs(NamedTuple):
-    """The cameras of a correction, in the cloud's CRS."""
+    """The k cameras of a correction, in the cloud's CRS, and what refers to them."""
 
     cameras: Cameras  # for the correction; `NO_CAMERAS` if there are none
-    views: ViewList | None  # of the cloud
-    listed: Cameras  # the original cameras, to which the row numbers of the view list refer
-    transfer: CloudTransfer | None  # from the original to the adjusted cameras
+    views: Views | None = None  # the view list, with rows of the original cameras
+    match: ViewMatch | None = None  # gives the view list of a file to the points of the cloud
+    transfer: CloudTransfer | None = None  # from the original to the adjusted cameras
+    level_offset_m: FloatArray | None = None  # (k,), how much higher the water stood per image
 
 
-def read_blocks(inputs: Inputs, cloud_crs: str | CRS | None) -> CameraInputs:
+def read_blocks(inputs: Inputs, view: CloudView) -> CameraInputs:
     """Return cameras in the cloud's CRS and the view list, matched with the original cameras."""
     if not inputs.cameras:
-        return CameraInputs(NO_CAMERAS, None, NO_CAMERAS, None)
+        return CameraInputs(NO_CAMERAS)
     if inputs.adjusted_from is None:
-        cameras, views = inputs.block(cloud_crs)
-        return CameraInputs(cameras, views, cameras, None)
-    original, adjusted = both_models(inputs)
-    cameras, _ = adjusted.block(cloud_crs)
-    listed, views = original.block(cloud_crs)
-    return CameraInputs(cameras, views, listed, transfer_between(listed, cameras))
+        cameras, listed = inputs.block(view.crs)
+        original, transfer = cameras, None
+    else:
+        of_original, of_adjusted = both_models(inputs)
+        cameras, _ = of_adjusted.block(view.crs)
+        original, listed = of_original.block(view.crs)
+        for one, option in ((original, "adjusted-from"), (cameras, "cameras")):
+            if one.rotations is None or one.lenses is None:
+                missing = "angles" if one.rotations is None else "lens"
+                words = f"--{option}: has no {missing}, without which points have no image. Give"
+                words += " the model itself, or --sensor."
+                raise SettingError(f"cameras.no_{missing}", words, option=option)
+        transfer = transfer_of(original, cameras, _rows(original.labels, cameras.labels))
+    if listed is None:
+        return CameraInputs(cameras, transfer=transfer)
+    match = ViewMatch(listed, original, points=view.points, step_m=view.step_m)
+    return CameraInputs(cameras, listed.listed, match, transfer)
 
 
 def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:
@@ -173,32 +182,33 @@ def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:
     The options for CRS and offset apply to the file that states no CRS, or to both if both do. If
     neither does, the offset is applied so that the two files agree best.
     """
-    given = (inputs.views, inputs.cameras, inputs.adjusted_from)
-    listed, path, old = (None if isinstance(one, Cameras) else one for one in given)
-    if listed is not None and path is not None and Path(listed) == Path(path) != Path(old or ""):
+    listed, path, old = (
+        None if one is None or isinstance(one, Cameras) else Path(one)
+        for one in (inputs.views, inputs.cameras, inputs.adjusted_from)
+    )
+    if listed is not None and listed == path != old:
         words = (
             f"--views: the tie points of {path} are adjusted ones, not those of the cloud. Give"
             " the model of --adjusted-from, or the view list of the cloud."
         )
         raise SettingError("views.adjusted", words, path=path)
-    source = inputs.cameras if inputs.adjusted_from is None else inputs.adjusted_from
     both = [
-        replace(inputs, cameras=source, adjusted_from=None),
+        replace(inputs, cameras=inputs.adjusted_from, adjusted_from=None),
         replace(inputs, views=None, adjusted_from=None),
     ]
     tables = [not isinstance(one.cameras, Cameras) and takes_sensor(one.cameras) for one in both]
     if inputs.sensor is not None and any(tables):  # a model contains its lens
-        both = _without(both, tables, sensor=None)
+        both = _for_some(both, tables, "sensor")
     if inputs.cameras_crs is None and inputs.cameras_offset is None:
         return both[0], both[1]
     original, adjusted = read = [one.read() for one in both]
-    tied = [
-        isinstance(given.cameras, Cameras) or cameras.crs not in (None, LOCAL)
-        for given, cameras in zip(both, read, strict=True)
+    is_local = [
+        not isinstance(one.cameras, Cameras) and cameras.crs in (None, LOCAL)
+        for one, cameras in zip(both, read, strict=True)
     ]
-    if any(tied) and not all(tied):
-        both = _without(both, [not one for one in tied], cameras_crs=None, cameras_offset=None)
-    elif inputs.cameras_offset is not None and not any(tied):
+    if any(is_local) and not all(is_local):
+        both = _for_some(both, is_local, "cameras_crs", "cameras_offset")
+    elif inputs.cameras_offset is not None and all(is_local):
         # It is unknown which of the two files is shifted: try the offset on both, and on either.
         difference = adjusted.centres - original.centres[_rows(original.labels, adjusted.labels)]
         offset = np.array(inputs.cameras_offset)
@@ -208,16 +218,14 @@ def both_models(inputs: Inputs) -> tuple[Inputs, Inputs]:
             (False, True): difference + offset,
         }
         best = min(moves, key=lambda one: np.median(np.linalg.norm(moves[one], axis=1)))
-        both = _without(both, best, cameras_offset=None)
+        both = _for_some(both, best, "cameras_offset")
     return both[0], both[1]
 
 
-def _without(both: list[Inputs], unchanged: Sequence[bool], **changes: Any) -> list[Inputs]:
-    """Return the inputs, with changes where `unchanged` is false."""
-    return [
-        one if is_unchanged else replace(one, **changes)
-        for one, is_unchanged in zip(both, unchanged, strict=True)
-    ]
+def _for_some(both: list[Inputs], which: Iterable[bool], *names: str) -> list[Inputs]:
+    """Return the inputs, with the options of these names only for some of the two."""
+    nothing: dict[str, Any] = dict.fromkeys(names)
+    return [one if it else replace(one, **nothing) for one, it in zip(both, which, strict=True)]
 
 
 def original_ties(
@@ -225,25 +233,12 @@ def original_ties(
 ) -> TiePoints | None:
     """Return the tie points of the original model, numbered as the cameras of a transfer."""
     if transfer is None:
-        return ties_of(inputs, cloud_crs)
+        return inputs.tie_points(cloud_crs)
     ties = both_models(inputs)[0].tie_points(cloud_crs)
     if ties is None:
         return None
     views, entry = renumbered(ties.views, transfer.row)
     return replace(ties, views=views, image_xy=ties.image_xy[entry])
-
-
-def transfer_between(original: Cameras, adjusted: Cameras) -> CloudTransfer:
-    """Match the images of two models in the cloud's CRS by their names."""
-    for cameras, which in ((original, "adjusted-from"), (adjusted, "cameras")):
-        if cameras.rotations is None or cameras.lenses is None:
-            missing = "angles" if cameras.rotations is None else "lens"
-            words = (
-                f"--{which}: has no {missing}, without which points have no image. Give the model"
-                " itself, or --sensor."
-            )
-            raise SettingError(f"cameras.no_{missing}", words, option=which)
-    return transfer_of(original, adjusted, _rows(original.labels, adjusted.labels))
 
 
 def _rows(original: tuple[str, ...], adjusted: tuple[str, ...]) -> IntArray:
@@ -267,13 +262,6 @@ def _rows(original: tuple[str, ...], adjusted: tuple[str, ...]) -> IntArray:
         )
         raise GeometryError("adjusted_from.no_image", words, image=unknown[0], missing=len(unknown))
     return row
-
-
-def ties_of(inputs: Inputs, crs: Any) -> TiePoints | None:
-    """Return the tie points of the camera file in the cloud's CRS, if it has any."""
-    with warnings.catch_warnings():  # the warnings were shown when the cameras were read
-        warnings.simplefilter("ignore", PcfixWarning)
-        return inputs.tie_points(crs)
 
 
 def mask_of(path: File | None, cloud_crs: str | CRS | None) -> WaterMask | None:

@@ -7,7 +7,6 @@ from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from pcfix.errors import PcfixWarning
 from pcfix.flow.inputs import labelling_of, paths_in
@@ -17,15 +16,13 @@ from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header
 from pcfix.io.tiles import Clouds
-from pcfix.label.labelling import LabelCounts, Labelling
+from pcfix.label.labelling import Classes, LabelCounts, Labelling
 from pcfix.model import WaterPlane, WaterSurface
 from pcfix.options.correct import LabelOptions, StageLabelOptions
 from pcfix.options.declare import File, taken
 from pcfix.sums import Figures
 from pcfix.version import __version__
 from pcfix.water.checks import check_submerged, check_tilt
-
-Classes = npt.NDArray[np.uint8]
 
 
 def label_file(

@@ -25,13 +25,6 @@ from pcfix.photos.ortho import Picture, mosaic, picture_of
 from pcfix.running import threads
 from pcfix.sums import Figures
 
-TILE_CELLS = 512
-CACHE_BYTES = 400_000_000
-"""Of photographs cached for the next tile."""
-NO_WATER = WaterPlane(-100_000.0)
-"""Below all ground, so that every ray is straight."""
-COLOURS = {1: ("gray",), 3: ("red", "green", "blue")}
-
 
 def ortho_photo(
     images: File,
@@ -63,8 +56,8 @@ def ortho_photo(
     target = rasters.check_tif(output, overwrite=given.overwrite, inputs=known)
     check_summary(given, [*known, target])
     with threads(given.jobs), scratch_folder(target) as folder:
-        # without water, its level is below all ground
-        water = NO_WATER if given.water is None else given.water
+        # without water, its level is below all ground, so that every ray is straight
+        water = WaterPlane(-100_000.0) if given.water is None else given.water
         coarse_m = None
         if given.resolution and is_cloud(Path(given.dsm)):
             coarse_m = 2.0 * given.resolution
@@ -102,24 +95,21 @@ def _write(
     bands, dtype = first.shape[2], first.dtype
     shrunk = max(1, int(lattice.resolution_m / block.gsd_m))
 
-    @lru_cache(maxsize=max(4, CACHE_BYTES // first.nbytes))
+    @lru_cache(maxsize=max(4, 400_000_000 // first.nbytes))  # 400 MB for the next tile
     def picture(row: int) -> Picture:
         pixels = read_colours(block.paths[row])
         check_kind(block.paths[row], pixels, first)
         return picture_of(pixels, shrunk, blanks=given.water is None)
 
-    side = lattice.resolution_m
-    names = COLOURS.get(bands, tuple(f"band {b + 1}" for b in range(bands)))
+    colours = {1: ("gray",), 3: ("red", "green", "blue")}
+    names = colours.get(bands, tuple(f"band {b + 1}" for b in range(bands)))
     covered = ground = done = 0
     layers = dict.fromkeys((*names, "alpha"), "")
     with rasters.new_raster(
         path, lattice, block.crs, layers, dtype=str(dtype), nodata=None
     ) as target:  # fmt: skip
-        for window in lattice.window.parts(TILE_CELLS):
-            # the centres of the cells that have a height
-            x = lattice.left_m + (np.arange(window.column, window.column_stop) + 0.5) * side
-            y = lattice.top_m - (np.arange(window.row, window.row_stop) + 0.5) * side
-            xy = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x))])
+        for window in lattice.window.parts(512):
+            xy = lattice.centres(window)
             z = block.scene.ground.heights_at(xy)
             known = np.isfinite(z)
             xyz = np.column_stack([xy, z])[known]

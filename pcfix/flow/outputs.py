@@ -34,7 +34,7 @@ from pcfix.options.declare import File
 from pcfix.options.steps import DsmOptions
 from pcfix.report.adjustment import adjustment_sentence
 from pcfix.report.comparison import evaluation
-from pcfix.report.page import Report, Table, extent_of, render
+from pcfix.report.page import Report, Table, render
 from pcfix.report.run import RunMaps, run_report
 from pcfix.report.styles import Symbol, limits_of, vector_style
 from pcfix.report.text import Plain, Summary
@@ -274,7 +274,7 @@ def report_run(
         maps = read_maps(run.folder, names, *crs_words(stated_crs(source)))
     if compared:
         figures = evaluation(
-            compared["figures"], compared["sections"], maps.difference_m, extent_of(maps.lattice)
+            compared["figures"], compared["sections"], maps.lattice, maps.difference_m
         )
         more |= {"pictures": figures[0], "tables": figures[1]}
     if first["model"] is not None:

@@ -5,23 +5,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from functools import partial
-from itertools import compress
 
 import numpy as np
 
-from pcfix.errors import GeometryError, PcfixWarning, SettingError, coded
+from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError, coded
 from pcfix.flow.correction import Plan, batch_of, transferred
 from pcfix.flow.inputs import CameraInputs, Inputs, labelling_of, original_ties, read_blocks
 from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
 from pcfix.io.las.source import CHUNK_POINTS
 from pcfix.io.tables import read_check_depths
-from pcfix.io.views import ViewMatch
 from pcfix.label.labelling import Labelling, Part
-from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, Views, WaterPlane
-from pcfix.options.correct import CorrectOptions
+from pcfix.model import NOISE_CLASSES, Cameras, WaterPlane
+from pcfix.options.correct import CorrectOptions, ScienceOptions
 from pcfix.options.declare import File
 from pcfix.refract import learning
 from pcfix.refract.batch import Batch, Learned, Survey, require_orientation, stacked
@@ -41,8 +38,6 @@ FEWEST_BED_POINTS, MOST_BED_POINTS = 125_000, 1_000_000
 """Size of the sample of the cloud that the bed of the surroundings is estimated from."""
 LEAST_R2 = 0.5
 """Smallest coefficient of determination of a regression that is used."""
-Chunks = Callable[[], Iterable[Points]]
-"""The whole cloud, chunk by chunk, transferred to the adjusted cameras if there are any."""
 
 
 def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
@@ -53,53 +48,46 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
         _check_port(options)
     elif not options.cameras:
         options.check_no_cameras()
-    blocks, match, listed = read_blocks(inputs, view.crs), None, None
-    if blocks.views is not None:
-        match = ViewMatch(blocks.views, blocks.listed, points=view.points, step_m=view.step_m)
-        listed = blocks.views.listed
+    blocks = read_blocks(inputs, view)
     if inputs.port is not None:
-        cameras = blocks.cameras
-        require_orientation(cameras, "A port")
-        survey = Survey(WaterPlane(np.inf), cameras, replace(options, method="consistent"))
-        return Plan(
-            options, inputs, view, survey, FoundSurface(survey.water), labelling_of(options, view),
-            match, None if listed is None else listed.kind, input_notes=cameras.notes,
-        )  # fmt: skip
-    found = inputs.surface(view)
-    if match is None and not isinstance(options.cameras, Cameras):
-        _check_frames(blocks.cameras, options)
-    offset = inputs.level_offset_m(blocks.cameras)
-    plan = plan_of(
-        options, inputs, view, blocks, found, offset, listed, labelling_of(options, view)
-    )
+        require_orientation(blocks.cameras, "A port")
+        found = FoundSurface(WaterPlane(np.inf))  # all points are below it
+    else:
+        found = inputs.surface(view)
+        if blocks.match is None and not isinstance(options.cameras, Cameras):
+            _check_frames(blocks.cameras, options)
+        blocks = blocks._replace(level_offset_m=inputs.level_offset_m(blocks.cameras))
+    plan = plan_of(options, view, blocks, found, labelling_of(options, view))
     check_tilt(found.surface)
     if plan.survey.settings.method == "regression" and inputs.check_depths is None:
         sentence = "Method regression needs check-depths, a CSV of measured depths. Give it."
         raise SettingError("option.together", sentence, options=[])
-    return replace(plan, match=match, input_notes=(*blocks.cameras.notes, *plan.input_notes))
+    return replace(plan, input_notes=(*blocks.cameras.notes, *plan.input_notes))
 
 
 def plan_of(
-    options: CorrectOptions, inputs: Inputs, view: CloudView, blocks: CameraInputs,
-    found: FoundSurface, offset: FloatArray | None, listed: Views | None, labelling: Labelling,
-    line: DepthRegression | None = None,
+    options: CorrectOptions, view: CloudView, blocks: CameraInputs, found: FoundSurface,
+    labelling: Labelling, line: DepthRegression | None = None,
 ) -> Plan:  # fmt: skip
-    """Return the plan of a correction through a water surface, with nothing estimated yet.
+    """Return the plan of a correction with nothing estimated yet.
 
-    `offset`, shape (k,), is how much higher the water stood when each image was taken, `listed` are
-    the view lists, and `line` is that of a regression if it is known.
+    The options have a number as refractive index; `line` is that of a regression if it is known.
     """
-    cameras, kind, some_unlisted = blocks.cameras, None, False
-    if listed is not None:
-        kind, start = listed.kind, listed.start
+    cameras, views, match, transfer, offset = blocks
+    kind, some_unlisted, inputs = None, False, options.part(Inputs)
+    if views is not None:
+        kind, start = views.kind, views.start
         some_unlisted = len(start) <= view.points or not bool((np.diff(start) > 0).all())
-    check_above_water(cameras, found.surface, offset)
-    folder = options.water_per_image
-    settings = learning.resolved(options, cameras, kind, own_water=folder is not None)
-    own = own_water_of(folder, cameras, found.surface, view, offset)
+    if inputs.port is not None:
+        settings: ScienceOptions = replace(options, method="consistent")
+    else:
+        check_above_water(cameras, found.surface, offset)
+        is_own = options.water_per_image is not None
+        settings = learning.resolved(options, cameras, kind, own_water=is_own)
+    own = own_water_of(options.water_per_image, cameras, found.surface, view, offset)
     survey = Survey(found.surface, cameras, settings, offset, Learned(line), own_water=own)
     return Plan(
-        options, inputs, view, survey, found, labelling, None, kind, some_unlisted, blocks.transfer,
+        options, inputs, view, survey, found, labelling, match, kind, some_unlisted, transfer,
         input_notes=tuple(coded("water.surface", found.notes)),
     )  # fmt: skip
 
@@ -121,18 +109,14 @@ def _check_frames(cameras: Cameras, options: CorrectOptions) -> None:
 
 def _check_port(options: CorrectOptions) -> None:
     """Refuse values that need a water surface."""
-    excluded = {
-        "camera_set": options.camera_set == "mvs",
-        "occlusion": options.occlusion == "on",
-        "method": options.method not in ("auto", "consistent"),
-    }
-    for name in compress(excluded, excluded.values()):
-        raise SettingError(
-            "port.excludes",
-            f"{name.replace('_', '-')} {getattr(options, name)} has no effect with a port."
-            " Omit it; the method is consistent.",
-            option=name,
-        )
+    for name, allowed in (
+        ("camera_set", ("auto", "all")), ("occlusion", ("auto", "off")),
+        ("method", ("auto", "consistent")),
+    ):  # fmt: skip
+        if (value := getattr(options, name)) not in allowed:
+            sentence = f"{name.replace('_', '-')} {value} has no effect with a port. Omit it; the"
+            sentence += " method is consistent."
+            raise SettingError("port.excludes", sentence, option=name)
 
 
 def plan_correction(plan: Plan) -> Plan:
@@ -152,20 +136,16 @@ def plan_correction(plan: Plan) -> Plan:
             transfer.check_models(first.xyz)
     if inputs.port is not None:  # no water surface, and no reconstruction type to detect
         return plan
-    chunks = partial(_all_chunks, plan)
-    labelling = plan.labelling.scanned(parts_of(chunks(), water), view.low, view.high)
-    plan = replace(plan, labelling=labelling)
+    parts = parts_of(_all_chunks(plan), water)
+    plan = replace(plan, labelling=plan.labelling.scanned(parts, view.low, view.high))
     if inputs.check_depths is not None:
-        line = fit_check_depths(inputs.check_depths, parts_of(chunks(), water))
+        line = fit_check_depths(inputs.check_depths, parts_of(_all_chunks(plan), water))
         survey = replace(plan.survey, learned=plan.survey.learned._replace(regression=line))
         notes = coded("regression.fit", (line.words, *line.notes))
         plan = replace(plan, survey=survey, notes=tuple(notes))
-    plan = _estimated_from_cloud(plan, chunks)
-    if (
-        plan.options.dimensions == "all"
-        and plan.survey.learned.regression is None
-        and len(plan.cameras)
-    ):
+    plan = _estimated_from_cloud(plan)
+    has_line = plan.survey.learned.regression is not None
+    if plan.options.dimensions == "all" and len(plan.cameras) and not has_line:
         plan = _with_pose_errors(plan)
     if first is not None and plan.kind is not None:
         plan = _with_type_of_list(plan, first)
@@ -198,23 +178,22 @@ def fit_check_depths(path: File, parts: Iterable[Part]) -> DepthRegression:
         )
         if covered.sum() < LEAST_COUNT:
             raise GeometryError("check_depths.no_bed", notes[0], covered=int(covered.sum()))
-    rows = np.flatnonzero(covered)
-    true = np.asarray(checks.value_m[rows])
-    if checks.are_heights:  # they are subtracted from the water above them
-        true = level[rows] - true
-        above = np.flatnonzero(true < 0.0)
-        if len(above):
-            first = int(rows[above[0]])
-            raise GeometryError(
-                "check_depths.above_water",
-                f"{checks.where(first)}: the height {checks.value_m[first]:.2f} m is above the"
-                f" water, {level[first]:.2f} m there ({len(above)} of {len(rows)} are). Give"
-                " heights of the bed in the cloud's vertical datum, or depths in a column depth.",
-                height_m=float(checks.value_m[first]),
-                count=len(above),
-            )
+    # heights are subtracted from the water above them
+    true = level - checks.value_m if checks.are_heights else checks.value_m
+    above = np.flatnonzero(covered & (true < 0.0))
+    if len(above):  # heights only: the reader has refused negative depths
+        first = int(above[0])
+        height_m = float(checks.value_m[first])
+        raise GeometryError(
+            "check_depths.above_water",
+            f"{checks.where(first)}: the height {height_m:.2f} m is above the water,"
+            f" {level[first]:.2f} m there ({len(above)} of {int(covered.sum())} are). Give heights"
+            " of the bed in the cloud's vertical datum, or depths in a column depth.",
+            height_m=height_m,
+            count=len(above),
+        )
     try:
-        found = fit_depths(apparent[rows], true)
+        found = fit_depths(apparent[covered], true[covered])
     except GeometryError as error:
         raise GeometryError(error.code, f"{checks.name}: {error}", **error.values) from error
     if found.r2 < LEAST_R2:
@@ -225,18 +204,20 @@ def fit_check_depths(path: File, parts: Iterable[Part]) -> DepthRegression:
             r2=found.r2,
             least=LEAST_R2,
         )
-    notes += found.notes
-    return replace(found, notes=tuple(notes))
+    return replace(found, notes=(*notes, *found.notes))
 
 
 def _with_pose_errors(plan: Plan) -> Plan:
     """Return the plan with the errors of adjusted poses, if the adjustment left its members."""
     from pcfix.flow.pose_errors import SAMPLE_POINTS, members_of, pose_errors, with_poses
 
-    members, problem = members_of(plan.inputs.cameras, plan.cameras)
+    try:
+        members = members_of(plan.inputs.cameras, plan.cameras)
+    except InputError as error:
+        note = PcfixWarning("cameras.poses", error)
+        return replace(plan, input_notes=(*plan.input_notes, note))
     if members is None:
-        notes = coded("cameras.poses", filter(None, [problem]))
-        return replace(plan, input_notes=(*plan.input_notes, *notes))
+        return plan
     rows = np.arange(0, plan.view.points, 1 + plan.view.points // SAMPLE_POINTS)
     sample = sample_of(plan.view, rows, plan.found.surface, plan.match)
     errors = pose_errors(sample, plan.survey, members, plan.transfer)
@@ -255,8 +236,9 @@ def _with_type_of_list(plan: Plan, first: Points) -> Plan:
     """Return the plan with the type of its view list, as the first points show it."""
     points = transferred(plan, first, 0)[0]
     batch = replace(batch_of(points, plan.survey, plan.original), views=points.views)
-    is_open = plan.inputs.views_are == "auto" and plan.kind == "depth-maps"
-    is_open = is_open and plan.match is not None
+    # a file of view lists does not state what its images are
+    is_open = plan.match is not None and plan.inputs.views_are == "auto"
+    is_open = is_open and plan.kind == "depth-maps"
     verdict = learning.weigh_lists(learning.submerged_of(batch), is_open=is_open)
     if verdict is None:
         return plan
@@ -264,39 +246,36 @@ def _with_type_of_list(plan: Plan, first: Points) -> Plan:
     return replace(plan, survey=survey, kind=kind, verdicts=(verdict,))
 
 
-def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
+def _estimated_from_cloud(plan: Plan) -> Plan:
     """Resolve every option that is ``auto``, and estimate what the points have in common."""
     survey, view, some_unlisted = plan.survey, plan.view, plan.some_unlisted
-    given = survey.settings if survey.own_water is not None else plan.options
-    # listed cameras saw their points, so that nothing hides them
-    may_hide = plan.kind is None or survey.settings.occlusion != "auto"
+    # listed cameras saw their points, so that nothing occludes them
+    may_occlude = plan.kind is None or survey.settings.occlusion != "auto"
     sample, near, occluder = _scanned(
-        plan, chunks, sample=some_unlisted or learning.wants_sample(survey, plan.kind),
-        occluder=may_hide or some_unlisted,
+        plan, sample=some_unlisted or learning.wants_sample(survey, plan.kind),
+        occluder=may_occlude or some_unlisted,
     )  # fmt: skip
-    if may_hide:
+    if may_occlude:
         survey = replace(survey, learned=survey.learned._replace(occluder=occluder))
-    plan = replace(plan, survey=survey)
     if sample is None:
-        return plan
-    sample = replace(sample, survey=survey)
+        return replace(plan, survey=survey)
     ties = original_ties(plan.inputs, plan.transfer, view.crs)
-    sample, factor = learning.with_factor(sample)
+    sample, factor = learning.with_factor(replace(sample, survey=survey))
     notes = [*plan.notes, *coded("cloud.depth_factor", [] if factor is None else [factor])]
-    if factor is not None:
-        survey, given = sample.survey, replace(given, depth_factor=factor.factor)
     hint = hint_of(plan.options.software or view.software)
     if plan.kind is None:
         survey, verdicts = learning.learn_of_sample(sample, ties, hint, near)
         return replace(plan, survey=survey, verdicts=verdicts, notes=tuple(notes))
     survey = learning.with_matcher(sample, ties)
     if some_unlisted:
-        learned = plan.survey.learned._replace(occluder=occluder)
+        # other points get the reconstruction type that is detected, and may be occluded
+        given = survey.settings if survey.own_water is not None else plan.options
+        if factor is not None:
+            given = replace(given, depth_factor=factor.factor)
         settings = learning.resolved(given, plan.cameras, None)
-        bare = replace(survey, settings=settings, learned=learned)
-        unlisted, verdicts = learning.learn_of_sample(
-            replace(sample, survey=bare), ties, hint, near
-        )
+        learned = survey.learned._replace(occluder=occluder)
+        bare = replace(sample, survey=replace(survey, settings=settings, learned=learned))
+        unlisted, verdicts = learning.learn_of_sample(bare, ties, hint, near)
         survey = replace(survey, unlisted=unlisted)
         words = ["Points missing in the view list are corrected without it.", *map(str, verdicts)]
         notes.append(PcfixWarning("views.unlisted", " ".join(words)))
@@ -304,7 +283,7 @@ def _estimated_from_cloud(plan: Plan, chunks: Chunks) -> Plan:
 
 
 def _scanned(
-    plan: Plan, chunks: Chunks, *, sample: bool, occluder: bool
+    plan: Plan, *, sample: bool, occluder: bool
 ) -> tuple[Batch | None, Batch | None, Occluder | None]:
     """Read the whole cloud once, for a sample of it and for the surface that occludes points.
 
@@ -317,9 +296,7 @@ def _scanned(
     if not sample and builder is None:
         return None, None, None
     # the bed of depth maps needs about 5 points per square metre, wherever the cloud is denser
-    area_m2 = np.prod(np.maximum(np.subtract(view.high, view.low)[:2], 1.0))
-    dense = BED_POINTS_A_M2 * float(area_m2)
-    dense = dense if np.isfinite(dense) else MOST_BED_POINTS  # unknown bounds
+    dense = BED_POINTS_A_M2 * float(np.prod(np.fmax(view.high - view.low, 1.0)))
     step = max(1, view.points // int(np.clip(dense, FEWEST_BED_POINTS, MOST_BED_POINTS)))
     near_step = max(1, view.points // int(max(dense, FEWEST_BED_POINTS)))
     squares = None
@@ -332,14 +309,13 @@ def _scanned(
         squares = Squares(PATCH_WIDTH * (float(np.median(above)) if len(above) else HEIGHT_M))
 
     def every(step: int, row: int, points: Points) -> Batch:
+        """Return each point of a chunk whose row in the cloud is a multiple of the step."""
         some = points._replace(views=None).take(slice(-row % step, None, step))
-        noise = np.isin(some.classes, NOISE_CLASSES)
-        if noise.any():
-            some = some.take(np.flatnonzero(~noise))
+        some = some.take(np.flatnonzero(~np.isin(some.classes, NOISE_CLASSES)))
         return batch_of(some, survey, plan.original)
 
     taken, row = list[Batch](), 0
-    for points in chunks():
+    for points in _all_chunks(plan):
         if builder is not None:
             builder.add(points.xyz, points.classes)
         if sample:

@@ -9,7 +9,7 @@ barometer recorded them. What cannot be tested is listed. None of it changes a r
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -31,15 +31,17 @@ SAMPLE_POINTS, IN_FRAMES = 30_000, 4_000
 MOST_UNSEEN = 0.01
 """Share of a cloud that may lie in fewer than two frames: noise, and the borders of lenses."""
 MOST_RESIDUAL, MOST_HEIGHT = 0.01, 0.02
-"""Of tie points in the images (of the frame), and from the cloud (of the flying height)."""
+"""Largest residual of tie points, as a share of the frame's width, and their largest distance from
+the heights of the cloud, as a share of the flying height; medians."""
 LEAST_TIES, TIES = 10, 3_000
 """The fewest tie points that are compared, in an image or with the cloud, and the most."""
 LEAST_STEPS, STEADY, MOST_TURN_DEG = 10, 0.9, 45.0
 """Steps along flight lines, the consistency of their angle to the images, and its maximum."""
 STEEP_COSINE = 0.9
-"""Of the tilt of images whose top has a clear direction in plan, about 25 degrees."""
+"""Cosine of the largest tilt, about 25 degrees, at which the upper edge of an image has a clear
+direction in plan."""
 MOST_OFF_M = 15.0
-"""In plan, or in height, from positions of the GNSS, in the median; these are often 5 m off."""
+"""Largest median distance from GNSS positions, in plan or in height; these are often 5 m off."""
 TAKE_OFF_M, MOST_SHARE = (-15.0, 25.0), 0.1
 """How high above the water drones take off, and the share of their height that barometers err."""
 
@@ -49,17 +51,28 @@ ABSURD_HEIGHTS = 3.0
 """Largest height of cameras above the cloud, in widths of the cloud."""
 
 
-class Plausible(NamedTuple):
-    """The results of one or more tests."""
+class Passed(str):
+    """A test that was passed, in words."""
 
-    fits: tuple[str, ...] = ()  # tests that were passed
-    problems: tuple[PcfixWarning, ...] = ()  # tests that were not
-    unchecked: tuple[str, ...] = ()  # what could not be tested
+
+class Unchecked(str):
+    """What could not be tested, and why."""
+
+
+Finding: TypeAlias = Passed | Unchecked | PcfixWarning
+"""The result of a test; a warning if it failed."""
+
+
+class Plausible(NamedTuple):
+    """The results of all tests."""
+
+    fits: list[Passed]
+    problems: list[PcfixWarning]
+    unchecked: list[Unchecked]
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        lists = {"fits": self.fits, "problems": self.problems, "unchecked": self.unchecked}
-        return {name: list(map(str, one)) for name, one in lists.items()}
+        return {name: list(map(str, found)) for name, found in self._asdict().items()}
 
 
 @dataclass(frozen=True)
@@ -88,30 +101,28 @@ class CloudSample(Sums):
         known = self.rows[np.isfinite(self.rows[:, 3]), 3]
         return float(np.median(known)) if len(known) else None
 
-    def level_notes(self) -> tuple[PcfixWarning, ...]:
-        """Return warnings if the shoreline in the cloud is at another height than the water."""
+    def level_notes(self) -> list[PcfixWarning]:
+        """Return a warning if the shoreline in the cloud is at another height than the water."""
         known = self.rows[np.isfinite(self.rows[:, 3])]
         if len(known) < LEAST_POINTS:
-            return ()
-        water = known[:, 3]
-        found = find_elsewhere(known[:, :3], water, known[:, 4:])
+            return []
+        found = find_elsewhere(known[:, :3], known[:, 3], known[:, 4:])
         if found is None:
-            return ()
-        off, level = found.level_m, float(np.median(water)) + found.level_m
+            return []
+        off, level = found.level_m, float(np.median(known[:, 3])) + found.level_m
         sentence = (
             f"The cloud's shoreline is {abs(off):.2f} m {'above' if off > 0.0 else 'below'} the"
             f" given water, at about {level:.2f} m (standard error {found.sigma_level_m:.2f} m:"
             f" {'; '.join(found.reasons)}). Check the level and its vertical datum, or try"
             " --water auto."
         )
-        return (PcfixWarning("water.shoreline_level", sentence, off_m=off, level_m=level),)
+        return [PcfixWarning("water.shoreline_level", sentence, off_m=off, level_m=level)]
 
 
 def plausible(
     cameras: Cameras,
     cloud: FloatArray,
     ties: TiePoints | None = None,
-    level_notes: tuple[PcfixWarning, ...] = (),
     *,
     file: File = "",
     water_m: float | None = None,
@@ -120,40 +131,34 @@ def plausible(
     """Test cameras and cloud against each other.
 
     Cameras and tie points are in the cloud's frame; `cloud` are some of its points, shape (n, 3),
-    metres, evenly spread. `level_notes` are those of `CloudSample`, `file` is that of the cameras,
-    `water_m` the median height of the water, and `listed` says whether the listed images were found
-    to hold their points.
+    metres, evenly spread. `file` is that of the cameras, `water_m` the median height of the water,
+    and `listed` says whether the listed images were found to hold their points.
     """
-    level = Plausible(problems=level_notes)
-    if not len(cameras) or not len(cloud):
-        return level
-    in_list = Plausible(fits=("listed points visible in their images",))
-    heights, flown = _ties(cameras, cloud, ties), _flown(cameras, file, water_m)
-    if flown != Plausible():
-        heights = heights._replace(unchecked=())
-    tests = (
-        level,
-        _frames(cameras, np.ascontiguousarray(cloud[:: 1 + len(cloud) // IN_FRAMES])),
-        _directions(cameras),
-        in_list if listed and cameras.lenses else Plausible(),
-        _positions(cameras, str(file)),
-        heights,
-        flown,
-    )
+    found: list[Finding | None] = []
+    if len(cameras) and len(cloud):
+        flown, heights = _flown(cameras, file, water_m), _ties(cameras, cloud, ties)
+        found += [
+            _frames(cameras, np.ascontiguousarray(cloud[:: 1 + len(cloud) // IN_FRAMES])),
+            _directions(cameras),
+            Passed("listed points visible in their images") if listed and cameras.lenses else None,
+            _positions(cameras, str(file)),
+            None if flown and isinstance(heights, Unchecked) else heights,
+            flown,
+        ]
     return Plausible(
-        tuple(one for test in tests for one in test.fits),
-        tuple(one for test in tests for one in test.problems),
-        tuple(one for test in tests for one in test.unchecked),
+        [one for one in found if isinstance(one, Passed)],
+        [one for one in found if isinstance(one, PcfixWarning)],
+        [one for one in found if isinstance(one, Unchecked)],
     )
 
 
-def _frames(cameras: Cameras, xyz: FloatArray) -> Plausible:
+def _frames(cameras: Cameras, xyz: FloatArray) -> Finding:
     """Test whether each point is in two frames or more, as its reconstruction needs two.
 
     A wrong CRS, datum, unit or convention of angles moves frames off the points.
     """
     if cameras.lenses is None or cameras.rotations is None:
-        return Plausible(unchecked=("frames (the cameras have no lenses or no angles)",))
+        return Unchecked("frames (the cameras have no lenses or no angles)")
     unseen = float(np.mean(count_visible_cameras(xyz, cameras) < 2))
     if unseen > MOST_UNSEEN:
         sentence = (
@@ -161,21 +166,18 @@ def _frames(cameras: Cameras, xyz: FloatArray) -> Plausible:
             " heights, angles and interior orientation of the cameras, and whether some are"
             " missing."
         )
-        return Plausible(problems=(PcfixWarning("cameras.no_overlap", sentence, share=unseen),))
-    fits = f"{100.0 * (1.0 - unseen):.4g} % of the points in two frames or more"
-    unchecked = () if cameras.gnss else ("a shift in plan (no GNSS positions)",)
-    return Plausible(fits=(fits,), unchecked=unchecked)
+        return PcfixWarning("cameras.no_overlap", sentence, share=unseen)
+    return Passed(f"{100.0 * (1.0 - unseen):.4g} % of the points in two frames or more")
 
 
-def _ties(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Plausible:
+def _ties(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Finding:
     """Compare tie points with their image coordinates, and with the heights of the cloud."""
     above = float(abs(np.median(cameras.centres[:, 2]) - np.median(cloud[:, 2])))
     if ties is None or cameras.lenses is None or cameras.rotations is None:
-        words = f"heights (no tie points; cameras {above:.0f} m above the cloud)"
-        return Plausible(unchecked=(words,))
+        return Unchecked(f"heights (no tie points; cameras {above:.0f} m above the cloud)")
     found = _worst_residual(cameras, ties)
     if found is None:
-        return Plausible(unchecked=("heights (no tie points in the frames)",))
+        return Unchecked("heights (no tie points in the frames)")
     residual, image = found
     if residual > MOST_RESIDUAL:
         sentence = (
@@ -183,8 +185,7 @@ def _ties(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Plausi
             f" {image} (median). Poses, lens and points of the camera file do not belong together;"
             " export them again."
         )
-        problem = PcfixWarning("cameras.residuals", sentence, share=residual, image=image)
-        return Plausible(problems=(problem,))
+        return PcfixWarning("cameras.residuals", sentence, share=residual, image=image)
     placed = ties.xyz[np.isfinite(ties.xyz).all(axis=1)]
     placed = placed[:: 1 + len(placed) // TIES]
     tree = cKDTree(cloud[:, :2])
@@ -192,7 +193,7 @@ def _ties(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Plausi
     among = np.asarray(tree.query(cloud[:: 1 + len(cloud) // TIES, :2], k=2)[0])
     near = distance <= 2.0 * np.median(among[:, 1])
     if near.sum() < LEAST_TIES:
-        return Plausible(unchecked=("heights (no tie points on the cloud)",))
+        return Unchecked("heights (no tie points on the cloud)")
     off = float(np.median((placed[:, 2] - cloud[row, 2])[near]))
     if abs(off) > MOST_HEIGHT * above:
         sentence = (
@@ -200,9 +201,8 @@ def _ties(cameras: Cameras, cloud: FloatArray, ties: TiePoints | None) -> Plausi
             f" (median of {int(near.sum()):,}). Check the offset, the vertical datum and the unit"
             " of the heights."
         )
-        return Plausible(problems=(PcfixWarning("cameras.height", sentence, off_m=off),))
-    fits = f"tie points match their images, {abs(off):.2f} m from the cloud's heights"
-    return Plausible(fits=(fits,))
+        return PcfixWarning("cameras.height", sentence, off_m=off)
+    return Passed(f"tie points match their images, {abs(off):.2f} m from the cloud's heights")
 
 
 def _worst_residual(cameras: Cameras, ties: TiePoints) -> tuple[float, str] | None:
@@ -226,7 +226,7 @@ def _worst_residual(cameras: Cameras, ties: TiePoints) -> tuple[float, str] | No
     return max(zip(medians, (cameras.labels[i] for i in images), strict=True))
 
 
-def _directions(cameras: Cameras) -> Plausible:
+def _directions(cameras: Cameras) -> Finding:
     """Compare the yaw of near-nadir images with the direction of the flight lines."""
     # steps between near-nadir images that follow each other
     step = np.diff(cameras.centres[:, :2], axis=0)
@@ -236,41 +236,42 @@ def _directions(cameras: Cameras) -> Plausible:
         usual = 2.0 * np.median(length)
         rows = np.flatnonzero((length > 0.0) & (length < usual) & steep[:-1] & steep[1:])
     if cameras.rotations is None or len(rows) < LEAST_STEPS:
-        return Plausible(unchecked=("yaw (the images are not in flight lines)",))
+        return Unchecked("yaw (the images are not in flight lines)")
     top = -cameras.rotations[rows, 1]  # direction of the upper edge, world frame
     heading, yaw = np.arctan2(*step[rows].T), np.arctan2(top[:, 0], top[:, 1])
-    # the angles as they are, and as if radians had been taken for degrees
+    # The angles as they are, and as if radians had been taken for degrees: the mean of unit vectors
+    # has the direction of the usual turn, and the length 1 if all images are turned alike.
     means = [np.mean(np.exp(1j * (heading - angle))) for angle in (yaw, np.degrees(yaw))]
     turns = [abs(float(np.degrees(np.angle(mean)))) for mean in means]
     is_steady = [bool(abs(mean) >= STEADY) for mean in means]
     if not is_steady[0]:
-        return Plausible(unchecked=("yaw (the images are not in flight lines)",))
+        return Unchecked("yaw (the images are not in flight lines)")
     if turns[0] <= MOST_TURN_DEG:
-        return Plausible(fits=("yaw along the flight lines",))
+        return Passed("yaw along the flight lines")
     are_radians = is_steady[1] and turns[1] <= MOST_TURN_DEG
     if turns[0] < 180.0 - MOST_TURN_DEG and not are_radians:  # as cameras are mounted in aircraft
-        return Plausible(unchecked=("yaw (the images are across the flight lines)",))
+        return Unchecked("yaw (the images are across the flight lines)")
     sentence = (
         f"The images are turned by {turns[0]:.0f} degrees against the flight lines. Check the"
         " convention and the unit of the angles, unless the camera was mounted like that."
     )
-    return Plausible(problems=(PcfixWarning("cameras.yaw", sentence, turn_deg=turns[0]),))
+    return PcfixWarning("cameras.yaw", sentence, turn_deg=turns[0])
 
 
-def _positions(cameras: Cameras, name: str) -> Plausible:
+def _positions(cameras: Cameras, name: str) -> Finding | None:
     """Compare the places of cameras with those that their GNSS recorded."""
-    found, has_datum = np.zeros((0, 3)), False
+    if cameras.gnss is None:
+        return Unchecked("a shift in plan (no GNSS positions)")
     try:
-        if cameras.gnss is not None:
-            found = adjusted_minus_gnss(cameras, name)[0]
-            has_datum = is_tied(cameras.crs, name) and (
-                heights_of(frame_of(cameras.crs or "", name).crs) == "gravity"
-            )
+        found = adjusted_minus_gnss(cameras, name)[0]
+        has_datum = is_tied(cameras.crs, name) and (
+            heights_of(frame_of(cameras.crs or "", name).crs) == "gravity"
+        )
     except InputError:
-        return Plausible()
+        return None
     off_m = np.hypot(*found[np.isfinite(found[:, :2]).all(axis=1), :2].T)
     if not len(off_m):
-        return Plausible()
+        return None
     middle = float(np.median(off_m))
     # GNSS heights are above the geoid as stated only where cameras and GNSS have a vertical datum
     up_m = found[np.isfinite(found[:, 2]), 2] if has_datum else np.zeros(0)
@@ -280,44 +281,41 @@ def _positions(cameras: Cameras, name: str) -> Plausible:
             f"The cameras are {abs(above_m):.1f} m {'above' if above_m > 0.0 else 'below'} their"
             " GNSS positions. Check the heights of --cameras-crs, or install the grid of the geoid."
         )
-        return Plausible(
-            problems=(PcfixWarning("cameras.heights_differ", sentence, off_m=above_m),)
-        )
+        return PcfixWarning("cameras.heights_differ", sentence, off_m=above_m)
     if middle <= MOST_OFF_M:
-        return Plausible(fits=(f"positions {middle:.1f} m in plan from their GNSS",))
+        return Passed(f"positions {middle:.1f} m in plan from their GNSS")
     sentence = (
         f"The cameras are {middle:.4g} m in plan from their GNSS positions (median of"
         f" {len(off_m)}). Check their CRS and offset."
     )
-    return Plausible(problems=(PcfixWarning("cameras.gnss", sentence, off_m=middle),))
+    return PcfixWarning("cameras.gnss", sentence, off_m=middle)
 
 
-def _flown(cameras: Cameras, file: File, water_m: float | None) -> Plausible:
+def _flown(cameras: Cameras, file: File, water_m: float | None) -> Finding | None:
     """Compare the heights of cameras above the water with those recorded above take-off.
 
     A wrong vertical datum or unit moves all cameras, which no other test sees without tie points.
     """
     if not file or water_m is None:
-        return Plausible()
+        return None
     recorded = read_altitudes(file, cameras.labels)
     rows = np.flatnonzero(np.isfinite(recorded))
     if not len(rows):
-        return Plausible()
+        return None
     above = float(np.median(cameras.centres[rows, 2])) - water_m
     flown = float(np.median(recorded[rows]))
     off, (low, high), least = above - flown, TAKE_OFF_M, MOST_SHARE * abs(flown)
     where = f"{abs(off):.0f} m {'above' if off > 0.0 else 'below'} the water"
     if low - least <= off <= high + least:
-        return Plausible(fits=(f"heights as recorded in flight, from a take-off {where}",))
+        return Passed(f"heights as recorded in flight, from a take-off {where}")
     sentence = (
         f"The cameras are {above:.0f} m above the water, and recorded {flown:.0f} m above their"
         f" take-off (median of {len(rows)}), which would be {where}. If it was not, check the"
         " vertical datum and the unit of cameras and water."
     )
-    problem = PcfixWarning(
+    return PcfixWarning(
         "cameras.flying_height", sentence, above_water_m=above, above_take_off_m=flown
     )
-    return Plausible(problems=(problem,))
 
 
 def likely_mistake(centres: FloatArray, low: FloatArray, high: FloatArray) -> str | None:

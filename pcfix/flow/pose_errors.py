@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.adjust.transfer import CloudTransfer
-from pcfix.errors import InputError, PcfixWarning
+from pcfix.errors import PcfixWarning, bad_file
 from pcfix.flow.surfaces import Points
 from pcfix.io.files import find_members
 from pcfix.model import NOISE_CLASSES, Cameras, FloatArray, Outcome
@@ -26,23 +26,25 @@ if TYPE_CHECKING:
     from pcfix.adjust.precision import Members
 
 SAMPLE_POINTS, BED_POINTS = 20_000, 1000
-"""Of the cloud, and of its points under water; a thousand is enough, as the errors are smooth."""
+"""Points that are sampled from the cloud, and points under water that are corrected with each
+member; a thousand is enough, as the errors are smooth."""
 
 
-def members_of(path: File | Cameras, cameras: Cameras) -> tuple[Members | None, str]:
-    """Return the members of the adjustment in the folder of its cameras, and a note if unusable."""
-    try:
-        found = None if isinstance(path, Cameras) else find_members(path)
-    except InputError as error:
-        return None, str(error)
+def members_of(path: File | Cameras, cameras: Cameras) -> Members | None:
+    """Return the members of the adjustment in the folder of its cameras, if there are any.
+
+    Raises InputError if they are damaged, or of other cameras.
+    """
+    found = None if isinstance(path, Cameras) else find_members(path)
     if found is None:
-        return None, ""
+        return None
     where, members = found
     aligned = members.aligned(cameras)
-    return aligned, "" if aligned is not None else (
-        f"{where}: belongs to other cameras, so SigmaZ does not include errors of the poses."
-        " Use the cameras that the adjustment wrote, or remove the file."
-    )
+    if aligned is None:
+        sentence = "belongs to other cameras, so SigmaZ does not include errors of the poses. Use"
+        sentence += " the cameras that the adjustment wrote, or remove the file."
+        raise bad_file(where, "cameras.poses", sentence)
+    return aligned
 
 
 def pose_errors(
@@ -54,8 +56,9 @@ def pose_errors(
     the adjustment of the survey's cameras, in their order, and `transfer` has the original cameras,
     if those of the survey were adjusted since.
     """
-    k = len(survey.cameras)
-    transfer = transfer or CloudTransfer(survey.cameras, survey.cameras, np.arange(k))
+    if transfer is None:
+        cameras = survey.cameras
+        transfer = CloudTransfer(cameras, cameras, np.arange(len(cameras)))
     step = transfer.step(sample.xyz, sample.views)
     above = surface_above(survey.water, step.xyz, sample.heights)
     wet = is_submerged(step.xyz[:, 2], above) & step.moved & ~np.isin(sample.classes, NOISE_CLASSES)
@@ -111,9 +114,7 @@ def variances(
 
     with warnings.catch_warnings(action="ignore", category=PcfixWarning):  # shown by the correction
         nominal = heights(survey)
-        off = [
-            heights(_survey_of(survey, members, member)) - nominal for member in range(len(members))
-        ]
+        off = [heights(_survey_of(survey, members, i)) - nominal for i in range(len(members))]
     return np.asarray(np.square(off).mean(axis=0))
 
 

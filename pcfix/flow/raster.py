@@ -34,7 +34,7 @@ from pcfix.running import current
 OUTPUTS = ("height", "depth", "shift", "uncertainty", "outcome", "class")
 """A labelling has the last, a correction the others."""
 BANDS = {"shift": SHIFTS, "uncertainty": ("uncertainty", "SigmaZ")}
-"""Of outputs with several; the band of the others has their name."""
+"""The bands of outputs that have several; the band of the others has their name."""
 NO_CODE = 255
 """Value of cells without a height in outcome and class, which have whole numbers."""
 WINDOW_CELLS = 512
@@ -90,10 +90,10 @@ def raster_writer(
     height. `source` is the open `RasterSource`. The `targets`, as in `OUTPUTS`, are cloud optimised
     GeoTIFFs on its grid. `progress` is called with the number of cells written, and of all.
     """
-    target, full_window, farthest, empty = next(iter(targets.values())), source.window, 0.0, 0
+    target, whole, farthest, empty = next(iter(targets.values())), source.window, 0.0, 0
     is_corrected = SHIFTS[0] in header.point_format.dimension_names
     with scratch_arrays(target) as new:
-        cells = new((full_window.height, full_window.width), CELL)
+        cells = new((whole.height, whole.width), CELL)
         release = current().release  # `append` runs in a thread that has other settings
 
         def append(points: Any) -> None:
@@ -121,16 +121,14 @@ def raster_writer(
                 name: files.enter_context(_new_raster(path, name, source, tags))
                 for name, path in targets.items()
             }
-            for window in full_window.parts(WINDOW_CELLS):
+            for window in whole.parts(WINDOW_CELLS):
                 layers, lost = _layers(source, cells, window, margin if is_corrected else None)
                 empty += lost
                 for name, out in outs.items():
                     rasters.write_bands(out, layers[name], window)
                 release()
                 if progress is not None:
-                    progress(
-                        window.row_stop * full_window.width, full_window.height * full_window.width
-                    )
+                    progress(window.row_stop * whole.width, whole.height * whole.width)
     if empty:
         sentence = f"{target}: {empty:,} cells under water have no height any more, as no corrected"
         sentence += " point is near. Fill them in a GIS if you need them."

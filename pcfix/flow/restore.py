@@ -83,13 +83,12 @@ def _restoring(plan: None, source: LasSource) -> FileWork:
 
 def _ours(source: LasSource, settings: dict[str, Any]) -> set[str]:
     """Return the dimensions that pcfix added; InputError if any is missing or has changed."""
-    dimensions = settings["dimensions"]
-    columns = columns_for(dimensions)
-    names = {column.name for column in columns}
-    wrong, header = "", source.header.point_format
+    written, header = settings["dimensions"], source.header.point_format
+    columns = columns_for(written)
+    names, wrong = {column.name for column in columns}, ""
     missing = names.difference(header.dimension_names)
     if not names.issuperset(SHIFTS):
-        wrong = f"was written with --dimensions {dimensions}, which cannot be undone"
+        wrong = f"was written with --dimensions {written}, which cannot be undone"
     elif missing:
         wrong = f"has lost the dimensions {', '.join(sorted(missing))} since it was corrected"
     else:

@@ -144,7 +144,7 @@ class RunFolder:
     def cameras(self) -> Cameras:
         """The cameras in the CRS of the cloud."""
         with _shown_before():
-            return read_blocks(self.inputs, view_of(self.cloud("corrected")).crs).cameras
+            return read_blocks(self.inputs, view_of(self.cloud("corrected"))).cameras
 
     @cached_property
     def water(self) -> WaterSurface:

@@ -44,7 +44,6 @@ from pcfix.running import current, running, threads
 
 if TYPE_CHECKING:
     import laspy
-    from matplotlib.figure import Figure
 
 Result = TypeVar("Result")
 Chunk: TypeAlias = "laspy.ScaleAwarePointRecord"
@@ -421,15 +420,8 @@ def check_summary(options: Any, inputs: Iterable[File] = ()) -> None:
             known.append(files.check_output(path, overwrite=options.overwrite, inputs=known))
 
 
-def write_summary(options: Any, summary: Any, figure: Callable[[], Figure] | None = None) -> None:
-    """Write a summary as JSON and its figure as PNG, if the options name files for them.
-
-    The summary is a dict, or has a method `as_dict`.
-    """
-    if figure is not None and options.plot is not None:
-        from pcfix.report.page import png_of
-
-        write_bytes(options.plot, png_of(figure()), overwrite=options.overwrite)
+def write_summary(options: Any, summary: Any) -> None:
+    """Write a summary, a dict or with a method `as_dict`, as JSON if the options name a file."""
     path = getattr(options, "summary", None)
     if path is not None:
         values = summary if isinstance(summary, dict) else summary.as_dict()

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from functools import partial
 from os import PathLike
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -100,16 +100,15 @@ def sample_of(
             break
     if len(parts) == 1:
         return parts[0]
-    joined = [
+    joined: list[Any] = [
         None if any(v is None for v in one) else np.concatenate(one)
         for one in zip(*(part[:-2] for part in parts), strict=True)
     ]
-    lists = [part.views for part in parts if part.views is not None]
-    if not lists:
-        return Points._make([*joined, None, None])
-    start = np.cumsum(np.concatenate([[0], *(np.diff(one.start) for one in lists)]))
-    camera = np.concatenate([one.camera for one in lists])
-    return Points._make([*joined, Views(start, camera, kind=lists[0].kind), None])
+    views, lists = None, [part.views for part in parts if part.views is not None]
+    if lists:
+        start = np.cumsum(np.concatenate([[0], *(np.diff(one.start) for one in lists)]))
+        views = Views(start, np.concatenate([one.camera for one in lists]), kind=lists[0].kind)
+    return Points(*joined)._replace(views=views)
 
 
 def parts_of(chunks: Iterable[Points], water: WaterSurface) -> Iterable[Part]:
@@ -138,15 +137,20 @@ def find_surface(
     if not isinstance(water, str | PathLike | float | int):
         return FoundSurface(water)
     if str(water).strip().lower() == "auto":
-        return _found(view)
+        from pcfix.water.auto import find_water
+
+        if view is None:
+            text = "The water surface 'auto' is found in a cloud. Give the cloud too."
+            raise SettingError("cloud.missing", text)
+        some = sample_of(view, SAMPLE_POINTS)
+        some = some.take(np.flatnonzero(~np.isin(some.classes, NOISE_CLASSES)))
+        return find_water(some.xyz, some.rgb)
     if isinstance(water, str | PathLike) and is_vector_file(water):
         return _fitted(options, water, view)
-    if view is None:
-        return FoundSurface(read_water(water))
-    found = read_water(water, view.crs)
-    if isinstance(found, WaterMesh):
+    found = read_water(water, None if view is None else view.crs)
+    if view is not None and isinstance(found, WaterMesh):
         _check_near(str(water), found.vertices, view, 0.0)
-    elif isinstance(found, WaterRaster):
+    elif view is not None and isinstance(found, WaterRaster):
         sides = np.multiply(found.height_m.shape[::-1], found.cell_m) * [1.0, -1.0]
         corner = np.array([found.left_m, found.top_m])
         _check_near(str(water), np.array([corner, corner + sides]), view, 0.0)
@@ -196,28 +200,26 @@ def own_water_of(
             options=["water_per_image", "water"],
         )
     west, south, east, north = view.bounds
-    paths = rasters_of_images(folder, cameras.labels)
     offset = np.zeros(len(cameras)) if level_offset_m is None else level_offset_m
-    heights = dict[int, WaterRaster]()
-    overlaps, differs = [], list[float]()
+    heights, overlaps, differs_m = dict[int, WaterRaster](), False, list[float]()
     with warnings.catch_warnings():  # those of the first raster are enough
-        for image, path in paths.items():
+        for image, path in rasters_of_images(folder, cameras.labels).items():
             heights[image] = raster = read_water_raster(path, view.crs)
             warnings.simplefilter("ignore", PcfixWarning)
             # the rasters must overlap the cloud, and have the vertical datum of the common water
             rows, columns = np.nonzero(np.isfinite(raster.height_m))
             x = raster.left_m + (columns + 0.5) * raster.cell_m[0]
             y = raster.top_m - (rows + 0.5) * raster.cell_m[1]
-            overlaps.append(((x >= west) & (x <= east) & (y >= south) & (y <= north)).any())
+            overlaps |= bool(((x >= west) & (x <= east) & (y >= south) & (y <= north)).any())
             if not isinstance(water, WaterDimension):
                 common = surface_above(water, np.column_stack([x, y, x])).height_m + offset[image]
                 off = raster.height_m[rows, columns] - common
                 if np.isfinite(off).any():
-                    differs.append(float(np.nanmedian(off)))
-    if np.isfinite(west) and not any(overlaps):
+                    differs_m.append(float(np.nanmedian(off)))
+    if np.isfinite(west) and not overlaps:
         text = f"{folder}: none of its rasters overlaps the cloud. Check their CRS."
         raise InputError("water.no_overlap", text, path=folder)
-    off_m = float(np.median(differs)) if differs else 0.0
+    off_m = float(np.median(differs_m)) if differs_m else 0.0
     if abs(off_m) > MOST_OFFSET_M:
         raise InputError(
             "water.datum",
@@ -225,20 +227,8 @@ def own_water_of(
             " same vertical datum, and 'pcfix calm' the --level of the calm water.",
             path=folder, difference_m=off_m,
         )  # fmt: skip
-    k, rest = len(cameras), water if isinstance(water, WaterRaster) else None
-    return build_fields(heights, k, rest)
-
-
-def _found(view: CloudView | None) -> FoundSurface:
-    """Find the water level in a cloud."""
-    from pcfix.water.auto import find_water
-
-    if view is None:
-        text = "The water surface 'auto' is found in a cloud. Give the cloud too."
-        raise SettingError("cloud.missing", text)
-    some = sample_of(view, SAMPLE_POINTS)
-    some = some.take(np.flatnonzero(~np.isin(some.classes, NOISE_CLASSES)))
-    return find_water(some.xyz, some.rgb)
+    rest = water if isinstance(water, WaterRaster) else None
+    return build_fields(heights, len(cameras), rest)
 
 
 def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundSurface:
@@ -263,8 +253,7 @@ def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundS
             " ignored."
         )
         warnings.warn(PcfixWarning("water.points", words), stacklevel=2)
-    if options.water_model == "river":
-        low, high = corners(*xyz[:, :2].T)
-        bounds = (*low.tolist(), *high.tolist()) if view is None else view.bounds
-        return fit_river(xyz, bounds, name=shore.name, counts=shore.counts)
-    return fit_water(xyz, model=options.water_model, counts=shore.counts)
+    if options.water_model != "river":
+        return fit_water(xyz, model=options.water_model, counts=shore.counts)
+    low, high = (view.low, view.high) if view is not None else corners(*xyz[:, :2].T)
+    return fit_river(xyz, (*low.tolist(), *high.tolist()), name=shore.name, counts=shore.counts)

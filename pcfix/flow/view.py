@@ -32,14 +32,9 @@ if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
-AXIS_SHARE = 0.06
-"""Length of the line along the axis of a camera, as a share of its height above the clouds."""
 WATER_CELLS = 40
 SHOWN = ("WaterDepth", "SigmaZ", *SHIFTS)
 LINE_COLOURS = {"water": (0.65, 0.82, 0.89), "cameras": (0.04, 0.37, 0.54)}
-AZIMUTH_DEG, ELEVATION_DEG = -119.0, 29.0
-"""The view is from the south-west, from above."""
-MOST_DOTS = 30_000
 GREY = 0.72
 """Of points without a value, such as land where depths are shown."""
 MOST_PERCENT = 98.0
@@ -57,24 +52,20 @@ COLOURS = {
 """Ramp, name, dimension and factor of the values, and what to do where no cloud has any."""
 
 
-class _Layer(NamedTuple):
-    """Some points of a cloud, world frame, and the values of its dimensions by name."""
+class Shown(NamedTuple):
+    """Some points of a cloud, the values of its dimensions by name, and the colours of the points.
+
+    They are in the world frame until all clouds are moved to a common origin.
+    """
 
     name: str
     xyz: FloatArray
     known: dict[str, FloatArray]
+    rgb: FloatArray = np.empty((0, 3))
 
 
-class Scene3d(NamedTuple):
-    """Named clouds with their colours, and the lines of cameras and water, metres from an origin.
-
-    `lines`, "cameras" and "water", have the shape (k, 2, 3): optical axes, and a grid.
-    """
-
-    names: list[str]
-    xyz: list[FloatArray]
-    rgb: list[FloatArray]
-    lines: dict[str, FloatArray]
+Lines = dict[str, FloatArray]
+"""Optical axes of "cameras" and a grid of the "water", shape (k, 2, 3) each."""
 
 
 def view_clouds(
@@ -105,51 +96,52 @@ def view_clouds(
         sentence = "--colour error is the height above a reference. Give --reference too."
         raise SettingError("option.missing", sentence, option="reference")
     paths = [check_input(cloud) for cloud in clouds]
-    first, layers = view_of(paths[0]), list[_Layer]()
+    first, shown = view_of(paths[0]), list[Shown]()
     crs_of_all: Any = first.crs
     surface = None if given.water is None else find_surface(given.water, given, first).surface
+    if isinstance(surface, WaterDimension):
+        surface = None  # a dimension has no surface between its points
     for path in paths:
         some, crs = _read(path, given.points)
         check_same_crs(first.name, crs_of_all, str(path), crs)
-        layers += some
+        shown += some
     if given.reference is not None:
         target = read_reference(given.reference)
         check_same_crs(first.name, crs_of_all, target.name, target.crs)
         step = 1 + len(target.xyz) // given.points
-        layers.append(_Layer(f"reference {Path(target.name).name}", target.xyz[::step], {}))
-    xyz = [one.xyz for one in layers]
-    values = [_values(given.colour, one, surface, xyz[-1]) for one in layers]
+        shown.append(Shown(f"reference {Path(target.name).name}", target.xyz[::step], {}))
+    values = [_values(given.colour, one, surface, shown[-1].xyz) for one in shown]
     if not any(np.isfinite(one).any() for one in values):
         sentence = f"No cloud has values for --colour {given.colour}. {COLOURS[given.colour][-1]}"
         raise SettingError("view.no_values", sentence, colour=given.colour)
     scale = _scale_of(given.colour, np.concatenate(values))
-    rgb = [scale.to_rgba(np.ma.masked_invalid(one))[:, :3] for one in values]
-    points = np.vstack(xyz)
+    points = np.vstack([one.xyz for one in shown])
     low, high = points.min(axis=0), points.max(axis=0)
-    lines = {"water": _grid(surface, low, high)}
+    lines = {} if surface is None else {"water": _grid(surface, low, high)}
     if given.cameras is not None:
         inputs = replace(given, water=0.0 if given.water is None else given.water).part(Inputs)
         cameras = inputs.block(first.crs)[0]
-        length = AXIS_SHARE * max(float(np.median(cameras.centres[:, 2])) - high[2], 1.0)
+        # the lines along optical axes are short against the height above the clouds
+        length = 0.06 * max(float(np.median(cameras.centres[:, 2])) - high[2], 1.0)
         down = np.array([0.0, 0.0, -1.0])
         axes = down if cameras.rotations is None else cameras.rotations[:, 2]
         lines["cameras"] = np.stack([cameras.centres, cameras.centres + length * axes], axis=1)
     # coordinates relative to the common centre
     ends = np.vstack([low, high, *(one.reshape(-1, 3) for one in lines.values())])
     origin = (ends.min(axis=0) + ends.max(axis=0)) / 2.0
-    scene = Scene3d(
-        [one.name for one in layers], [one - origin for one in xyz], rgb,
-        {name: one - origin for name, one in lines.items() if len(one)},
-    )  # fmt: skip
+    lines = {name: one - origin for name, one in lines.items()}
+    for row, one in enumerate(values):
+        rgb = scale.to_rgba(np.ma.masked_invalid(one))[:, :3]
+        shown[row] = shown[row]._replace(xyz=shown[row].xyz - origin, rgb=rgb)
     if given.image is None:
-        _show(scene, f"pcfix view: {given.colour}")
+        _show(shown, lines, f"pcfix view: {given.colour}")
         return ""
-    picture = png_of(view_figure(scene, scale, given.colour))
+    picture = png_of(view_figure(shown, lines, scale, COLOURS[given.colour][1]))
     write_bytes(given.image, picture, overwrite=given.overwrite)
-    return f"{given.image}: {', '.join(scene.names)} by {given.colour}"
+    return f"{given.image}: {', '.join(one.name for one in shown)} by {given.colour}"
 
 
-def _read(path: Path, most: int) -> tuple[list[_Layer], Any]:
+def _read(path: Path, most: int) -> tuple[list[Shown], Any]:
     """Return a cloud, its apparent points if they are known, and its CRS."""
     with LasSource(path) as source:
         crs = metric_crs(source)
@@ -163,20 +155,20 @@ def _read(path: Path, most: int) -> tuple[list[_Layer], Any]:
     if not parts:
         raise InputError("cloud.empty", f"{path}: has no points to show.", path=path)
     rows = np.vstack(parts)
-    after = _Layer(path.name, rows[:, :3], dict(zip(names, rows.T[3:], strict=True)))
+    after = Shown(path.name, rows[:, :3], dict(zip(names, rows.T[3:], strict=True)))
     if not {*SHIFTS, "WaterDepth"} <= after.known.keys():
         return [after], crs
     shift = np.column_stack([after.known[name] for name in SHIFTS])
     depth = after.known["WaterDepth"]
     apparent = np.where(depth > 0.0, depth + shift[:, 2], 0.0)
-    return [_Layer(f"{path.name} before", after.xyz - shift, {"WaterDepth": apparent}), after], crs
+    return [Shown(f"{path.name} before", after.xyz - shift, {"WaterDepth": apparent}), after], crs
 
 
 def _values(
-    colour: str, layer: _Layer, surface: WaterSurface | None, reference: FloatArray
+    colour: str, cloud: Shown, surface: WaterSurface | None, reference: FloatArray
 ) -> FloatArray:
-    """Return the values for the colours of a layer, NaN where unknown."""
-    xyz, known = layer.xyz, layer.known
+    """Return the values for the colours of a cloud, NaN where unknown."""
+    xyz, known = cloud.xyz, cloud.known
     if colour == "height":
         return xyz[:, 2]
     found = np.full(len(xyz), np.nan)
@@ -189,18 +181,13 @@ def _values(
     _, _, name, factor, _ = COLOURS[colour]
     if name in known:
         return np.where(known[name] != 0.0, factor * known[name], np.nan)
-    if colour == "depth" and surface is not None and not isinstance(surface, WaterDimension):
+    if colour == "depth" and surface is not None:
         found = surface_above(surface, xyz).height_m - xyz[:, 2]
     return np.where(found > 0.0, found, np.nan)
 
 
-def _grid(surface: WaterSurface | None, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return the edges of cells of the water over the clouds.
-
-    A dimension has no surface between its points.
-    """
-    if surface is None or isinstance(surface, WaterDimension):
-        return np.zeros((0, 2, 3))
+def _grid(surface: WaterSurface, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return the edges of cells of the water over the clouds, shape (k, 2, 3)."""
     sides = [np.linspace(low[axis], high[axis], WATER_CELLS + 1) for axis in (0, 1)]
     xyz = np.dstack([*np.meshgrid(*sides), np.zeros((WATER_CELLS + 1, WATER_CELLS + 1))])
     xyz[..., 2] = surface_above(surface, xyz.reshape(-1, 3)).height_m.reshape(xyz.shape[:2])
@@ -229,7 +216,7 @@ def _scale_of(what: str, values: FloatArray) -> ScalarMappable:
     return ScalarMappable(Normalize(low, high), ramp)
 
 
-def _show(scene: Scene3d, title: str) -> None:
+def _show(shown: list[Shown], lines: Lines, title: str) -> None:
     """Open open3d's viewer with a switch for each cloud, and return when it is closed."""
     on_x = sys.platform.startswith("linux")
     if on_x and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
@@ -238,37 +225,34 @@ def _show(scene: Scene3d, title: str) -> None:
         )
     o3d = load_open3d()
     points, things = o3d.utility.Vector3dVector, []
-    for name, xyz, rgb in zip(scene.names, scene.xyz, scene.rgb, strict=True):
-        cloud = o3d.geometry.PointCloud(points(xyz))
-        cloud.colors = points(rgb)
-        things.append({"name": name, "geometry": cloud})
-    for name, edges in scene.lines.items():
+    for one in shown:
+        cloud = o3d.geometry.PointCloud(points(one.xyz))
+        cloud.colors = points(one.rgb)
+        things.append({"name": one.name, "geometry": cloud})
+    for name, edges in lines.items():
         ends = o3d.utility.Vector2iVector(np.arange(2 * len(edges)).reshape(-1, 2))
-        lines = o3d.geometry.LineSet(points(edges.reshape(-1, 3)), ends)
-        lines.paint_uniform_color(LINE_COLOURS[name])
-        things.append({"name": name, "geometry": lines})
+        line_set = o3d.geometry.LineSet(points(edges.reshape(-1, 3)), ends)
+        line_set.paint_uniform_color(LINE_COLOURS[name])
+        things.append({"name": name, "geometry": line_set})
     o3d.visualization.draw(
         things, title=title, show_ui=True, point_size=3, line_width=1, bg_color=(1.0, 1.0, 1.0, 1.0)
     )
 
 
-def view_figure(scene: Scene3d, scale: ScalarMappable, what: str) -> Figure:
+def view_figure(shown: list[Shown], lines: Lines, scale: ScalarMappable, label: str) -> Figure:
     """Draw each cloud as dots with its name, side by side, and the scale of the colours."""
-    count = len(scene.names)
-    figure, axes = new_figure(
-        0.8 + 6.4 * count, 5.2, ncols=count, squeeze=False, subplot_kw={"projection": "3d"}
-    )
-    for panel, name, xyz, rgb in zip(axes[0], scene.names, scene.xyz, scene.rgb, strict=True):
-        step = max(1, len(xyz) // MOST_DOTS)
-        panel.set_title(name)
-        panel.scatter(*xyz[::step].T, c=rgb[::step], s=1, depthshade=False)
-        for kind, edges in scene.lines.items():
+    width, grid = 0.8 + 6.4 * len(shown), {"ncols": len(shown), "squeeze": False}
+    figure, axes = new_figure(width, 5.2, **grid, subplot_kw={"projection": "3d"})
+    for panel, one in zip(axes[0], shown, strict=True):
+        step = max(1, len(one.xyz) // 30_000)
+        panel.set_title(one.name)
+        panel.scatter(*one.xyz[::step].T, c=one.rgb[::step], s=1, depthshade=False)
+        for kind, edges in lines.items():
             gaps = np.full((len(edges), 1, 3), np.nan)  # between the edges
             line = np.hstack([edges, gaps]).reshape(-1, 3)
             panel.plot(*line.T, color=LINE_COLOURS[kind], linewidth=0.5)
-        panel.view_init(ELEVATION_DEG, AZIMUTH_DEG)
+        panel.view_init(29.0, -119.0)  # degrees: from the south-west, from above
         panel.set_aspect("equal")
         panel.set(xlabel="East (m)", ylabel="North (m)", zlabel="Height (m)")
-    label = COLOURS[what][1]
     figure.colorbar(scale, ax=list(axes[0]), label=label, shrink=0.8, extend="both")
     return figure

@@ -32,12 +32,14 @@ def grid_window(
     TIN, and `spacing` of the points (see `pcfix.clean.neighbours`) are in cells. The bands have the
     shape of the window, NaN if unknown.
     """
-    cell = lattice.cells(points)
-    inner, shape = window.holds(cell), (window.height, window.width)
-    code = (cell[inner, 1] - window.row) * window.width + cell[inner, 0] - window.column
+    shape = window.height, window.width
+    column, row = (lattice.cells(points) - (window.column, window.row)).T
+    inner = (column >= 0) & (column < window.width) & (row >= 0) & (row < window.height)
+    code = row[inner] * window.width + column[inner]
     cells = cell_statistics(code, points[inner, 2], window.height * window.width)
     if method == "tin":
-        height = triangulated(lattice.positions(points), points[:, 2], window, reach, spacing)
+        away = np.column_stack([points[:, 0] - lattice.left_m, lattice.top_m - points[:, 1]])
+        height = triangulated(away / lattice.resolution_m, points[:, 2], window, reach, spacing)
     else:
         height = cells[method]
     counts, spread = cells["points"].reshape(shape), cells["spread"].reshape(shape)
@@ -68,9 +70,6 @@ def cell_statistics(cell: IntArray, z: FloatArray, size: int) -> dict[str, Any]:
     return {"points": count, **dict(zip(names, statistics, strict=True))}
 
 
-MOVED = 1e-4
-"""Displacement for the choice of triangles, relative to the spacing of the points."""
-ON_EDGE = 1e-9  # of a barycentric coordinate: a centre on an edge belongs to both sides
 _MIX = np.array([0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB], np.uint64)
 
 
@@ -86,7 +85,7 @@ def triangulated(
     """
     out = np.full(window.height * window.width, np.nan)
     position, z = _one_a_place(position, z)
-    moved = position + MOVED * spacing * _offsets(position)
+    moved = position + 1e-4 * spacing * _offsets(position)  # for the choice of triangles
     row, column = np.divmod(np.arange(out.size), window.width)
     centre = np.column_stack([column + window.column, row + window.row]) + 0.5
     origin = np.floor(moved.mean(axis=0)) if len(moved) else 0.0
@@ -94,7 +93,7 @@ def triangulated(
         mesh = Delaunay(moved - origin)
     except (QhullError, ValueError):  # fewer than three points, or all on one line
         return out.reshape(window.height, window.width)
-    found = mesh.find_simplex(centre - origin, tol=ON_EDGE)
+    found = mesh.find_simplex(centre - origin, tol=1e-9)  # a centre on an edge is on both sides
     corners = np.sort(mesh.simplices[found], axis=1)
     # the radius of the circle through three points is a b c / 4 area
     a, b, c = np.moveaxis(moved[corners], 1, 0)
@@ -118,16 +117,13 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def _one_a_place(position: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return points sorted by column and row, each place once, with the mean of its heights."""
-    order = np.lexsort((z, position[:, 1], position[:, 0]))
+    order = np.lexsort((position[:, 1], position[:, 0]))
     position, z = position[order], z[order]
     new = np.ones(len(z), bool)
     new[1:] = (position[1:] != position[:-1]).any(axis=1)
     if new.all():
         return position, z
-    first = np.flatnonzero(new)
-    n = np.diff(first, append=len(z))
-    mean = z[first] + np.add.reduceat(z - np.repeat(z[first], n), first) / n
-    return position[first], mean
+    return position[new], cell_statistics(np.cumsum(new) - 1, z, int(new.sum()))["mean"]
 
 
 def _offsets(position: FloatArray) -> FloatArray:
@@ -143,8 +139,6 @@ def _offsets(position: FloatArray) -> FloatArray:
     return np.asarray((mixed >> np.uint64(11)) / 2.0**53 - 0.5)
 
 
-PART_CELLS, PART_MARGINS = 64, 8
-"""Side of a part, cells: small triangulations take half the time per point."""
 SLACK_CELLS = 1.5
 """Rims k + 1 cells apart enclose k empty ones; circles through their corners are a bit wider."""
 
@@ -165,7 +159,7 @@ def fill_holes(height: FloatArray, window: Window, around: Window, widest: float
     from scipy.ndimage import binary_erosion
 
     margin = margin_cells(widest)
-    side = max(PART_CELLS, PART_MARGINS * margin)
+    side = max(64, 8 * margin)  # small triangulations take half the time per point
     filled = np.empty((window.height, window.width))
 
     def fill(part: Window) -> None:

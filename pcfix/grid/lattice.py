@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pcfix.errors import SettingError
-from pcfix.model import BoolArray, FloatArray, IntArray
+from pcfix.model import FloatArray, IntArray
 from pcfix.options.steps import MIN_RESOLUTION_M
 
 MAX_CELLS = 1_000_000_000
@@ -41,12 +41,6 @@ class Window(NamedTuple):
         return Window(
             self.row - cells, self.row_stop + cells, self.column - cells, self.column_stop + cells
         )
-
-    def holds(self, cell: IntArray) -> BoolArray:
-        """Return whether columns and rows, shape (n, 2), are in the window."""
-        column, row = cell.T
-        across = (column >= self.column) & (column < self.column_stop)
-        return np.asarray(across & (row >= self.row) & (row < self.row_stop))
 
     def parts(self, side: int) -> Iterator[Window]:
         """Yield squares of `side` cells that cover the window, row by row."""
@@ -104,17 +98,18 @@ class Lattice:
         """The whole raster."""
         return Window(0, self.height, 0, self.width)
 
+    def centres(self, window: Window) -> FloatArray:
+        """Return x and y of the centres of the cells of a window, shape (n, 2), row by row."""
+        row, column = np.divmod(np.arange(window.height * window.width), window.width)
+        x = self.left_m + (column + window.column + 0.5) * self.resolution_m
+        return np.column_stack([x, self.top_m - (row + window.row + 0.5) * self.resolution_m])
+
     def box(self, window: Window) -> tuple[FloatArray, FloatArray]:
         """Return the least and largest x, y and z of a window, and of a cell more on each side."""
         first = np.array([window.column - 1, -window.row_stop - 1, -np.inf])
         last = np.array([window.column_stop + 1, -window.row + 1, np.inf])
         corner = np.array([self.left_m, self.top_m, 0.0])
         return corner + first * self.resolution_m, corner + last * self.resolution_m
-
-    def positions(self, xyz: FloatArray) -> FloatArray:
-        """Return columns and rows of points, shape (n, 2), cells from the top left corner."""
-        away = np.column_stack([xyz[:, 0] - self.left_m, self.top_m - xyz[:, 1]])
-        return np.asarray(away / self.resolution_m)
 
     def cells(self, xyz: FloatArray) -> IntArray:
         """Return the column and row of points, shape (n, 2), counted from the top left corner."""
@@ -146,14 +141,11 @@ def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float, name: s
         return np.asarray(last - first + 1.0)
 
     if size(resolution_m).prod() > MAX_CELLS:
-        finest = resolution_m
-        while size(finest).prod() > MAX_CELLS:
-            finest = float(f"{1.05 * finest:.2g}")
         columns, rows = size(resolution_m)
+        finest = float(f"{1.06 * resolution_m * math.sqrt(columns * rows / MAX_CELLS):.2g}")
         sentence = (
-            f"{name}: a resolution of {resolution_m:g} m makes {columns:,.0f} x {rows:,.0f} cells,"
-            f" more than {MAX_CELLS:,}. Use {finest:g} m or more, or first remove points that are"
-            " far from all others (pcfix clean)."
+            f"{name}: {columns:,.0f} x {rows:,.0f} cells of {resolution_m:g} m are too many. Use"
+            f" {finest:g} m or more, or first remove points far from all others (pcfix clean)."
         )
         raise SettingError("option.resolution", sentence, value=resolution_m, finest=finest)
     (west, south), (east, north) = cells_of(np.array([low, high]), resolution_m).tolist()

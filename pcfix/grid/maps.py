@@ -17,7 +17,6 @@ from pcfix.sums import nice_step
 DEPTH = "YlGnBu"
 HEIGHT = "cividis"
 UNCERTAINTY = "OrRd"
-RAYS = "Purples"
 DIFFERENCE = "RdBu_r"
 
 
@@ -38,12 +37,10 @@ DARKEST = 0.35
 """Share of the colour without light."""
 SUN = np.array([-0.5, 0.5, 0.5**0.5])
 """Direction of the sun, east, north and up: in the north-west, 45 degrees above the horizon."""
-NO_LIGHT = 0
-"""Value of cells without a height."""
 
 
 def relief_colours(
-    light: npt.NDArray[np.uint8], depth_m: FloatArray, deepest_m: float
+    light: FloatArray, depth_m: FloatArray, deepest_m: float
 ) -> npt.NDArray[np.uint8]:
     """Return red, green, blue and alpha, shape (4, rows, columns), of a shaded bed and its land.
 
@@ -52,18 +49,18 @@ def relief_colours(
     """
     stops = stops_of(DEPTH, 33)
     at = np.array([share for share, _ in stops]) * deepest_m
-    lit = DARKEST + (1.0 - DARKEST) * (light - 1.0) / 254.0 / SUN[2]
+    lit = DARKEST + (1.0 - DARKEST) * light / SUN[2]
     colours = [
         np.where(np.isnan(depth_m), land, np.interp(np.nan_to_num(depth_m), at, ramp))
         for land, ramp in zip(LAND, np.array([colour for _, colour in stops]).T, strict=True)
     ]
-    alpha = np.where(light == NO_LIGHT, 0, 255)
+    alpha = np.full(light.shape, 255.0)
     bands = [np.clip(np.rint(band * lit), 0, 255) for band in colours]
-    return np.where(alpha > 0, [*bands, alpha], 0).astype(np.uint8)
+    return np.where(np.isnan(light), 0.0, [*bands, alpha]).astype(np.uint8)
 
 
-def hillshade(height: FloatArray, resolution_m: float) -> npt.NDArray[np.uint8]:
-    """Return the brightness of each cell, 1 (dark) to 255; `NO_LIGHT` without a height.
+def hillshade(height: FloatArray, resolution_m: float) -> FloatArray:
+    """Return the brightness of each cell, 0 (dark) to 1 in 254 steps; NaN without a height.
 
     The slope of a cell comes from its eight neighbours, the four nearest counting twice (B. K. P.
     Horn, Hill shading and the reflectance map, 1981); the light is the cosine of the angle between
@@ -86,12 +83,8 @@ def hillshade(height: FloatArray, resolution_m: float) -> npt.NDArray[np.uint8]:
     slope_x, slope_y = (east - west) / (8.0 * resolution_m), (north - south) / (8.0 * resolution_m)
     cosine = SUN[2] - SUN[0] * slope_x - SUN[1] * slope_y
     cosine /= np.sqrt(1.0 + slope_x**2 + slope_y**2)
-    light = np.rint(1.0 + 254.0 * np.clip(cosine, 0.0, 1.0))
-    return np.where(np.isnan(own), NO_LIGHT, light).astype(np.uint8)
-
-
-Extent = tuple[float, float, float, float]
-"""West, east, south and north, metres."""
+    light = np.rint(254.0 * np.clip(cosine, 0.0, 1.0)) / 254.0
+    return np.where(np.isnan(own), np.nan, light)
 
 
 def smoothed(values: FloatArray, sigma_cells: float) -> FloatArray:
@@ -104,13 +97,6 @@ def smoothed(values: FloatArray, sigma_cells: float) -> FloatArray:
     return np.where(known, total / np.maximum(weight, 1e-9), np.nan)
 
 
-MOST_LEVELS, LEAST_INTERVAL_M = 15, 1e-3
-SMOOTH_CELLS = 1.0
-"""Standard deviation of the filter before the lines are drawn."""
-LEAST_CELLS = 12.0
-"""Shorter lines are dropped."""
-
-
 def depth_interval(depth_m: FloatArray, uncertainty_m: FloatArray) -> float:
     """Return the interval for a map of depths: few levels, and not finer than the uncertainty.
 
@@ -119,7 +105,7 @@ def depth_interval(depth_m: FloatArray, uncertainty_m: FloatArray) -> float:
     known = uncertainty_m[np.isfinite(uncertainty_m)]
     deepest = np.max(depth_m, where=np.isfinite(depth_m), initial=0.0)
     sigma = float(np.median(known)) if known.size else 0.0
-    return nice_step(max(float(deepest) / MOST_LEVELS, sigma, LEAST_INTERVAL_M))
+    return nice_step(max(float(deepest) / 15, sigma, 1e-3))
 
 
 def contours(values: FloatArray, interval: float) -> list[tuple[float, FloatArray]]:
@@ -132,12 +118,12 @@ def contours(values: FloatArray, interval: float) -> list[tuple[float, FloatArra
 
     if min(values.shape) < 2 or not np.isfinite(values).any():
         return []
-    maker = contour_generator(z=np.ma.masked_invalid(smoothed(values, SMOOTH_CELLS)))
+    maker = contour_generator(z=np.ma.masked_invalid(smoothed(values, 1.0)))
     first = math.floor(float(np.nanmin(values)) / interval) + 1
     last = math.ceil(float(np.nanmax(values)) / interval)
     return [
         (round(step * interval, 6), line)
         for step in range(first, last)
         for line in map(np.asarray, maker.lines(step * interval))
-        if np.hypot(*np.diff(line, axis=0).T).sum() >= LEAST_CELLS
+        if np.hypot(*np.diff(line, axis=0).T).sum() >= 12.0  # cells
     ]

@@ -17,19 +17,12 @@ import numpy.typing as npt
 from pcfix.model import FloatArray
 from pcfix.sums import Sums
 
-REACH_M = 2.0
-"""Points farther above or below the water are not used."""
 MOST_POINTS = 2_000_000
 """Maximum number of points in memory, evenly spread."""
 POINTS_PER_CELL = 4.0
 MAX_CELLS = 25_000_000
 SMOOTH_CELLS = 1.0
 """Standard deviation of the filter over the cells; it averages about 50 points."""
-KNOWN_SHARE = 0.4
-"""Least share of the filter's weight on cells with points: gaps of two cells are bridged."""
-LEAST_CELLS = 12.0
-LEAST_SIGMAS = 4.0
-"""Shorter lines, in cells or in standard errors, are dropped."""
 FLATTEST = 0.01
 """Least slope for the standard error: on flat ground the line may be anywhere."""
 
@@ -41,11 +34,7 @@ class Shoreline:
     xy: FloatArray  # (n, 2), world frame, metres; closed for an island or a pool
     level_m: float  # mean height of the water along it
     sigma_m: float  # standard error in plan across the line, root mean square along it
-
-    @property
-    def length_m(self) -> float:
-        """Length in plan."""
-        return float(np.hypot(*np.diff(self.xy, axis=0).T).sum())
+    length_m: float  # in plan
 
 
 @dataclass(frozen=True)
@@ -56,17 +45,14 @@ class NearWater(Sums):
     every: int = 1  # one point in this number is used
 
     @classmethod
-    def of(
-        cls, xyz: FloatArray, above_m: FloatArray, sigma_z_m: FloatArray | None = None
-    ) -> NearWater:
+    def of(cls, xyz: FloatArray, above_m: FloatArray, sigma_z_m: FloatArray) -> NearWater:
         """Return those of n points, shape (n, 3), world frame, metres.
 
         `above_m` is the height above the water surface, NaN if unknown, and `sigma_z_m` the
         standard error of the heights, zero if unknown; both have the shape (n,).
         """
-        rows = np.flatnonzero(np.abs(above_m) <= REACH_M)
-        sigma = np.zeros(len(xyz)) if sigma_z_m is None else sigma_z_m
-        return cls((np.column_stack([xyz, above_m, sigma])[rows],))
+        rows = np.flatnonzero(np.abs(above_m) <= 2.0)  # metres
+        return cls((np.column_stack([xyz, above_m, sigma_z_m])[rows],))
 
     def __add__(self, other: NearWater) -> NearWater:
         """Return the points of both; every second is dropped while there are too many."""
@@ -91,7 +77,7 @@ class NearWater(Sums):
         if wanted_m > field.cell_m:  # so that the line's own scatter is half a cell
             field = _field_of(points, wanted_m)
         maker = contour_generator(z=np.ma.masked_invalid(field.above_m))
-        found, least_m = [], LEAST_CELLS * field.cell_m
+        found = []
         for line in maker.lines(0.0):
             xy = field.low + np.asarray(line) * field.cell_m
             # the standard error of the heights over the slope, rms along the line
@@ -101,8 +87,9 @@ class NearWater(Sums):
             weight = np.append(step, 0.0) + np.append(0.0, step)
             sigma = math.sqrt(float(np.average((height_m / slope) ** 2, weights=weight)))
             level = float(np.nanmean(_at(field, field.water_m, xy)))
-            found.append(Shoreline(xy, level, sigma))
-        long = [one for one in found if one.length_m >= max(least_m, LEAST_SIGMAS * one.sigma_m)]
+            found.append(Shoreline(xy, level, sigma, float(step.sum())))
+        least_m = 12.0 * field.cell_m  # shorter lines are noise
+        long = [one for one in found if one.length_m >= max(least_m, 4.0 * one.sigma_m)]
         return sorted(long, key=lambda one: -one.length_m)
 
 
@@ -144,7 +131,8 @@ def _field_of(points: FloatArray, cell_m: float) -> _Field:
     z, above, sigma = points[:, 2:].T
     counts = summed(1.0)
     held = np.bincount(number, minlength=counts.size).reshape(shape) > 0
-    known = gaussian_filter(held.astype(np.float64), SMOOTH_CELLS) >= KNOWN_SHARE
+    # where enough of the filter's weight is on cells with points: gaps of two cells are bridged
+    known = gaussian_filter(held.astype(np.float64), SMOOTH_CELLS) >= 0.4
     with np.errstate(invalid="ignore", divide="ignore"):
         height = np.where(known, summed(above) / counts, np.nan)
         water = summed(z - above) / counts

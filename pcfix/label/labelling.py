@@ -71,8 +71,8 @@ class LabelCounts(Sums):
     """Counts of points by their new classes, and of those that the rules exclude."""
 
     points: int = 0
-    submerged: int = 0  # of class 40 now because they are submerged
-    stale: int = 0  # of class 40 in the input although they are not submerged
+    submerged: int = 0  # they have class 40 now
+    stale: int = 0  # class 40 in the input, although they are not submerged
     water_unknown: int = 0  # without a known height of the water
     # depth of the point that is nearest to the water surface, negative above it, metres
     least_m: float = field(default=np.inf, metadata=LEAST)
@@ -207,17 +207,15 @@ class Labelling:
         """Return rules and counts of excluded points as plain values; None without rules."""
         if self.is_plain:
             return None
-        cell_m, separate = None, None
-        if self.pools is not None:  # pools that are excluded
-            cell_m, pools = self.pools.frame.side_m, len(self.pools.stays) - 1
-            pools -= int(self.pools.stays.sum())
-            separate = {"pools": pools, "points": counts.in_pools}
+        separate = None  # pools, and their points
+        if self.pools is not None:
+            excluded = int(np.count_nonzero(~self.pools.stays[1:]))
+            separate = {"pools": excluded, "points": counts.in_pools}
         return {
             "settings": asdict(self.settings),
             "water_mask": None if self.mask is None else self.mask.name,
             "below": counts.below,
             "outside_mask": counts.outside_mask,
             "respected": counts.respected,
-            "cell_m": cell_m,
             "separate": separate,
         }

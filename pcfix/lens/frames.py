@@ -17,16 +17,8 @@ import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Vector, dot, minus, row_of, scaled, times
-from pcfix.lens.imaging import (
-    HEIGHT,
-    PLAIN,
-    WIDTH,
-    image_of,
-    lens_table,
-    plain_image,
-    plain_lens,
-    unproject,
-)
+from pcfix.lens.formulas import HEIGHT, PLAIN, WIDTH, lens_table
+from pcfix.lens.imaging import image_of, plain_image, plain_lens, unproject
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, Views
 
 
@@ -57,11 +49,10 @@ STEEPEST = np.cos(np.radians(80.0))
 
 def _border(lens: Lens, count: int) -> FloatArray:
     """Return points around the image, `count` a side, the first one again at the end."""
-    w, h = lens.width, lens.height
-    corners = np.array([(0.0, 0.0), (w, 0.0), (w, h), (0.0, h), (0.0, 0.0)])
-    share = np.linspace(0.0, 1.0, count, endpoint=False)[:, None]
-    sides = [(1.0 - share) * corners[i] + share * corners[i + 1] for i in range(4)]
-    return np.vstack([*sides, corners[:1]])
+    w, h, way = lens.width, lens.height, np.linspace(0.0, 4.0, 4 * count + 1)  # in sides
+    x = np.interp(way, range(5), (0.0, w, w, 0.0, 0.0))
+    y = np.interp(way, range(5), (0.0, 0.0, h, h, 0.0))
+    return np.column_stack([x, y])
 
 
 NOT_DISTORTED = -1
@@ -99,6 +90,7 @@ def frames_of(cameras: Cameras) -> Frames:
         return no_frames(len(cameras))._replace(planes=front)
     row, lenses = lens_table(cameras.lenses)
     shapes = [frame_shape(lens) for lens in dict.fromkeys(cameras.lenses)]
+    # a camera's planes are those of its lens, turned into the world
     planes, is_distorted = (np.array(one)[row] for one in zip(*shapes, strict=True))
     return Frames(
         planes=np.ascontiguousarray(planes @ rotations),
@@ -218,6 +210,7 @@ def mark(
 def may_hold(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: FloatArray) -> bool:
     """Whether the frame of camera c may hold a point of an upright box; never wrongly False."""
     for p in range(4):
+        # the corner of the box farthest inside this plane; if it is outside, all are
         reach, inward = 0.0, row_of(frames.planes[c], p)
         for axis in range(3):
             corner = high[axis] if inward[axis] > 0.0 else low[axis]
@@ -241,11 +234,6 @@ def count_visible_cameras(
     points = np.ascontiguousarray(xyz)
     in_tiles(_count, len(xyz), points, start, camera, cameras.centres, frames, counts)
     return counts
-
-
-def count_outside_frames(xyz: FloatArray, views: Views, cameras: Cameras) -> IntArray:
-    """Return the number of cameras in the view list of each point, (n, 3), that cannot image it."""
-    return np.asarray(np.diff(views.start) - count_visible_cameras(xyz, cameras, views))
 
 
 @kernel

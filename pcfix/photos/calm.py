@@ -25,17 +25,9 @@ from pcfix.photos.mapping import by_bands
 
 FOLLOWED_PX = 2048
 """Longer side of the images in which corners are tracked; larger ones are reduced."""
-COARSE_PX = 1024
-"""Longer side of the images in which features are matched, for a first homography."""
-CORNERS = 2000
 LEAST_CORNERS = 12
-RETURN_PX = 0.7
-"""A corner that is tracked there and back must return to within this distance."""
 OUTLIER_PX = 5.0
 """Waves move corners; what lies farther off in the reduced image is a mismatch."""
-ROUNDS = 20
-STILL_PX = 0.1
-"""Least scatter of a corner for its weight: the precision of tracking."""
 
 
 def grey8(image: npt.NDArray[Any], longest_px: int | None = None) -> npt.NDArray[np.uint8]:
@@ -68,7 +60,7 @@ def corners_in(frames: Iterable[npt.NDArray[Any]]) -> Iterator[FloatArray]:
     whole = next(others)
     first = grey8(whole, FOLLOWED_PX)
     scale, features = whole.shape[1] / first.shape[1], _features(first)
-    found = cv2.goodFeaturesToTrack(first, CORNERS, 0.01, max(first.shape) / 80.0)
+    found = cv2.goodFeaturesToTrack(first, 2000, 0.01, max(first.shape) / 80.0)
     start = np.empty((0, 1, 2), np.float32) if found is None else found
     yield (start[:, 0].astype(np.float64) + 0.5) * scale - 0.5  # pixels of the whole image
     for frame in others:
@@ -81,14 +73,14 @@ def corners_in(frames: Iterable[npt.NDArray[Any]]) -> Iterator[FloatArray]:
         there, found, _ = cv2.calcOpticalFlowPyrLK(first, grey, start, guess, **how)
         back, again, _ = cv2.calcOpticalFlowPyrLK(grey, first, there, start.copy(), **how)
         back[(found & again).ravel() == 0] = np.inf
-        returned = np.hypot(*(back - start)[:, 0].T) < RETURN_PX
+        returned = np.hypot(*(back - start)[:, 0].T) < 0.7  # px: tracked there and back again
         yield np.where(returned[:, None], (there[:, 0] + 0.5) * scale - 0.5, np.nan)
 
 
 def _features(grey: Any) -> tuple[FloatArray, Any]:
-    """Return places, in pixels of the image, and descriptors."""
+    """Return places, in pixels of the image, and descriptors, for a first homography."""
     cv2 = photo_library("cv2")
-    step = max(1.0, max(grey.shape) / COARSE_PX)
+    step = max(1.0, max(grey.shape) / 1024)
     small = cv2.resize(grey, None, fx=1.0 / step, fy=1.0 / step, interpolation=cv2.INTER_AREA)
     keys, described = cv2.SIFT_create(nfeatures=1500).detectAndCompute(small, None)
     return np.array([key.pt for key in keys], np.float32).reshape(-1, 2) * step, described
@@ -125,13 +117,15 @@ def register(places: FloatArray) -> tuple[FloatArray, FloatArray]:
             first = cv2.findHomography(there[known], places[0][known], cv2.RANSAC, OUTLIER_PX)[0]
             one[:] = np.nan if first is None else first
     scatter = np.empty(0)
-    for _ in range(ROUNDS):
+    for _ in range(20):
         on = np.stack([_moved(one, there) for one, there in zip(homographies, places, strict=True)])
         on[~often] = np.nan
         counted = np.flatnonzero(np.isfinite(on[..., 0]).sum(axis=0) >= 2)
         mean = np.nanmedian(on[:, counted], axis=0)
         off = np.hypot(*np.moveaxis(on[:, counted] - mean, 2, 0))
-        scatter = np.maximum(np.nanmedian(off, axis=0) / 1.1774, STILL_PX)  # Rayleigh's median
+        # by the median of Rayleigh's distribution, but at least the precision of tracking
+        scatter = np.maximum(np.nanmedian(off, axis=0) / 1.1774, 0.1)
+        # inverse variance, and less for what is off by more than twice its scatter (Huber)
         weight = np.minimum(1.0, 2.0 * scatter / np.maximum(off, 1e-9)) / scatter**2
         for one, there, each in zip(homographies, places[:, counted], weight, strict=True):
             known = np.isfinite(each)
@@ -151,6 +145,7 @@ def _fitted(one: FloatArray, other: FloatArray, weight: FloatArray) -> FloatArra
     """Return the homography between places by weighted least squares, linear: it is near 1."""
     middle, size = one.mean(axis=0), one.std() + 1e-9
     (x, y), (u, v) = ((one - middle) / size).T, ((other - middle) / size).T
+    # u (g x + h y + 1) = a x + b y + c and the same for v, linear in a to h
     zero, full = np.zeros(len(x)), np.ones(len(x))
     of_u = np.column_stack([x, y, full, zero, zero, zero, -u * x, -u * y])
     of_v = np.column_stack([zero, zero, zero, x, y, full, -v * x, -v * y])

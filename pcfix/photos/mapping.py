@@ -34,10 +34,6 @@ from pcfix.water.surface import surface_above
 
 MOST_CELLS = 6_000_000
 """Of the surface for ray casting (200 bytes each); a raster with more is averaged."""
-OCCLUSION_CELLS = 1.5
-"""A ray that meets the ground more cells before its point than this is occluded."""
-INVERSION_STEPS = 6
-"""Of the mapping of the paper; each leaves a tenth of the error, 0.01 px of 50 in the end."""
 STRIP_ROWS = 512
 """Rows resampled at once, so that the places stay in the processor's cache."""
 BANDS_AT_ONCE = 4
@@ -158,8 +154,10 @@ def exact(photo: Photo, scene: Scene, step_px: int) -> Shifts:
     xyz, depth, known = ground_seen(photo, scene, nodes)
     shift = np.zeros((len(nodes), 2))
     wet = np.flatnonzero(depth > 0.0)
-    place, pierced, free = traced(photo, xyz[wet], depth[wet], scene)
-    free &= np.isfinite(place).all(axis=1)
+    n = scene.refractive_index
+    pierced = trace(photo.centre, xyz[wet], scene.water, refractive_index=n).piercing_xyz
+    place = photo.pixels(pierced)  # NaN where no path was found
+    free = np.asarray(np.isfinite(place).all(axis=1))
     free[free] = ~occluded(scene.ground, pierced[free], xyz[wet[free]])
     shift[wet[free]] = place[free] - nodes[wet[free]]
     known[wet[~free]] = False
@@ -182,17 +180,17 @@ def paper(photo: Photo, scene: Scene, step_px: int) -> Shifts:
     shift[wet] = project(photo.lens, camera) - nodes[wet]
     known &= np.isfinite(shift).all(axis=1)
     shift[~known] = 0.0
-    forward = Shifts(step_px, shift.reshape(*shape, 2).astype(np.float32), known.reshape(shape))
+    forward = shift.reshape(*shape, 2).astype(np.float32)
     # the inverse: p - q for each node q, where p + shift(p) = q
     cv2 = photo_library("cv2")
     rows, columns = shape
     here = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=2).astype(np.float32)
-    back = np.zeros_like(forward.shift_px)
-    for _ in range(INVERSION_STEPS):
+    edge: Any = cv2.BORDER_REPLICATE
+    back: Any = np.zeros_like(forward)
+    for _ in range(6):  # each leaves a tenth of the error, 0.01 px of 50 in the end
         u, v = np.moveaxis(here + back / step_px, 2, 0)
-        look: dict[str, Any] = {"borderMode": cv2.BORDER_REPLICATE}
-        back = -cv2.remap(forward.shift_px, u, v, cv2.INTER_LINEAR, **look)
-    return forward._replace(shift_px=back)
+        back = -cv2.remap(forward, u, v, cv2.INTER_LINEAR, borderMode=edge)
+    return Shifts(step_px, back, known.reshape(shape))
 
 
 def ground_seen(
@@ -210,21 +208,6 @@ def ground_seen(
     return xyz, np.maximum(np.nan_to_num(depth, nan=0.0), 0.0), known  # NaN: no water above
 
 
-def traced(
-    photo: Photo, xyz: FloatArray, depth: FloatArray, scene: Scene
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Trace light from places (n, 3), with their depths (n,), through the water to an image.
-
-    Returns the pixels, the piercing points (places on land are their own), and whether the light
-    was found.
-    """
-    wet = np.flatnonzero(depth > 0.0)
-    pierced, found = xyz.copy(), np.ones(len(xyz), bool)
-    path = trace(photo.centre, xyz[wet], scene.water, refractive_index=scene.refractive_index)
-    pierced[wet], found[wet] = path.piercing_xyz, path.converged
-    return photo.pixels(pierced), pierced, found
-
-
 def occluded(ground: Ground, start: FloatArray, end: FloatArray) -> BoolArray:
     """Return whether the ground is between start and end, both of shape (n, 3)."""
     ray = end - start
@@ -232,7 +215,7 @@ def occluded(ground: Ground, start: FloatArray, end: FloatArray) -> BoolArray:
     distinct = length > 0.0
     found = np.zeros(len(ray), bool)
     hit = ground.hit(start[distinct], ray[distinct] / length[distinct, None])
-    found[distinct] = hit < length[distinct] - OCCLUSION_CELLS * ground.cell_m
+    found[distinct] = hit < length[distinct] - 1.5 * ground.cell_m  # not by its own cell
     return found
 
 

@@ -17,16 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from pcfix.model import BoolArray, FloatArray
-from pcfix.photos.mapping import Photo, Scene, occluded, traced
-from pcfix.water.surface import surface_above
+from pcfix.photos.mapping import Photo, Scene, occluded
+from pcfix.refract.tracing import trace
 
 FEATHER = 0.01
 """Images are mixed within this difference of tangents from nadir (15 px at f = 1500 px)."""
 SPARE_SHARE = 0.15
 """Of the frame: a straight ray may end so far outside it while the refracted ray ends inside."""
-BLACK = 3
-"""Pixels up to this value (of 255) over an area of `BLACK_PX` squared have no picture."""
-BLACK_PX = 7
 REMAP_COLUMNS = 1024
 
 
@@ -72,9 +69,9 @@ def blank_in(pixels: npt.NDArray[Any]) -> BoolArray:
     """Return the black areas of an image without water, and the pixels next to them."""
     import cv2
 
-    limit = BLACK * (257 if pixels.dtype == np.uint16 else 1)
+    limit = 3 * (257 if pixels.dtype == np.uint16 else 1)  # 3 of 255
     dark = (pixels.max(axis=2) <= limit).astype(np.uint8)
-    square = np.ones((BLACK_PX, BLACK_PX), np.uint8)
+    square = np.ones((7, 7), np.uint8)
     wide = cv2.morphologyEx(
         dark, cv2.MORPH_OPEN, square, borderType=cv2.BORDER_REPLICATE
     )  # single dark pixels are shadows
@@ -122,13 +119,11 @@ def mosaic(
         return None
     share = np.clip(1.0 - (slope - np.where(covered, best, 0.0)) / FEATHER, 0.0, 1.0)
     share /= np.maximum(share.sum(axis=0), 1e-9)
-    colour: Any = 0.0
-    for k in np.flatnonzero((share > 0.0).any(axis=1)):
+    used = np.flatnonzero((share > 0.0).any(axis=1))
+    colour: Any = np.zeros((len(xyz), picture(near[used[0]]).pixels.shape[2]), np.float32)
+    for k in used:
         rows = np.flatnonzero(share[k] > 0.0)
-        found = picture(near[k]).at(place[k, rows])
-        if np.isscalar(colour):
-            colour = np.zeros((len(xyz), found.shape[1]), np.float32)
-        colour[rows] += share[k, rows, None] * found
+        colour[rows] += share[k, rows, None] * picture(near[k]).at(place[k, rows])
     return colour, covered
 
 
@@ -137,13 +132,12 @@ def seen_at(photo: Photo, xyz: FloatArray, scene: Scene) -> tuple[FloatArray, Bo
 
     A place is seen if it lies in the frame and the ground does not occlude its ray in air or water.
     """
-    depth = np.nan_to_num(surface_above(scene.water, xyz).height_m - xyz[:, 2], nan=0.0)
-    place, pierced, seen = traced(photo, xyz, depth, scene)
+    n = scene.refractive_index
+    pierced = trace(photo.centre, xyz, scene.water, refractive_index=n).piercing_xyz
+    place = photo.pixels(pierced)  # NaN where no path was found
     frame = np.array([photo.lens.width, photo.lens.height])
-    seen &= ((place >= 0.0) & (place <= frame)).all(axis=1)
-    rows = np.flatnonzero(seen)
-    start = np.broadcast_to(photo.centre, (len(rows), 3))
-    seen[rows] = ~occluded(scene.ground, start, pierced[rows])
-    rows = np.flatnonzero(seen)
-    seen[rows] = ~occluded(scene.ground, pierced[rows], xyz[rows])
+    seen = np.asarray(((place >= 0.0) & (place <= frame)).all(axis=1))
+    centre = np.broadcast_to(photo.centre, xyz.shape)
+    for start, end in (centre, pierced), (pierced, xyz):
+        seen[seen] = ~occluded(scene.ground, start[seen], end[seen])
     return place, seen

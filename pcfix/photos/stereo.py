@@ -21,19 +21,9 @@ from pcfix.model import BoolArray, FloatArray
 from pcfix.photos.mapping import Ground, Photo
 from pcfix.photos.ortho import Picture
 
-PARTNERS = 4
 BASE_SHARES = (0.1, 0.3, 0.55)
 """Shortest, best and longest base, as shares of the shorter side of the image."""
-MOST_ANGLE_DEG = 30.0
-"""Between the axes of a pair."""
-SPARE_PX = 4
-SPARE_RELIEF = 0.5
-"""The bed is searched this share of the range of heights below the ground."""
-BLOCK_PX = 5
-FEWEST_PAIRS = 2
-"""Pairs, and half of its own, that a cell needs within a pixel of parallax of the median."""
-HALF = 1 << 31
-"""Added to columns, so that those west of x = 0 do not run into the row of their number."""
+SPARE_PX, BLOCK_PX = 4, 5  # disparities beyond those expected, and the side of matched blocks
 
 
 def stereo_cloud(
@@ -50,16 +40,18 @@ def stereo_cloud(
     `photos`, and where it has no picture.
     """
     low, high = np.nanquantile(ground.height_m, [0.001, 0.999])
-    heights = float(low - SPARE_RELIEF * (high - low) - 1.0), float(high + 1.0)
+    # the bed is searched half of the range of heights below the ground
+    heights = float(low - 0.5 * (high - low) - 1.0), float(high + 1.0)
     middle = float(np.nanmedian(ground.height_m))
     pairs, cells, means = pairs_of(photos, middle), [], []
     for done, (one, other) in enumerate(pairs, start=1):
         xyz = pair_points(photos[one], photos[other], picture(one), picture(other), heights)
-        column, row = np.floor(xyz[:, :2] / cell_m).astype(np.int64).T
-        own, cell = np.unique((row << 32) + column + HALF, return_inverse=True)
+        # the mean height of each cell, by its row and column
+        place = np.floor(xyz[:, 1::-1] / cell_m).astype(np.int64)
+        own, cell = np.unique(place, axis=0, return_inverse=True)
         if len(own):
             cells.append(own)
-            means.append(cell_statistics(cell, xyz[:, 2], len(own))["mean"])
+            means.append(cell_statistics(cell.ravel(), xyz[:, 2], len(own))["mean"])
         if progress is not None:
             progress(done, len(pairs))
     if not cells:
@@ -74,19 +66,18 @@ def stereo_cloud(
         (photo.centre[2] - middle) / (BASE_SHARES[1] * min(photo.lens.width, photo.lens.height))
         for photo in photos
     ]
-    own, cell = np.unique(np.concatenate(cells), return_inverse=True)
-    z = np.concatenate(means)
+    own, cell = np.unique(np.concatenate(cells), axis=0, return_inverse=True)
+    cell, z = cell.ravel(), np.concatenate(means)
     fused = cell_statistics(cell, z, len(own))
     agrees = np.abs(z - fused["median"][cell]) <= float(np.median(parallax))
     agreeing = np.bincount(cell[agrees], minlength=len(own))
-    row = own >> 32
-    centre = cell_m * (np.column_stack([own - (row << 32) - HALF, row]) + 0.5)
-    fine = agreeing >= np.maximum(FEWEST_PAIRS, 0.5 * fused["points"])
+    centre = cell_m * (own[:, ::-1] + 0.5)
+    fine = agreeing >= np.maximum(2, 0.5 * fused["points"])
     return np.column_stack([centre, fused["median"]])[fine]
 
 
 def pairs_of(photos: Sequence[Photo], ground_m: float) -> list[tuple[int, int]]:
-    """Pair each image with the neighbours whose bases are nearest to the best."""
+    """Pair each image with the four neighbours whose bases are nearest to the best."""
     shortest, best, longest = BASE_SHARES
     centres = np.array([photo.centre for photo in photos])
     axes = np.array([photo.rotation[2] for photo in photos])
@@ -96,9 +87,9 @@ def pairs_of(photos: Sequence[Photo], ground_m: float) -> list[tuple[int, int]]:
         base = np.linalg.norm(centres - photo.centre, axis=1)
         share = base * photo.lens.focal / (photo.centre[2] - ground_m) / side
         fits = (share > shortest) & (share < longest)
-        fits &= axes @ axes[row] > np.cos(np.radians(MOST_ANGLE_DEG))
+        fits &= axes @ axes[row] > np.cos(np.radians(30.0))  # nearly parallel axes
         near = np.flatnonzero(fits)
-        for other in near[np.argsort(np.abs(share[near] - best), kind="stable")][:PARTNERS]:
+        for other in near[np.argsort(np.abs(share[near] - best), kind="stable")][:4]:
             chosen.add((min(row, int(other)), max(row, int(other))))
     return sorted(chosen)
 
@@ -112,26 +103,27 @@ def pair_points(
     """
     import cv2
 
-    nothing = np.empty((0, 3))
-    baseline = right.centre - left.centre
+    # the common frame: x along the base, z between the optical axes
+    nothing, baseline = np.empty((0, 3)), right.centre - left.centre
     base = float(np.linalg.norm(baseline))
     x = baseline / base
     z = left.rotation[2] + right.rotation[2]
     z = z - (z @ x) * x
     z /= np.linalg.norm(z)
     rotation = np.stack([x, np.cross(z, x), z])
-    corners = []  # directions of the corners of both images, world frame
-    for photo in (left, right):
-        w, h = photo.lens.width, photo.lens.height
-        places = np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]])
-        corners.append(photo.rays(places))
+    # rays of the corners of both images, in the world and in the frame
+    sizes = (np.array([photo.lens.width, photo.lens.height]) for photo in (left, right))
+    places = [np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size for size in sizes]
+    corners = [left.rays(places[0]), right.rays(places[1])]
     ahead = [rays @ rotation.T for rays in corners]
-    if min((rays[:, 2] / np.linalg.norm(rays, axis=1)).min() for rays in ahead) < 0.3:
+    if min(rays[:, 2].min() for rays in ahead) < 0.3:
         return nothing
+    # the window that both images see, in pixels from the principal point
     focal = left.lens.focal
     plane = [focal * rays[:, :2] / rays[:, 2:] for rays in ahead]
     top = max(corner[:, 1].min() for corner in plane)
     bottom = min(corner[:, 1].max() for corner in plane)
+    # disparity = focal length x base / depth: its range from the depths at the corners
     lengths = [(left.centre[2] - height) / -corners[0][:, 2] for height in heights]
     far = np.concatenate([length * ahead[0][:, 2] for length in lengths])
     far = far[far > 0.0]
@@ -142,7 +134,7 @@ def pair_points(
     start = max(plane[0][:, 0].min(), plane[1][:, 0].min() + least)
     stop = min(plane[0][:, 0].max(), plane[1][:, 0].max() + most)
     width, height = int(stop - start), int(bottom - top)
-    disparities = -(-(most - least) // 16) * 16
+    disparities = -(-(most - least) // 16) * 16  # a multiple of 16, as OpenCV wants
     if width <= disparities + 8 * BLOCK_PX:
         return nothing
     u, v = np.arange(width) + 0.5 + start, np.arange(height) + 0.5 + top
@@ -154,7 +146,7 @@ def pair_points(
         uniquenessRatio=5, speckleWindowSize=100, speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )  # fmt: skip
-    disparity = matcher.compute(seen, found).astype(np.float32) / 16.0
+    disparity = matcher.compute(seen, found).astype(np.float32) / 16.0  # it counts in sixteenths
     row, column = np.nonzero((disparity > 0.0) & ~lost)
     shift = disparity[row, column]
     partner = np.rint(column - shift).astype(int)

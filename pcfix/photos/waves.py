@@ -47,21 +47,6 @@ from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.photos.calm import grey8
 from pcfix.photos.mapping import Photo
 
-GRAVITY = 9.81
-CELLS = 2000
-"""Of the rasters by default; more cells give more short waves, and take more time."""
-MARGIN = 0.4
-"""Of the depth, by which the rasters exceed what the camera sees of the level."""
-SHORTEST_CELLS = 3.0
-WAVES_AT_ONCE = 40
-ROUNDS = 6
-LEAST_GAIN = 0.003
-"""Share of the slopes' energy that a further round must explain."""
-OVER_NOISE = 8.0
-"""Energy that a wave needs, in multiples of the mean of the shell."""
-STILL = 0.15
-"""Share of the usual displacement below which a node is land."""
-
 
 class View(NamedTuple):
     """The first frame's camera, calm water, and the true bed."""
@@ -116,17 +101,16 @@ def nodes_of(view: View, cell_m: float | None) -> Nodes:
     if not np.isfinite(outline).all():
         sentence = "Part of the image does not show the water. Check pose and level."
         raise GeometryError("cameras.pose", sentence, level=view.level_m)
-    cell = cell_m or float(np.sqrt(np.ptp(outline, axis=0).prod() / CELLS))
+    # more than about 2000 cells would give more short waves, and take more time
+    cell = cell_m or float(np.sqrt(np.ptp(outline, axis=0).prod() / 2000))
     depth = float(np.nanmedian(view.level_m - view.bed(outline)))
     low, high = outline.min(axis=0), outline.max(axis=0)
-    beyond = max(cell, MARGIN * depth)
+    beyond = max(cell, 0.4 * depth)  # as waves need some room around the image
     columns, rows = (int(n) for n in np.ceil((high - low + 2.0 * beyond) / cell) + 1)
     west = int(np.floor((low[0] - beyond) / cell))
     north = int(np.ceil((high[1] + beyond) / cell))
     lattice = Lattice(cell, west, -north, columns, rows)
-    x = lattice.left_m + (np.arange(columns) + 0.5) * cell
-    y = lattice.top_m - (np.arange(rows) + 0.5) * cell
-    xy = np.column_stack([np.tile(x, rows), np.repeat(y, columns)])
+    xy = lattice.centres(lattice.window)
     pixel = view.photo.pixels(np.column_stack([xy, np.full(len(xy), view.level_m)]))
     inside = ((pixel > 0.0) & (pixel < [lens.width, lens.height])).all(axis=1)
     return Nodes(lattice, xy, np.asarray(inside))
@@ -163,8 +147,8 @@ def displacements(
     weight_at = cv2.remap(base, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)[:, 0]
     weight_at = np.where(nodes.seen, weight_at, 0.0).astype(np.float64)
     known, size = weight_at > 0.0, np.sqrt((shift_px**2).sum(axis=2).mean(axis=0))
-    if known.any():
-        weight_at[size < STILL * np.median(size[known])] = 0.0
+    if known.any():  # what moves much less than usual is land
+        weight_at[size < 0.15 * np.median(size[known])] = 0.0
     return shift_px, weight_at
 
 
@@ -215,19 +199,19 @@ def fit_waves(
     found, covariance = np.empty(0), np.empty((0, 0))
     left = float((weight[..., None] * slope**2).sum())
     total = max(left, 1e-30)
-    for _ in range(ROUNDS):
-        # those with most energy that are not chosen, well above that of white noise
+    for _ in range(6):
+        # the 40 with most energy that are not chosen, well above that of white noise
         energy = shell.energy(residual)
         energy[chosen] = 0.0
-        more = np.argsort(-energy, kind="stable")[:WAVES_AT_ONCE]
-        more = more[energy[more] > OVER_NOISE * shell.white(residual)]
+        more = np.argsort(-energy, kind="stable")[:40]
+        more = more[energy[more] > 8.0 * shell.white(residual)]
         if not len(more):
             break
         chosen = np.concatenate([chosen, more])
         found, covariance, residual = shell.solved(slope, chosen)
         before, left = left, float((weight[..., None] * residual**2).sum())
-        if before - left < LEAST_GAIN * total:
-            break
+        if before - left < 0.003 * total:
+            break  # hardly more is explained
     # residuals that are not white make the covariance larger
     energy = np.delete(shell.energy(residual), chosen)
     redness = max(1.0, float(energy.mean()) / max(shell.white(residual), 1e-30))
@@ -245,17 +229,18 @@ class _Shell:
     ) -> None:
         self._local, self._weight, self._time_s = nodes.local, weight, time_s
         cell_m, self._height = nodes.lattice.resolution_m, nodes.lattice.height
+        # padded to twice the size, so that waves twice as long as the raster have a number
         rows, columns = 2 * nodes.lattice.height, 2 * nodes.lattice.width
         x = 2.0 * np.pi * np.fft.fftfreq(columns, cell_m)
         y = -2.0 * np.pi * np.fft.fftfreq(rows, cell_m)  # rows go south
         every = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
         size = np.hypot(*every.T)
         longest = cell_m * max(rows, columns)
-        least, most = 2.0 * np.pi / longest, 2.0 * np.pi / (SHORTEST_CELLS * cell_m)
+        least, most = 2.0 * np.pi / longest, 2.0 * np.pi / (3.0 * cell_m)
         may = (size >= least) & (size <= most)
         self._rows, self._shape = np.flatnonzero(may), (rows, columns)
         self.number, self._size = every[may], size[may]
-        self.frequency = np.sqrt(GRAVITY * self._size * np.tanh(self._size * depth_m))
+        self.frequency = np.sqrt(9.81 * self._size * np.tanh(self._size * depth_m))
 
     def _transformed(self, slope: FloatArray, weight: FloatArray) -> npt.NDArray[np.complex128]:
         """Return the slopes of f frames along each wave number, as Fourier coefficients, (f, m)."""
@@ -266,6 +251,7 @@ class _Shell:
 
     def energy(self, slope: FloatArray) -> FloatArray:
         """Return the energy of slopes, shape (f, n, 2), at each wave number."""
+        # turned back by each frame's phase, so that a wave of the right frequency adds up
         turn = np.exp(1j * self._time_s[:, None] * self.frequency)
         return np.abs((self._transformed(slope, self._weight) * turn).sum(axis=0)) ** 2
 
@@ -299,6 +285,7 @@ class _Shell:
 
         Returns the amplitudes of the slope, their covariance, and the residuals.
         """
+        # slopes lie along the wave number: a wave of unit slope has its two components `along`
         along = np.tile(self.number[chosen] / self._size[chosen, None], (2, 1))
         gram, right = np.zeros((len(along), len(along))), np.zeros(len(along))
         used = np.flatnonzero((self._weight > 0.0).any(axis=0))

@@ -8,57 +8,56 @@ for intersections and for the bundle adjustment.
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.kernels import device
-from pcfix.lens.algebra import Vector, beyond, cross, dot, minus, plus, scaled, unit, vector
+from pcfix.lens.algebra import Vector, beyond, cross, dot, minus, plus, scaled, unit
 from pcfix.model import FloatArray
 from pcfix.port.shapes import DomePort, FlatPort, Port
 from pcfix.refract.rays import refracted
 
-KIND, X, Y, Z, SIZE, THICK, GLASS = range(7)
-FLAT, DOME = 0.0, 1.0
-
-PortShape: TypeAlias = tuple[float, Vector, float, float, float]
-"""Kind; normal or centre; distance or radius; thickness; refractive index of the glass."""
-
+NO_PORT, FLAT, DOME = range(3)
 NOWHERE: Vector = (np.nan, np.nan, np.nan)
 
 
-def coefficients(port: Port) -> FloatArray:
-    """Return a port as the flat array that the kernels take, shape (7,).
+class Window(NamedTuple):
+    """A port for the kernels."""
 
-    Kind; x, y, z of the normal or of the centre; distance or radius; thickness; glass index.
-    """
+    kind: int
+    where: Vector  # unit normal of a flat port, or centre of a dome
+    size: float  # distance or radius of the inner face, metres
+    thickness: float  # metres
+    glass: float  # refractive index
+
+
+def window_of(port: Port | None) -> Window:
+    """Return a port, or none, for the kernels."""
     match port:
-        case FlatPort(distance, thickness, glass, normal):
-            c = [FLAT, *normal, distance, thickness, glass]
-        case DomePort(radius, thickness, glass, centre):
-            c = [DOME, *centre, radius, thickness, glass]
-    return np.array(c, np.float64)
+        case FlatPort(size, thickness, glass, where):
+            kind = FLAT
+        case DomePort(size, thickness, glass, where):
+            kind = DOME
+        case _:
+            kind, size, thickness, glass, where = NO_PORT, 0.0, 0.0, 1.0, (0.0, 0.0, 0.0)
+    x, y, z = map(float, where)  # numba compiles whole numbers anew
+    return Window(kind, (x, y, z), float(size), float(thickness), float(glass))
 
 
 @device
-def window_of(port: FloatArray) -> PortShape:
-    """Return the same as numbers, which stay in registers."""
-    return port[KIND], vector(port, X), port[SIZE], port[THICK], port[GLASS]
-
-
-@device
-def _at_face(window: PortShape, depth: float, start: Vector, s: Vector) -> tuple[Vector, Vector]:
+def _at_face(window: Window, depth: float, start: Vector, s: Vector) -> tuple[Vector, Vector]:
     """Return where a ray leaves a face, and the normal there, towards the water.
 
     The face lies `depth` behind the inner one. NaN if the ray does not meet it.
     """
-    kind, where, size = window[:3]
-    size += depth
-    if kind == FLAT:
+    where, size = window.where, window.size + depth
+    if window.kind == FLAT:
         steep = dot(where, s)
         if not steep > 0.0:
             return NOWHERE, NOWHERE
         return beyond(start, (size - dot(where, start)) / steep, s), where
+    # |start + f s| = size, from the inside: the positive root
     start = minus(start, where)
     along = dot(start, s)
     f = -along + np.sqrt(along * along + max(size * size - dot(start, start), 0.0))
@@ -67,23 +66,23 @@ def _at_face(window: PortShape, depth: float, start: Vector, s: Vector) -> tuple
 
 
 @device
-def ray_through(window: PortShape, n: float, direction: Vector) -> tuple[Vector, Vector]:
+def ray_through(window: Window, n: float, direction: Vector) -> tuple[Vector, Vector]:
     """Return where a ray from the projection centre leaves the port, and its unit direction there.
 
     The direction in air may have any length; n is the refractive index of the water relative to
     air, at least 1. NaN is returned if the ray misses the port.
     """
-    s, thickness, glass = unit(direction), window[3], window[4]
+    s, glass = unit(direction), window.glass
     # `refracted` takes the ray backwards and the normal against the light
     inner, normal = _at_face(window, 0.0, (0.0, 0.0, 0.0), s)
     inside = refracted(scaled(-1.0, s), 1.0, scaled(-1.0, normal), dot(normal, s), 1.0 / glass)
-    outer, normal = _at_face(window, thickness, inner, inside)
+    outer, normal = _at_face(window, window.thickness, inner, inside)
     back, inward = scaled(-1.0, inside), scaled(-1.0, normal)
     return outer, refracted(back, 1.0, inward, dot(normal, inside), glass / n)
 
 
 @device
-def cosine_at_port(window: PortShape, direction: Vector) -> float:
+def cosine_at_port(window: Window, direction: Vector) -> float:
     """Return the cosine of the incidence angle in air at the inner face; see `ray_through`."""
     s = unit(direction)
     return dot(s, _at_face(window, 0.0, (0.0, 0.0, 0.0), s)[1])
@@ -94,33 +93,33 @@ STEPS, CLOSE = 100, 1e-13
 
 
 @device
-def light_through(port: FloatArray, n: float, x: float, y: float, z: float) -> Vector:
+def light_through(window: Window, n: float, point: Vector) -> Vector:
     """Return the unit direction in which the light of a point reaches the projection centre.
 
-    The port is that of `coefficients`, n the refractive index of the water relative to air, at
-    least 1, and x, y, z the point, camera frame, metres; NaN if it is not in the water.
+    n is the refractive index of the water relative to air, at least 1; the point is in the camera
+    frame, metres; NaN if it is not in the water.
 
     Seen from the point, the place on the inner face that is nearest to it is its foot. The light
     stays in the plane of foot, point and projection centre, and crosses the face between the foot
     and the straight line: for refractive indices of at least 1 there is exactly one such ray. The
     secant method finds the one that passes the point, with bisection if a step leaves the bracket.
     """
-    window, point = window_of(port), (x, y, z)
-    kind, where, size, thickness, _ = window
-    if kind == FLAT:
+    where, size = window.where, window.size
+    if window.kind == FLAT:
         depth = dot(where, point) - size
         foot = beyond(point, -depth, where)
     else:
         outward = minus(point, where)
         depth = np.sqrt(dot(outward, outward)) - size
         foot = beyond(where, size, unit(outward))
-    if not depth > thickness:
+    if not depth > window.thickness:
         return NOWHERE
     straight, foot = unit(point), unit(foot)
     across = cross(straight, foot)
     low, high, last, share = 0.0, 1.0, 0.0, 0.5
     before = _signed_miss(window, n, straight, point, across)
     for _ in range(STEPS):
+        # directions between straight (share 0) and foot (1), all in the plane
         w = beyond(scaled(1.0 - share, straight), share, foot)
         miss = _signed_miss(window, n, w, point, across)
         if miss > 0.0:  # it passes the point on the side of the foot
@@ -137,7 +136,7 @@ def light_through(port: FloatArray, n: float, x: float, y: float, z: float) -> V
 
 
 @device
-def _signed_miss(window: PortShape, n: float, w: Vector, point: Vector, across: Vector) -> float:
+def _signed_miss(window: Window, n: float, w: Vector, point: Vector, across: Vector) -> float:
     """Return how far a ray passes a point on the side of the foot, in any unit."""
     place, t = ray_through(window, n, w)
     return dot(across, cross(minus(point, place), t))
@@ -150,7 +149,7 @@ They leave relative errors of about 1e-8."""
 
 
 @device
-def through_port(port: FloatArray, n: float, x: float, y: float, z: float, out: FloatArray) -> None:
+def through_port(window: Window, n: float, point: Vector, out: FloatArray) -> None:
     """Fill in the direction w of `light_through` and its derivatives.
 
     Column 0 of `out`, shape (3, 5) or (3, 8), gets w, columns 1 to 3 the derivatives of w by x, y,
@@ -161,20 +160,20 @@ def through_port(port: FloatArray, n: float, x: float, y: float, z: float, out: 
     ray. As it has to stay in X, dw = M^-1 (dX - d spot / d p dp), with M = d spot / d w and p the
     refractive index or a number of the port. The derivatives of the spot are differences.
     """
-    window, point, w = window_of(port), (x, y, z), light_through(port, n, x, y, z)
+    w = light_through(window, n, point)
     t = ray_through(window, n, w)[1]
+    # w and the spot move across w and t: two numbers each, along e1, e2 and p1, p2
     (e1, e2), (p1, p2) = _two_across(w), _two_across(t)
     by_1 = _difference(window, n, window, n, e1, w, point, t, BY_DIRECTION)
     by_2 = _difference(window, n, window, n, e2, w, point, t, BY_DIRECTION)
     a, b, c, d = dot(p1, by_1), dot(p1, by_2), dot(p2, by_1), dot(p2, by_2)
     det = a * d - b * c
-    # the rows of M^-1 for the parts of dw along e1 and e2
+    # a, b, c, d is M in these axes; the rows of M^-1 give the parts of dw along e1 and e2
     g1 = scaled(1.0 / det, minus(scaled(d, p1), scaled(b, p2)))
     g2 = scaled(1.0 / det, minus(scaled(a, p2), scaled(c, p1)))
     for i in range(3):
         out[i, 0] = w[i]
-        for j in range(3):
-            out[i, 1 + j] = e1[i] * g1[j] + e2[i] * g2[j]
+        _set_column(out, 1 + i, e1, e2, g1[i], g2[i])
     still = (0.0, 0.0, 0.0)
     spot = _difference(window, n + BY_INDEX, window, n - BY_INDEX, still, w, point, t, BY_INDEX)
     _set_column(out, 4, e1, e2, -dot(g1, spot), -dot(g2, spot))
@@ -184,12 +183,12 @@ def through_port(port: FloatArray, n: float, x: float, y: float, z: float, out: 
     step = BY_PLACE * max(size, LEAST_SIZE_M)
     for i in range(1 if kind == FLAT else 3):
         if kind == FLAT:
-            more: PortShape = (kind, where, size + step, thickness, glass)
-            less: PortShape = (kind, where, size - step, thickness, glass)
+            more = Window(kind, where, size + step, thickness, glass)
+            less = Window(kind, where, size - step, thickness, glass)
         else:
             move = (step * (i == 0), step * (i == 1), step * (i == 2))
-            more = (kind, plus(where, move), size, thickness, glass)
-            less = (kind, minus(where, move), size, thickness, glass)
+            more = Window(kind, plus(where, move), size, thickness, glass)
+            less = Window(kind, minus(where, move), size, thickness, glass)
         spot = _difference(more, n, less, n, still, w, point, t, step)
         _set_column(out, BY_PORT + i, e1, e2, -dot(g1, spot), -dot(g2, spot))
 
@@ -203,7 +202,7 @@ def _two_across(v: Vector) -> tuple[Vector, Vector]:
 
 @device
 def _difference(
-    more: PortShape, more_n: float, less: PortShape, less_n: float, turn: Vector, w: Vector,
+    more: Window, more_n: float, less: Window, less_n: float, turn: Vector, w: Vector,
     point: Vector, t: Vector, step: float,
 ) -> Vector:  # fmt: skip
     """Return the derivative of the spot, from its places a step further and a step back.

@@ -56,12 +56,13 @@ from pcfix.lens.algebra import (
     transposed_times,
     vector,
 )
+from pcfix.lens.formulas import lens_table
 from pcfix.lens.frames import Frames, frames_of, holds, no_frames
-from pcfix.lens.imaging import image_and_gradients, image_in_world, lens_table
+from pcfix.lens.imaging import image_and_gradients, image_and_slopes
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Views
 from pcfix.options.correct import ScienceOptions
 from pcfix.port.light import (
-    coefficients,
+    Window,
     cosine_at_port,
     light_through,
     ray_through,
@@ -87,19 +88,18 @@ CLOSE_M = 1e-7
 ROUNDS = 6
 """At the border of an image a point may alternate in and out; after so many rounds it stays."""
 
-_DISTANCE, _COSINE, _OUTCOME, _COUNT, _FOUND, _WIDTH = range(3, 9)
-"""Columns of the result after the shift."""
-
 
 class Rig(NamedTuple):
     """The k cameras and the port before each of them, for kernels."""
 
     centres: FloatArray  # (k, 3), metres, world frame
     rotations: FloatArray  # (k, 3, 3), world to camera
-    row: IntArray  # lens of each camera, see `pcfix.lens.imaging.lens_table`
+    row: IntArray  # lens of each camera, see `pcfix.lens.formulas.lens_table`
     lenses: FloatArray
-    port: FloatArray  # see `pcfix.port.light.coefficients`
+    frames: Frames
+    window: Window
     n: float  # refractive index of the water
+    least_cosine: float  # of the incidence angle in air
 
 
 class Sigmas(NamedTuple):
@@ -133,7 +133,7 @@ def correct_through_port(
     Covariances are zero if fewer than two rays meet. Raises SettingError without angles or lenses.
     """
     require_orientation(cameras, "A port")
-    lenses, none = cameras.lenses or (), np.zeros(0, np.int64)
+    lenses, none, limit = cameras.lenses or (), np.zeros(0, np.int64), settings.limit_deg
     lists, frames = (none, none), frames_of(cameras)
     if views is not None:
         lists = np.asarray(views.start, np.int64), np.asarray(views.camera, np.int64)
@@ -142,11 +142,11 @@ def correct_through_port(
         np.ascontiguousarray(cameras.centres),
         np.ascontiguousarray(cameras.rotations, np.float64),
         *lens_table(lenses),
-        coefficients(port),
+        frames,
+        window_of(port),
         settings.refractive_index,
+        0.0 if limit is None else float(np.cos(np.radians(limit))),
     )
-    limit = settings.limit_deg
-    least_cosine = 0.0 if limit is None else float(np.cos(np.radians(limit)))
     sigmas = Sigmas(
         settings.sigma_image * np.array([lens.pixel_size for lens in lenses]),
         settings.sigma_index,
@@ -154,116 +154,117 @@ def correct_through_port(
         float(np.radians(settings.sigma_attitude)),
     )
     m = len(xyz)
-    result, covariance = np.zeros((m, _WIDTH)), np.zeros((m, 6))
-    used = np.zeros(len(cameras), np.bool_)
-    in_tiles(
-        _correct, -(-m // TILE), spatial_order(xyz), np.ascontiguousarray(xyz), lists, rig, frames,
-        least_cosine, sigmas, (result, covariance, used),
-    )  # fmt: skip
-    outcome = result[:, _OUTCOME].astype(np.uint8)
-    moved = outcome == CORRECTED
-    warn_of_unsolved("no solution was found behind the port", result[moved, _FOUND] > 0.0)
-    return Intersection(
-        shift_m=result[:, :3],
-        outcome=outcome,
-        ray_count=result[:, _COUNT].astype(np.int32),
-        ray_miss_m=result[:, _DISTANCE],
-        sigma_z_m=np.sqrt(covariance[:, 5]),
-        incidence_deg=np.where(moved, np.degrees(np.arccos(result[:, _COSINE])), 0.0),
-        camera_used=used,
+    covariance, converged = np.zeros((m, 6)), np.zeros(m, np.bool_)
+    found = Intersection(
+        shift_m=np.zeros((m, 3)),
+        outcome=np.zeros(m, np.uint8),
+        ray_count=np.zeros(m, np.int32),
+        ray_miss_m=np.zeros(m),
+        sigma_z_m=np.zeros(m),
+        incidence_deg=np.zeros(m),
+        camera_used=np.zeros(len(cameras), np.bool_),
         covariance_m2=covariance,
     )
+    in_tiles(
+        _correct, -(-m // TILE), spatial_order(xyz), np.ascontiguousarray(xyz), lists, rig, sigmas,
+        found, covariance, converged,
+    )  # fmt: skip
+    moved = found.outcome == CORRECTED
+    warn_of_unsolved("no solution was found behind the port", converged[moved])
+    return found
 
 
 @kernel(allocates=True)
 def _correct(
     span: Span, order: IntArray, xyz: FloatArray, lists: tuple[IntArray, IntArray], rig: Rig,
-    frames: Frames, least_cosine: float, sigmas: Sigmas,
-    found: tuple[FloatArray, FloatArray, BoolArray],
+    sigmas: Sigmas, found: Intersection, covariance: FloatArray, converged: BoolArray,
 ) -> None:  # fmt: skip
     """Correct the points of each tile, by the cameras of their lists or, if empty, in the frame."""
-    (start, camera), (result, covariance, used) = lists, found
+    (start, camera), shifts = lists, found.shift_m
     every = np.arange(len(rig.centres))
     for t in range(*span):
         rows = order[t * TILE : (t + 1) * TILE]
         low, high = corners_of(rows, xyz)
-        wide, near = 0.0, near_cameras(every, frames, rig.centres, low, high)
+        # cameras that may image a point within `wide` metres of the tile
+        wide, near = 0.0, near_cameras(every, rig.frames, rig.centres, low, high)
         for i in rows:
-            point, row = row_of(xyz, i), result[i]
+            point = row_of(xyz, i)
             some = camera[start[i] : start[i + 1]] if start.size else near
-            chosen = _usable(some, point, rig, frames, least_cosine, False)
-            _solve(row, point, chosen, rig)
+            chosen = _usable(some, point, rig, False)
+            solution = _solve(point, chosen, rig)
             # without a list: the cameras that image the true point, which depends on them
             for _ in range(0 if start.size else ROUNDS):
-                shift = vector(row)
+                shift = solution[1]
                 # the straight line to a true point may miss a frame that its refracted light
                 # reaches, by at most the shift
                 reach = max(abs(shift[0]), abs(shift[1]), abs(shift[2]))
                 if reach > wide:
                     wide = 2.0 * reach
-                    near = near_cameras(every, frames, rig.centres, low - wide, high + wide)
-                imaging = _usable(near, plus(point, shift), rig, frames, least_cosine, True)
+                    near = near_cameras(every, rig.frames, rig.centres, low - wide, high + wide)
+                imaging = _usable(near, plus(point, shift), rig, True)
                 if are_same(imaging, chosen):
                     break
                 chosen = imaging
-                _solve(row, point, chosen, rig)
-            if row[_OUTCOME] == CORRECTED:
-                row[_COUNT] = chosen.size
-                _set_covariance(covariance[i], plus(point, vector(row)), chosen, rig, sigmas)
+                solution = _solve(point, chosen, rig)
+            found.outcome[i], shift, distance, cosine, converged[i] = solution
+            if found.outcome[i] == CORRECTED:
+                shifts[i, 0], shifts[i, 1], shifts[i, 2] = shift
+                _set_covariance(covariance[i], plus(point, shift), chosen, rig, sigmas)
+                found.ray_count[i], found.ray_miss_m[i] = chosen.size, distance
+                found.sigma_z_m[i] = np.sqrt(covariance[i, 5])
+                found.incidence_deg[i] = np.degrees(np.arccos(cosine))
                 for c in chosen:
-                    used[c] = True
+                    found.camera_used[c] = True
 
 
 @device(allocates=True)
-def _usable(
-    candidates: IntArray, point: Vector, rig: Rig, frames: Frames, least_cosine: float,
-    through: bool,
-) -> IntArray:  # fmt: skip
+def _usable(candidates: IntArray, point: Vector, rig: Rig, through: bool) -> IntArray:
     """Return the cameras that give a ray, in their order.
 
     The point is imaged along a straight line, or `through` the port.
     """
-    usable = np.empty(candidates.size, np.int64)
-    window, k = window_of(rig.port), 0
+    usable, k = np.empty(candidates.size, np.int64), 0
     for c in candidates:
         r, x = rig.rotations[c], minus(point, row_of(rig.centres, c))
         w = times(r, x)
         if through:
-            w = light_through(rig.port, rig.n, *w)
+            w = light_through(rig.window, rig.n, w)
             x = transposed_times(r, w)
-        steep = cosine_at_port(window, w)
-        if steep > 0.0 and steep >= least_cosine and holds(frames, c, scaled(-1.0, x)):
+        steep = cosine_at_port(rig.window, w)
+        if steep > 0.0 and steep >= rig.least_cosine and holds(rig.frames, c, scaled(-1.0, x)):
             usable[k] = c
             k += 1
     return usable[:k]
 
 
+Solution: TypeAlias = tuple[int, Vector, float, float, bool]
+"""Outcome, shift and rms distance of the rays (m), least cosine at the port, whether converged."""
+
+
 @device(allocates=True)
-def _solve(row: FloatArray, point: Vector, chosen: IntArray, rig: Rig) -> None:
-    """Intersect the rays of a point and search the true point; fill in a row of the result."""
-    window, sums, least, k = window_of(rig.port), np.zeros(9), 1.0, 0
+def _solve(point: Vector, chosen: IntArray, rig: Rig) -> Solution:
+    """Intersect the rays of a point, and search the true point from there."""
+    sums, least, k = np.zeros(9), 1.0, 0
     for c in chosen:
         r, away = rig.rotations[c], minus(row_of(rig.centres, c), point)
         d = times(r, scaled(-1.0, away))
-        leaves, t = ray_through(window, rig.n, d)
+        leaves, t = ray_through(rig.window, rig.n, d)
         if np.isnan(leaves[0] + t[0]):
             continue
+        # where the ray leaves the port, from the apparent point
         a = plus(transposed_times(r, leaves), away)
         k, terms = k + 1, line_terms(a, transposed_times(r, t), 1.0)
         for i in range(9):
             sums[i] += terms[i]
-        least = min(least, cosine_at_port(window, d))
-    solved, q, distance = nearest_point(
-        float(k), (*vector(sums), *vector(sums, 3), *vector(sums, 6))
-    )
-    row[:] = 0.0
+        least = min(least, cosine_at_port(rig.window, d))
     if k < 2:
-        row[_OUTCOME] = ONE_CAMERA if k == 1 else NO_CAMERA
-    elif not solved:
-        row[_OUTCOME] = PARALLEL
-    else:
-        (row[0], row[1], row[2]), row[_FOUND] = _search(q, point, chosen, rig)
-        row[_DISTANCE], row[_COSINE], row[_OUTCOME] = distance, least, CORRECTED
+        return ONE_CAMERA if k == 1 else NO_CAMERA, (0.0, 0.0, 0.0), 0.0, least, False
+    nine = (*vector(sums), *vector(sums, 3), *vector(sums, 6))
+    solved, q, distance = nearest_point(float(k), nine)
+    if not solved:
+        return PARALLEL, (0.0, 0.0, 0.0), 0.0, least, False
+    shift, converged = _search(q, point, chosen, rig)
+    return CORRECTED, shift, distance, least, converged
 
 
 Projected: TypeAlias = tuple[float, float, Vector, Vector, float, float]
@@ -274,7 +275,7 @@ Projected: TypeAlias = tuple[float, float, Vector, Vector, float, float]
 def _image_through(a: Vector, rig: Rig, c: int, out: FloatArray) -> Projected:
     """Project the point at C + a through the port of a camera; `out`, shape (3, 5), is for this."""
     r = rig.rotations[c]
-    through_port(rig.port, rig.n, *times(r, a), out)
+    through_port(rig.window, rig.n, times(r, a), out)
     u, v, g = image_and_gradients(rig.lenses[rig.row[c]], *column_of(out, 0))
     x, y, z, by_n = column_of(out, 1), column_of(out, 2), column_of(out, 3), column_of(out, 4)
     gu, gv = g[:3], g[3:]
@@ -292,7 +293,8 @@ def _search(start: Vector, point: Vector, chosen: IntArray, rig: Rig) -> tuple[V
         g[:], slope[:] = 0.0, 0.0
         for c in chosen:
             a = minus(point, row_of(rig.centres, c))
-            u, v, ju, jv = image_in_world(rig.lenses[rig.row[c]], rig.rotations[c], a)
+            u, v, ju, jv = image_and_slopes(rig.lenses[rig.row[c]], None, rig.rotations[c], a)
+            # the image of the true point minus that of the apparent one is the residual of g
             u_true, v_true, lu, lv, _, _ = _image_through(plus(a, q), rig, c, out)
             for k in range(3):
                 g[k] += ju[k] * (u_true - u) + jv[k] * (v_true - v)
@@ -333,6 +335,7 @@ def _set_covariance(
             noise = plus_square(noise, scaled(sigmas.attitude, turned))
     # the error of the refractive index is common to all images
     noise = plus_square(noise, scaled(sigmas.refractive_index, by_n))
+    # H^-1 N H^-1, with the cofactors over the determinant for H^-1
     det, (xx, xy, xz, yy, yz, zz) = cofactors(h)
     if det > 0.0:
         x, y, z = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)

@@ -29,15 +29,13 @@ class FlatPort:
 
     def __post_init__(self) -> None:
         """Check every value against its rule."""
-        _check(
-            "distance", self.distance_m, math.isfinite(self.distance_m) and self.distance_m >= 0.0,
-            "must not be negative. Give metres from the projection centre to the inner face.",
-        )  # fmt: skip
-        _check_glass(self)
         length = math.hypot(*self.normal)
         _check(
-            "normal", self.normal, math.isfinite(length) and self.normal[2] > 0.0,
-            "must point out of the camera. Give its x (right), y (down) and z (forward).",
+            self,
+            ("distance", self.distance_m, 0.0 <= self.distance_m < math.inf,
+             "must not be negative. Give metres from the projection centre to the inner face."),
+            ("normal", self.normal, math.isfinite(length) and self.normal[2] > 0.0,
+             "must point out of the camera. Give its x (right), y (down) and z (forward)."),
         )  # fmt: skip
         x, y, z = (part / length for part in self.normal)
         object.__setattr__(self, "normal", (x, y, z))
@@ -63,14 +61,12 @@ class DomePort:
     def __post_init__(self) -> None:
         """Check every value against its rule."""
         _check(
-            "radius", self.radius_m, math.isfinite(self.radius_m) and self.radius_m > 0.0,
-            "must be positive. Give that of the inner face in metres.",
-        )  # fmt: skip
-        _check_glass(self)
-        _check(
-            "centre", self.centre_m, math.hypot(*self.centre_m) < self.radius_m,
-            f"is farther from the projection centre than the radius {self.radius_m:g}, so that the"
-            " camera is outside. Give x, y and z in metres, in the camera frame.",
+            self,
+            ("radius", self.radius_m, 0.0 < self.radius_m < math.inf,
+             "must be positive. Give that of the inner face in metres."),
+            ("centre", self.centre_m, math.hypot(*self.centre_m) < self.radius_m,
+             f"is farther from the projection centre than the radius {self.radius_m:g}, so that the"
+             " camera is outside. Give x, y and z in metres, in the camera frame."),
         )  # fmt: skip
 
     def __str__(self) -> str:
@@ -117,12 +113,12 @@ def port_of(text: str) -> Port:
             raise _bad(text, f"{word} is not a number: '{number}'", _EXAMPLES[kind])
     if known[0] not in values:
         raise _bad(text, f"{known[0]} is missing", _EXAMPLES[kind])
-    size, thickness, _, x, y, *z = (values.get(name, 0.0) for name in known)
-    glass = values.get("glass", ACRYLIC_INDEX)
+    values = {"glass": ACRYLIC_INDEX} | values
+    size, thickness, glass, x, y, *z = (values.get(name, 0.0) for name in known)
     if kind == "dome":
         return DomePort(size, thickness, glass, (x, y, z[0]))
-    _check("normal", (x, y), x * x + y * y < 1.0, "is longer than a unit vector.")
-    return FlatPort(size, thickness, glass, (x, y, math.sqrt(1.0 - x * x - y * y)))
+    z_normal = math.sqrt(max(1.0 - x * x - y * y, 0.0))  # 0 of a vector that is too long is refused
+    return FlatPort(size, thickness, glass, (x, y, z_normal))
 
 
 def _bad(text: str, why: str, example: str) -> SettingError:
@@ -131,18 +127,16 @@ def _bad(text: str, why: str, example: str) -> SettingError:
     )
 
 
-def _check(name: str, value: object, is_right: bool, rule: str) -> None:
-    if not is_right:
-        raise SettingError("port.range", f"port: {name} {value} {rule}", option=name, value=value)
-
-
-def _check_glass(port: Port) -> None:
-    thickness, index = port.thickness_m, port.glass_index
-    _check(
-        "thickness", thickness, math.isfinite(thickness) and thickness >= 0.0,
-        "must not be negative. Give metres of glass, or 0 for a thin port.",
-    )  # fmt: skip
-    _check(
-        "glass", index, math.isfinite(index) and index >= 1.0,
-        "must be at least 1: the refractive index of the glass, 1.49 for acrylic.",
-    )  # fmt: skip
+def _check(port: Port, *rules: tuple[str, object, bool, str]) -> None:
+    """Check rules (name, value, whether it is right, sentence) and those of the glass."""
+    thickness, glass = port.thickness_m, port.glass_index
+    for name, value, is_right, rule in (
+        *rules,
+        ("thickness", thickness, 0.0 <= thickness < math.inf,
+         "must not be negative. Give metres of glass, or 0 for a thin port."),
+        ("glass", glass, 1.0 <= glass < math.inf,
+         "must be at least 1: the refractive index of the glass, 1.49 for acrylic."),
+    ):  # fmt: skip
+        if not is_right:
+            text = f"port: {name} {value} {rule}"
+            raise SettingError("port.range", text, option=name, value=value)

@@ -17,13 +17,15 @@ import numpy.typing as npt
 from pcfix.errors import PcfixWarning, SettingError
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Vector, dot, minus, normal_of, row_of, times, transposed_times
-from pcfix.lens.imaging import direction_of, image_of, lens_table
+from pcfix.lens.formulas import lens_table
+from pcfix.lens.imaging import direction_of, image_of
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Outcome, Views, WaterSurface
 from pcfix.options.correct import ScienceOptions
 from pcfix.water.surface import Field, SurfaceAbove
 
 if TYPE_CHECKING:
-    from pcfix.refract.matcher import Bed, Matcher
+    from pcfix.refract.fusion import Bed
+    from pcfix.refract.matcher import Matcher
     from pcfix.refract.occlusion import Occluder
     from pcfix.refract.regression import DepthRegression
 
@@ -325,7 +327,7 @@ class Optics(NamedTuple):
 
     rotations: FloatArray  # (k, 3, 3), from the world
     row: IntArray  # (k,), of each camera in `lenses`
-    lenses: FloatArray  # see `pcfix.lens.imaging.lens_table`
+    lenses: FloatArray  # see `pcfix.lens.formulas.lens_table`
 
 
 def optics_of(cameras: Cameras) -> Optics:

@@ -11,8 +11,7 @@ from pcfix.errors import SettingError
 from pcfix.model import Cameras, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import ALIKE, FLAT_DEG, Batch, Survey, require_orientation
-from pcfix.refract.methods import batches, on_land, with_rays
-from pcfix.refract.patches import gsd_m
+from pcfix.refract.methods import on_land
 from pcfix.refract.reconstructions import (
     IN_FRAME,
     LIMITS,
@@ -22,12 +21,10 @@ from pcfix.refract.reconstructions import (
     type_given,
     weigh,
 )
-from pcfix.refract.tiling import spatial_order
 from pcfix.water.surface import is_submerged
 
 if TYPE_CHECKING:
     from pcfix.refract.literature import StereoFactor
-    from pcfix.refract.matcher import Bed
 
 
 def resolved(
@@ -151,7 +148,9 @@ def learn_of_sample(
     if not settings.models_matcher:
         learned = learned._replace(matcher=None)
     elif settings.chooses_maps and len(sample):
-        learned = learned._replace(bed=_learn_bed(replace(sample, survey=survey)))
+        from pcfix.refract.bed import bed_around
+
+        learned = learned._replace(bed=bed_around(replace(sample, survey=survey)))
     return replace(survey, learned=learned), verdicts
 
 
@@ -175,8 +174,8 @@ def _weighed(sample: Batch, hint: Hint | None) -> tuple[Survey, tuple[Verdict, .
         # which rays were used in the reconstruction does not depend on the formula: test by snell
         sample = replace(sample, survey=survey)
         limit = weigh(sample, LIMITS)
-        fits = limit is not None and limit.chosen == LIMITS[1] and limit.patches
-        if limit is not None and fits and limit.share <= min(STRONG, 0.5 - 2.0 * limit.sigma):
+        most = 0.0 if limit is None else min(STRONG, 0.5 - 2.0 * limit.sigma)
+        if limit is not None and limit.chosen == LIMITS[1] and limit.share <= most:
             survey = replace(survey, learned=survey.learned._replace(limit_deg=FLAT_DEG))
             verdicts.append(limit)
         elif survey.settings.dimensions == "all" and not _wants_comparison(survey):
@@ -216,26 +215,6 @@ def with_matcher(batch: Batch, ties: TiePoints | None) -> Survey:
         step = max(1, len(batch) // enough)
         matcher = matcher_of(matched, np.ascontiguousarray(places[::step]))
     return replace(survey, learned=survey.learned._replace(matcher=matcher))
-
-
-BED_POINTS = 100_000
-"""Every second point of a larger sample is enough for the bed, which most of its time goes into."""
-
-
-def _learn_bed(batch: Batch) -> Bed | None:
-    """Return the bed that agrees with a sample of fused points; None if no image sees a point."""
-    from pcfix.refract.depth_maps import likely_beds
-    from pcfix.refract.matcher import bed_of
-
-    # of single maps each point shows the bed less clearly: all of them are needed
-    many = len(batch) > BED_POINTS and batch.survey.settings.matcher == "depth-maps"
-    batch = batch.take(np.arange(0, len(batch), 2 if many else 1))
-    order = spatial_order(batch.xyz)
-    likely = [likely_beds(with_rays(batch.take(rows))) for rows in batches(order)]
-    table = np.full((len(batch), max(part.shape[1] for part in likely)), np.nan, np.float32)
-    for rows, part in zip(batches(np.arange(len(batch))), likely, strict=True):
-        table[rows, : part.shape[1]] = part
-    return bed_of(batch.xyz[order], table, gsd_m(batch)) if np.isfinite(table).any() else None
 
 
 def weigh_lists(batch: Batch, *, is_open: bool) -> Verdict | None:

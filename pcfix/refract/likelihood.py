@@ -67,6 +67,9 @@ def log_likelihood(
     prior /= np.maximum(prior.sum(axis=2, keepdims=True), 1e-12)
     depth = np.maximum(level_m - apparent_m, 0.05)
     gain = np.clip((level_m[..., None] - height) / depth[..., None], 1.0, 4.0)
+    # of the candidates of each patch about their means: how far apart beds may be
+    mean = (prior * height).sum(axis=2, keepdims=True)
+    spread = np.sqrt((prior * (height - mean) ** 2).sum(axis=2).mean(axis=1))
     rest, sigma = np.empty_like(height), SIGMA_GSD * gsd_m
     beds = np.full((len(terms), FOLDS, terms.shape[2]), np.nan)
 
@@ -83,7 +86,7 @@ def log_likelihood(
 
     bounds = np.log(np.multiply(SIGMAS_GSD, gsd_m)).tolist()
     for _ in range(2):
-        in_tiles(_predict, len(terms), terms, height, gain, prior, sigma, beds, rest)
+        in_tiles(_predict, len(terms), terms, height, gain, prior, spread, sigma, beds, rest)
         found = minimize_scalar(misfit, bounds=bounds, method="bounded", options={"xatol": 0.02})
         sigma = float(np.exp(found.x))
     return np.asarray(log_density(found.x).mean(axis=1))
@@ -101,7 +104,7 @@ def standard_errors(of: FloatArray, other: FloatArray, model_error: float = MODE
 @kernel(allocates=True)
 def _predict(
     span: Span, terms: FloatArray, height: FloatArray, gain: FloatArray, prior: FloatArray,
-    sigma: float, beds: FloatArray, rest: FloatArray,
+    spread: FloatArray, sigma: float, beds: FloatArray, rest: FloatArray,
 ) -> None:  # fmt: skip
     """Set the residuals of all candidates from the bed of the other points of their patch.
 
@@ -110,8 +113,6 @@ def _predict(
     n, k = height.shape[1:]
     bed, best, normal = np.zeros(6), np.zeros(6), np.empty((6, 7))
     for p in range(*span):
-        # of the candidates, which says how far apart beds may be
-        spread = _spread(height[p], prior[p])
         for fold in range(FOLDS):
             most, best[:] = -np.inf, beds[p, fold]
             if not np.isnan(best[0]):
@@ -122,7 +123,7 @@ def _predict(
                     bed[:] = 0.0
                     # through the mean candidates, with the largest noise that there can be
                     _step(terms[p], height[p], gain[p], prior[p], fold, 1e6, normal, bed)
-                    bed[0] += STARTS[start] * spread / terms[p, 0, 0]
+                    bed[0] += STARTS[start] * spread[p] / terms[p, 0, 0]
                     likelihood = 0.0
                     for wider in WIDER:
                         likelihood = _step(
@@ -145,20 +146,6 @@ def _height(terms: FloatArray, bed: FloatArray) -> float:
     for a in range(6):
         total += terms[a] * bed[a]
     return total
-
-
-@device
-def _spread(height: FloatArray, prior: FloatArray) -> float:
-    """Return the standard deviation of the candidates of a patch about their mean, metres."""
-    total = 0.0
-    for i in range(len(height)):
-        mean, square = 0.0, 0.0
-        for c in range(height.shape[1]):
-            mean += prior[i, c] * height[i, c]
-        for c in range(height.shape[1]):
-            square += prior[i, c] * (height[i, c] - mean) ** 2
-        total += square
-    return np.sqrt(total / len(height))
 
 
 # sums over candidates in any order are vectorised: three times as fast, equal to 1e-13

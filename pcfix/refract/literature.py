@@ -33,6 +33,10 @@ TOLERANCE = 1e-9
 MOST_ITERATIONS = 50
 
 Crossings: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Of the refracted rays of a point: how far below P each crosses the plumb line, metres; how it
+leans, metres aside in x and y per metre down; and s = tan a / tan b, true by apparent depth."""
+
+_MEAN, _PAIRS, _S_MODEL = range(3)
 
 
 def factor(batch: Batch) -> Intersection:
@@ -102,9 +106,6 @@ def _by_rays(batch: Batch, method: int) -> Intersection:
     return batch.result(shift, outcome=outcome.astype(np.uint8), ray_miss_m=distance)
 
 
-_MEAN, _PAIRS, _S_MODEL = range(3)
-
-
 @kernel(allocates=True)
 def _solve(
     span: Span, points: Chosen, method: int, shift: FloatArray, distance: FloatArray,
@@ -134,11 +135,7 @@ def _solve(
 
 @device(allocates=True)
 def _crossings(e: FloatArray, depth: FloatArray, tangent: FloatArray, n: float) -> Crossings:
-    """Return how far below P refracted rays cross its plumb line, how they lean, and s.
-
-    How a ray leans is how far it goes aside per metre down, in x and y; s = tan a / tan b is the
-    true by the apparent depth along it, 1 in air.
-    """
+    """Return the crossings of rays with tan a in air through depths of water; s is 1 above it."""
     s = np.where(depth > 0.0, np.sqrt(n * n + (n * n - 1.0) * tangent * tangent), 1.0)
     return depth * (s - 1.0), -e[:, 0] / (e[:, 2] * s), -e[:, 1] / (e[:, 2] * s), s
 
@@ -381,10 +378,8 @@ def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
     near = np.asarray(cKDTree(plan).query(plan, k=[2])[1])[:, 0]
     to_next = (plan[np.minimum(near, len(plan) - 1)] - plan)[place.reshape(-1)]
     right, down, _ = np.abs(np.einsum("kij,kj->ik", rotations[rows, :, :2], to_next))
-    height_m, base_m = (
-        float(np.median(centres[:, 2] - level_m)),
-        float(np.median(np.hypot(*to_next.T))),
-    )
+    height_m = float(np.median(centres[:, 2] - level_m))
+    base_m = float(np.median(np.hypot(*to_next.T)))
     frames = np.array([(lenses[i].focal, lenses[i].width, lenses[i].height) for i in rows])
     tangents = np.median(frames[:, 1:] / frames[:, :1], axis=0) / 2.0
     along, across = tangents[::-1] if np.median(right) < np.median(down) else tangents

@@ -1,4 +1,4 @@
-"""Predict which images a dense matcher compares with each other, and the bed of the surroundings.
+"""Predict which images a dense matcher compares with each other.
 
 For each image i the other images j are scored by the places p that both see,
 
@@ -6,16 +6,18 @@ For each image i the other images j are scored by the places p that both see,
 
 with the angle a_p between the two rays (g is a Gaussian around 12 degrees, wider on the upper
 side), the depths d of p in the images (f is 1 for equal ones), and the share of image i that the
-common places cover. This is the rule of OpenMVS (`Scene::SelectNeighborViews`); COLMAP and other
-patch matchers differ in the constants. On a real block it finds 91 % of the partners from places
-of the dense cloud and 98 % from the tie points that the matcher used.
+common places cover. Places of a cloud are found again in an image at another angle with the
+probability found = exp(-(a_p / REPEATED_DEG)^2); the images of tie points are known. This is the
+rule of OpenMVS (`Scene::SelectNeighborViews`); COLMAP and other patch matchers differ in the
+constants. On a real block it finds 91 % of the partners from places of the dense cloud and 98 %
+from the tie points that the matcher used.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,23 +28,22 @@ from pcfix.lens.imaging import project
 from pcfix.model import Cameras, FloatArray, IntArray, TiePoints
 
 MATCHED, AVERAGED, NEIGHBOURS = 5, 8, 12
+BEST_ANGLE_DEG, NARROW_DEG, WIDE_DEG = 12.0, 4.56, 8.4
+LEAST_ANGLE_DEG, LARGEST_ANGLE_DEG, LEAST_ANGLE_WEIGHT = 3.0, 65.0, 0.1
+REPEATED_DEG = 45.0
+CELLS = 16  # along each side of an image, to measure the area that common places cover
+LEAST_AREA, SCALE_RANGE = 0.05, (0.2, 3.2)
+FINER = 1.6
+"""Ratio of distances up to which an image is as good as one as far away as the reference."""
+
+TOLERANCE_PX2 = 0.1
+WIDTH_M, NEAR_WIDTH_M = 0.2, 0.06
+BORDER_PX = 8.0
+"""Half the width of a patch of 9 pixels at half resolution."""
+
 NEAR, BASE_TO_HEIGHT, AXES_WITHIN_DEG, LEAST_NEAR = 12, (0.1, 0.5), 30.0, 3
 """Of software that does not average maps: the stereo models of a base image, and how many of them
 must show a place."""
-BEST_ANGLE_DEG, NARROW_DEG, WIDE_DEG = 12.0, 4.56, 8.4
-LEAST_ANGLE_DEG, LARGEST_ANGLE_DEG = 3.0, 65.0
-LEAST_ANGLE_WEIGHT = 0.1
-REPEATED_DEG = 45.0
-"""Share of features found again in an image at another angle: exp(-(angle / REPEATED_DEG)^2)."""
-
-TOLERANCE_PX2 = 0.1
-CELLS = 16
-WIDTH_M, NEAR_WIDTH_M = 0.2, 0.06
-LEAST_AREA = 0.05
-LEAST_COMMON = 3
-SCALE_RANGE = (0.2, 3.2)
-FINER = 1.6
-"""Ratio of distances up to which an image is as good as one as far away as the reference."""
 
 
 class Matcher(NamedTuple):
@@ -87,23 +88,43 @@ def matcher_of(cameras: Cameras, places: FloatArray) -> Matcher:
         np.flatnonzero((((centre - places) @ around.T) <= 0.0).all(axis=1))
         for centre, around in zip(cameras.centres, planes, strict=True)
     )
-    return _matcher(cameras, places, _seen(cameras, places, likely), tracked=False)
+    return _matcher(cameras, places, likely, tracked=False)
 
 
 def matcher_of_ties(cameras: Cameras, ties: TiePoints) -> Matcher:
     """Predict the partners of images from the images that saw each tie point, world frame."""
     rows = np.flatnonzero(np.isfinite(ties.xyz).all(axis=1))
     views = ties.views.take(rows)
-    places = np.ascontiguousarray(ties.xyz[rows])
     owner = np.repeat(np.arange(len(rows)), np.diff(views.start))
     camera = np.asarray(views.camera)
-    order = np.lexsort((owner, camera))
-    ends = np.searchsorted(camera[order], np.arange(1, len(cameras)))
-    saw = (np.unique(mine) for mine in np.split(owner[order], ends))
-    return _matcher(cameras, places, _seen(cameras, places, saw), tracked=True)
+    ends = np.cumsum(np.bincount(camera, minlength=len(cameras)))[:-1]
+    saw = map(np.unique, np.split(owner[np.argsort(camera, kind="stable")], ends))
+    return _matcher(cameras, np.ascontiguousarray(ties.xyz[rows]), saw, tracked=True)
 
 
-def _matcher(cameras: Cameras, places: FloatArray, seen: _Seen, *, tracked: bool) -> Matcher:
+def _matcher(
+    cameras: Cameras, places: FloatArray, likely: Iterable[IntArray], *, tracked: bool
+) -> Matcher:
+    """Return the matcher of oriented cameras; `likely` are the places that each may see."""
+    found, rotations = list[tuple[IntArray, IntArray, FloatArray]](), np.asarray(cameras.rotations)
+    for c, (lens, rows) in enumerate(zip(cameras.lenses or (), likely, strict=True)):
+        rays = (places[rows] - cameras.centres[c]) @ rotations[c].T
+        u, v = project(lens, rays).T
+        inside = (u >= 0.0) & (u < lens.width) & (v >= 0.0) & (v < lens.height)
+        column, row = CELLS * u[inside] / lens.width, CELLS * v[inside] / lens.height
+        cell = row.astype(int) * CELLS + column.astype(int)
+        found.append((rows[inside], cell, rays[inside, 2]))
+    place, cell, depth = (np.concatenate(one) for one in zip(*found, strict=True))
+    counts = [len(rows) for rows, *_ in found]
+    seen = _Seen(
+        start=np.concatenate([[0], np.cumsum(counts)]),
+        place=place,
+        cell=cell,
+        depth=depth,
+        of_place=np.argsort(place, kind="stable"),
+        first=np.concatenate([[0], np.cumsum(np.bincount(place, minlength=len(places)))]),
+        image=np.repeat(np.arange(len(cameras)), counts),
+    )
     table = np.full((len(cameras), NEIGHBOURS), -1)
     in_tiles(_find_partners, len(cameras), places, cameras.centres, seen, tracked, table)
     return Matcher(
@@ -130,41 +151,11 @@ def _near_images(cameras: Cameras, ground_m: float) -> IntArray:
     return table
 
 
-BORDER_PX = 8.0
-"""Half the width of a patch of 9 pixels at half resolution."""
-
-
 def without_border(cameras: Cameras) -> Cameras:
     """Return cameras whose frames are narrower by the border in which no patch fits."""
     lenses = cameras.lenses or ()
     inner = tuple(with_border(lens, BORDER_PX * lens.pixel_size) for lens in lenses)
     return replace(cameras, lenses=inner)
-
-
-def _seen(cameras: Cameras, places: FloatArray, likely: Iterable[IntArray]) -> _Seen:
-    """Return which images, with angles and lenses, see which places.
-
-    `likely` has the rows of the places that each image may see.
-    """
-    found, rotations = list[tuple[IntArray, IntArray, FloatArray]](), np.asarray(cameras.rotations)
-    for c, (lens, rows) in enumerate(zip(cameras.lenses or (), likely, strict=True)):
-        rays = (places[rows] - cameras.centres[c]) @ rotations[c].T
-        u, v = project(lens, rays).T
-        inside = (u >= 0.0) & (u < lens.width) & (v >= 0.0) & (v < lens.height)
-        column, row = CELLS * u[inside] / lens.width, CELLS * v[inside] / lens.height
-        cell = row.astype(int) * CELLS + column.astype(int)
-        found.append((rows[inside], cell, rays[inside, 2]))
-    place, cell, depth = (np.concatenate(one) for one in zip(*found, strict=True))
-    counts = [len(rows) for rows, *_ in found]
-    return _Seen(
-        start=np.concatenate([[0], np.cumsum(counts)]),
-        place=place,
-        cell=cell,
-        depth=depth,
-        of_place=np.argsort(place, kind="stable"),
-        first=np.concatenate([[0], np.cumsum(np.bincount(place, minlength=len(places)))]),
-        image=np.repeat(np.arange(len(cameras)), counts),
-    )
 
 
 TOTAL, ANGLES, SCALES, COMMON = range(4)
@@ -175,11 +166,9 @@ def _find_partners(
     span: Span, places: FloatArray, centres: FloatArray, seen: _Seen, tracked: bool,
     table: IntArray,
 ) -> None:  # fmt: skip
-    """Set the best partners j of the reference i, best first.
-
-    `sums` and `covered` are zero for images that see no place of the reference.
-    """
+    """Set the best partners j of the reference i, best first."""
     k, width = len(centres), table.shape[1]
+    # of each other image, and zero again before the next reference
     sums, covered = np.zeros((k, 4)), np.zeros((k, CELLS * CELLS), np.bool_)
     best = np.empty(width)
     for i in range(*span):
@@ -196,12 +185,11 @@ def _find_partners(
                     angle = np.degrees(np.arccos(min(1.0, cosine)))
                     scale = seen.depth[other] / seen.depth[one]
                     found = 1.0 if tracked else np.exp(-((angle / REPEATED_DEG) ** 2))
-                    # full weight for images that are as near or up to FINER times farther away
+                    # f: full weight for images that are as near or up to FINER times farther away
                     weight = (FINER / scale) ** 2 if scale > FINER else min(scale * scale, 1.0)
-                    # a Gaussian around the best angle, wider towards large ones
-                    off = (angle - BEST_ANGLE_DEG) / (
-                        NARROW_DEG if angle < BEST_ANGLE_DEG else WIDE_DEG
-                    )
+                    # g: a Gaussian around the best angle, wider towards large ones
+                    off = angle - BEST_ANGLE_DEG
+                    off /= NARROW_DEG if off < 0.0 else WIDE_DEG
                     weight *= max(np.exp(-0.5 * off * off), LEAST_ANGLE_WEIGHT)
                     sums[j, TOTAL] += found * weight
                     sums[j, ANGLES] += found * angle
@@ -228,142 +216,10 @@ def _score(sums: FloatArray, covered: int) -> float:
     """Return the score of a partner from its sums and the cells that common places cover."""
     area, common = covered / (CELLS * CELLS), sums[COMMON]
     # too few common places, or mean angle or scale out of range
-    if covered < LEAST_COMMON or area < LEAST_AREA:
+    if area < LEAST_AREA:
         return 0.0
     if not LEAST_ANGLE_DEG <= sums[ANGLES] / common <= LARGEST_ANGLE_DEG:
         return 0.0
     if not SCALE_RANGE[0] <= sums[SCALES] / common <= SCALE_RANGE[1]:
         return 0.0
     return float(sums[TOTAL] * area)
-
-
-POINTS_A_CELL = 12.0
-WIDTH_GSD = 2.0
-"""Standard deviation of the likely beds of one place: relief within a cell, and noise."""
-OUTLIER = 0.01
-"""Likelihood of a point none of whose likely beds is near, relative to one that has one there."""
-
-FAR_OFF_M = 0.4
-REACH = 2
-MOST_CELLS = 4_000_000
-_STEPS = 2.0
-
-
-class Bed(NamedTuple):
-    """The bed of the surroundings as heights on a grid; NaN where nothing is known.
-
-    It serves only to choose among the likely beds of a point (`pcfix.refract.depth_maps`); no point
-    is put onto it.
-    """
-
-    height_m: FloatArray  # (rows, columns), world frame, southern row first
-    left_m: float
-    bottom_m: float
-    cell_m: float
-    between: bool = True  # whether heights are interpolated between cells
-
-    def height_at(self, xy: FloatArray) -> FloatArray:
-        """Return the height at each place, NaN where the cell has none."""
-        from scipy.ndimage import map_coordinates
-
-        place = (xy.T[::-1] - [[self.bottom_m], [self.left_m]]) / self.cell_m
-        cell: dict[str, Any] = {"mode": "grid-constant", "output": np.float64}
-        own = map_coordinates(self.height_m, np.floor(place), order=0, cval=np.nan, **cell)
-        if not self.between:
-            return np.asarray(own)
-        # the mean of the four nearest middles of cells that have a height
-        known = np.isfinite(self.height_m)
-        total, weight = (
-            map_coordinates(values, place - 0.5, order=1, **cell)
-            for values in (np.where(known, self.height_m, 0.0), known.astype(np.float64))
-        )
-        inside = np.isfinite(own) & (weight > 0.0)
-        return np.where(inside, total / np.where(inside, weight, 1.0), np.nan)
-
-
-def bed_of(xyz: FloatArray, likely_m: FloatArray, gsd_m: float) -> Bed:
-    """Return the most likely bed of apparent points, cell by cell.
-
-    `likely_m`, shape (m, h), are the `pcfix.refract.depth_maps.likely_beds`, and `gsd_m` is the
-    ground size of a pixel.
-    """
-    low, high = xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0)
-    cell = _cell_m(xyz[:, :2], low, high)
-    columns, rows = (int(n) + 1 for n in (high - low) / cell)
-    at = np.floor((xyz[:, :2] - low) / cell).astype(np.int64)
-    key = at[:, 1] * columns + at[:, 0]
-    order = np.argsort(key, kind="stable")
-    filled, counts = np.unique(key, return_counts=True)
-    start = np.concatenate([[0], np.cumsum(counts)])
-    found = np.empty(len(filled))
-    z, width_m = np.ascontiguousarray(xyz[:, 2]), WIDTH_GSD * gsd_m
-    in_tiles(_most_likely, len(found), order, start, z, likely_m, width_m, found)
-    height = np.full(rows * columns, np.nan)
-    height[filled] = found
-    grid = _without_outliers(height.reshape(rows, columns))
-    return Bed(grid, float(low[0]), float(low[1]), cell)
-
-
-def _without_outliers(height: FloatArray) -> FloatArray:
-    """Replace a cell far from the median of its 5 x 5 surroundings by that median.
-
-    Where only one group of images sees the bed, several heights are equally likely.
-    """
-    row, column = np.nonzero(np.isfinite(height))
-    padded, smooth = np.pad(height, REACH, constant_values=np.nan), height.copy()
-    down, right = np.mgrid[: 2 * REACH + 1, : 2 * REACH + 1].reshape(2, -1)
-    middle = np.nanmedian(padded[row[:, None] + down, column[:, None] + right], axis=1)
-    far = np.abs(height[row, column] - middle) > FAR_OFF_M
-    smooth[row[far], column[far]] = middle[far]
-    return smooth
-
-
-def _cell_m(xy: FloatArray, low: FloatArray, high: FloatArray) -> float:
-    """Return the side of cells that hold `POINTS_A_CELL` points on average where there are any."""
-    area = np.prod(np.maximum(high - low, 1.0))
-    least = float(np.sqrt(area / MOST_CELLS))
-    side = max(float(np.sqrt(area * POINTS_A_CELL / len(xy))), least)
-    for _ in range(3):
-        at = np.floor((xy - low) / side).astype(np.int64)
-        filled = len(np.unique(at[:, 1] * (at[:, 0].max() + 1) + at[:, 0]))
-        side = max(side * float(np.sqrt(POINTS_A_CELL * filled / len(xy))), least)
-    return side
-
-
-@kernel(allocates=True)
-def _most_likely(
-    span: Span, order: IntArray, start: IntArray, z: FloatArray, likely: FloatArray,
-    width_m: float, found: FloatArray,
-) -> None:  # fmt: skip
-    """Find the most likely height of the bed in each cell.
-
-    A point comes from one of its likely beds b, all equally probable, so that the log likelihood of
-    a height z is the sum of log(OUTLIER + sum_b exp(-((b - z) / width_m)^2 / 2)) over the points.
-    """
-    reach = int(3.0 * _STEPS)  # three standard deviations to both sides
-    for c in range(*span):
-        rows = order[start[c] : start[c + 1]]
-        # the range of likely beds in the cell
-        low, high = np.inf, -np.inf
-        for i in rows:
-            for h in range(likely.shape[1]):
-                if likely[i, h] == likely[i, h]:
-                    low = min(low, likely[i, h] + z[i])
-                    high = max(high, likely[i, h] + z[i])
-        found[c] = np.nan
-        if not high >= low:
-            continue
-        # a histogram with bins of half a standard deviation
-        step = max(width_m / _STEPS, (high - low) / 2000.0)
-        total = np.zeros(int((high - low) / step) + 2)
-        own = np.empty(total.size)
-        for i in rows:
-            own[:] = OUTLIER
-            for h in range(likely.shape[1]):
-                at = (likely[i, h] + z[i] - low) / step
-                if at == at:
-                    for k in range(max(0, int(at) - reach), min(own.size, int(at) + reach + 2)):
-                        off = (k - at) / _STEPS
-                        own[k] += np.exp(-0.5 * off * off)
-            total += np.log(own)
-        found[c] = low + np.argmax(total) * step

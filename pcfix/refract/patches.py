@@ -51,8 +51,7 @@ SQUARE_PATCHES, MOST_IN_SQUARES = 5.0, 1_000_000
 _MIX = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0xD6E8FEB86659FD93)
 """Odd numbers of a hash."""
 
-_TERMS = 6
-
+_TERMS = 6  # coefficients of a quadratic surface
 
 Patches: TypeAlias = tuple[IntArray, IntArray]
 """Groups of neighbours: the m rows of a batch that are in one, and their places among these rows,
@@ -64,43 +63,39 @@ def patches_of(batch: Batch, *, at_borders: bool) -> Patches | None:
 
     With `at_borders` those of dense clouds lie where the nearest image changes.
     """
-    sizes = PATCH_POINTS if batch.views is None else PATCH_POINTS[-1:]
-    found = (_patches_of(batch, points, at_borders) for points in sizes)
-    return next(filter(None, found), None)
-
-
-def _patches_of(batch: Batch, points: int, at_borders: bool) -> Patches | None:
     from scipy.spatial import cKDTree
 
-    usable, fewest = np.arange(len(batch)), FEWEST_WITHOUT_LIST
+    usable, fewest, largest = np.arange(len(batch)), FEWEST_WITHOUT_LIST, PATCH_POINTS[0]
     if batch.views is not None:
-        usable, fewest = np.flatnonzero(np.diff(batch.views.start) >= 2), FEWEST_POINTS
+        usable = np.flatnonzero(np.diff(batch.views.start) >= 2)
+        fewest, largest = FEWEST_POINTS, PATCH_POINTS[-1]
     if len(usable) < fewest:
         return None
     width_m = PATCH_WIDTH * flying_height_m(batch)
-    # so dense that a patch is as wide as the images' borders are far apart
-    # by axis, because numpy is slow along the short one
+    # the area of the points, in squares as wide as a patch: of their rectangle or, if it has gaps,
+    # of the squares that hold points; by axis, because numpy is slow along the short one
     x, y = (batch.xyz[usable, axis] for axis in (0, 1))
     extent = np.maximum([np.ptp(x), np.ptp(y)], width_m)
     column, row = (np.floor((one - one.min()) / width_m).astype(np.int64) for one in (x, y))
     squares = len(np.unique(column * (int(row.max()) + 1) + row))
     covered = min(float(extent.prod()) / width_m**2, squares)
-    step = max(1, int(len(usable) / max(FEWEST_POINTS, points * covered)))
-    usable = usable[::step]
-    xy = batch.xyz[usable, :2]
-    close = np.arange(len(xy))
-    if at_borders and points == PATCH_POINTS[0]:
-        border_m = _border_distance_m(xy, batch.survey.cameras.centres[:, :2])
-        close = np.sort(np.argsort(border_m)[: max(PATCHES, int(BORDER_SHARE * len(xy)))])
-    seeds = np.unique(close[np.linspace(0, len(close) - 1, PATCHES).astype(int)])
-    tree = cKDTree(xy, balanced_tree=False, compact_nodes=False)
-    patch = usable[tree.query(xy[seeds], k=points)[1]]
-    across = np.ptp(batch.xyz[patch, :2], axis=1).prod(axis=1)
-    is_wide = math.sqrt(np.median(across)) * PATCH_WIDTH > WIDEST_PATCH * width_m
-    if batch.views is None and is_wide:
-        return None
-    rows, place = np.unique(patch, return_inverse=True)
-    return rows, place.reshape(patch.shape)
+    for points in (n for n in PATCH_POINTS if n <= largest):
+        # so dense that the points of a patch spread over its width
+        some = usable[:: max(1, int(len(usable) / max(FEWEST_POINTS, points * covered)))]
+        xy = batch.xyz[some, :2]
+        close = np.arange(len(xy))
+        if at_borders and points == PATCH_POINTS[0]:
+            border_m = _border_distance_m(xy, batch.survey.cameras.centres[:, :2])
+            close = np.sort(np.argsort(border_m)[: max(PATCHES, int(BORDER_SHARE * len(xy)))])
+        seeds = np.unique(close[np.linspace(0, len(close) - 1, PATCHES).astype(int)])
+        tree = cKDTree(xy, balanced_tree=False, compact_nodes=False)
+        patch = some[tree.query(xy[seeds], k=points)[1]]
+        across = np.ptp(batch.xyz[patch, :2], axis=1).prod(axis=1)
+        is_wide = math.sqrt(np.median(across)) * PATCH_WIDTH > WIDEST_PATCH * width_m
+        if batch.views is not None or not is_wide:
+            rows, place = np.unique(patch, return_inverse=True)
+            return rows, place.reshape(patch.shape)
+    return None
 
 
 def _border_distance_m(xy: FloatArray, centres: FloatArray) -> FloatArray:

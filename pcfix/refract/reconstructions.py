@@ -1,7 +1,16 @@
 """Detect the reconstruction type: the one whose correction leaves the smoothest bed.
 
 ``auto`` corrects a sample of points as each type would require and looks for discontinuities where
-the images that see the points change (`pcfix.refract.patches`).
+the images that see the points change (`pcfix.refract.patches`). Of those by which the beds of the
+types a and b differ, the share beta is left in that of a, with the standard error sigma. So a is
+better by
+
+    (0.5 - beta) / sqrt(sigma^2 + SHARE_ERROR^2)
+
+standard errors or, in dense clouds, by the difference of log likelihoods over its standard error
+(`pcfix.refract.likelihood`). What is known of density and software is added. The best type is that
+with the largest distance from its runner-up; the confidence is the product of the probabilities
+that it is better than each other type.
 """
 
 from __future__ import annotations
@@ -240,31 +249,10 @@ def type_given(batch: Batch) -> Reconstruction:
         changes["camera_set"] = "mvs" if settings.models_matcher else "all"
         changes["matcher"] = settings.matcher
     kind = None if views is None else views.kind
-    for one in reconstructions_of(batch) if views is not None else IN_FRAME:
+    for one in IN_FRAME if views is None else reconstructions_of(batch):
         if one.kind == kind and all(changes[name] == one.changes[name] for name in one.changes):
             return one
     return Reconstruction(settings.method, changes, kind)
-
-
-class _Beds(NamedTuple):
-    """The points of patches as corrected for each type; see `pcfix.refract.patches.shares`.
-
-    `errors` are the standard errors by which one type is better than another; infinite for itself.
-    """
-
-    types: tuple[Reconstruction, ...]
-    z: FloatArray
-    place: IntArray
-    patches: int
-    share: FloatArray
-    sigma: FloatArray
-    errors: FloatArray
-
-    def rank(self, among: list[int]) -> tuple[int, int]:
-        """Return the best of some types, and the runner-up."""
-        errors = self.errors[np.ix_(among, among)]
-        best = int(np.argmax(errors.min(axis=1)))
-        return among[best], among[int(np.argmin(errors[best]))]
 
 
 def weigh(
@@ -276,31 +264,29 @@ def weigh(
 ) -> Verdict | None:
     """Choose the reconstruction that best explains the points, or test the one set by the user.
 
-    The submerged points are evenly spread over the cloud, and
-    `batch.survey.learned` has the matcher. `given` is set by the user, `hint` decides if the points
-    do not. None with a single type, or too few points for patches.
+    The submerged points are evenly spread over the cloud, and `batch.survey.learned` has the
+    matcher. `given` is set by the user, `hint` decides if the points do not. None with a single
+    type, or too few points for patches.
     """
     types = reconstructions
     if given is not None and given not in types:
         types = *types, given
-    at_borders = batch.views is None and LIMITS[0] not in types
-    sample = patches.patches_of(batch, at_borders=at_borders) if len(types) > 1 else None
+    # else they differ in what a view list means, or in the largest angle
+    by_images = batch.views is None and LIMITS[0] not in types
+    sample = patches.patches_of(batch, at_borders=by_images) if len(types) > 1 else None
     if sample is None:
         return None
     rows, place = sample
-    part = batch.take(rows)
-    survey = replace(part.survey, level_offset_m=None)
-    part = replace(part, survey=survey, level_sigma_m=None)
-    is_dense = place.shape[1] == patches.PATCH_POINTS[0]
-    around = patches.others_around(replace(batch, survey=part.survey), rows)
-    beds = _beds(part, around, place, types)
+    batch = replace(batch, survey=replace(batch.survey, level_offset_m=None), level_sigma_m=None)
+    part, is_dense = batch.take(rows), place.shape[1] == patches.PATCH_POINTS[0]
+    beds = _beds(part, patches.others_around(batch, rows), place, types, by_images)
     if beds is None or (given is not None and given not in beds.types):
         return None
     remarks, among, by = _remarks(part, place), list(range(len(beds.types))), ""
     if remarks:
         beds = beds._replace(errors=beds.errors / WEAK)
     if given is None:
-        if part.views is None and reconstructions is not LIMITS:
+        if by_images:
             beds, by = _with_prior(beds, is_dense, hint)
         best, other = beds.rank(among)
     else:
@@ -308,9 +294,7 @@ def weigh(
         among = [i for i in among if beds.types[i] in reconstructions]
         first, second = beds.rank(among)
         other = second if first == best else first
-    deeper_m = float(np.nanmean((beds.z[best] - beds.z[other])[beds.place]))
-    better = beds.errors[best, among] if beds.patches else np.zeros(2)
-    confidence = math.prod(0.5 * math.erfc(-one / math.sqrt(2.0)) for one in better)
+    confidence = math.prod(1.0 - _chance(errors) for errors in beds.errors[best, among])
     straight = None
     if beds.patches and not remarks and part.original_model is None:
         share, sigma = shares(part, beds.place, np.array([beds.z[best], part.xyz[:, 2]]))
@@ -318,13 +302,13 @@ def weigh(
     return Verdict(
         chosen=beds.types[best],
         runner_up=beds.types[other],
-        errors=float(beds.errors[best, other]) if beds.patches else 0.0,
+        errors=float(beds.errors[best, other]),
         share=float(beds.share[best, other]),
         sigma=float(beds.sigma[best, other]),
         candidates={
             one.words: float(beds.share[i, best]) for i, one in enumerate(beds.types) if i != best
         },
-        deeper_m=deeper_m,
+        deeper_m=float(np.nanmean((beds.z[best] - beds.z[other])[beds.place])),
         patches=beds.patches,
         confidence=min(confidence, MOST_CONFIDENCE),
         model_uncertainty=_model_uncertainty(part, beds, best, among),
@@ -335,8 +319,31 @@ def weigh(
     )
 
 
+def _chance(errors: float) -> float:
+    """Return the probability that the other type is right, from the standard errors against it."""
+    return 0.5 * math.erfc(errors / math.sqrt(2.0))
+
+
+class _Beds(NamedTuple):
+    """The m points of patches as corrected for each of h types, and how the types compare."""
+
+    types: tuple[Reconstruction, ...]
+    z: FloatArray  # (h, m), corrected heights, metres; NaN where a point is not corrected
+    place: IntArray  # (p, n), the points of each patch
+    patches: int  # 0 if too few of the patches are corrected for every type
+    share: FloatArray  # (h, h), of the discontinuities left in bed a; see `patches.shares`
+    sigma: FloatArray  # (h, h), its standard error
+    errors: FloatArray  # (h, h), standard errors by which a is better than b; infinite for itself
+
+    def rank(self, among: list[int]) -> tuple[int, int]:
+        """Return the best of some types, and the runner-up."""
+        errors = self.errors[np.ix_(among, among)]
+        best = int(np.argmax(errors.min(axis=1)))
+        return among[best], among[int(np.argmin(errors[best]))]
+
+
 def _beds(
-    part: Batch, around: Batch, place: IntArray, types: tuple[Reconstruction, ...]
+    part: Batch, around: Batch, place: IntArray, types: tuple[Reconstruction, ...], by_images: bool
 ) -> _Beds | None:
     """Correct the points of the patches for each type; None if fewer than two can."""
     z: FloatArray = np.array(in_threads(partial(_heights, part, around), types))
@@ -345,28 +352,33 @@ def _beds(
     if len(comparable) < 2 or not covered.max():
         return None
     z, types = z[comparable], tuple(types[i] for i in comparable)
-    known = place[np.isfinite(z[:, place]).all(axis=(0, 2))]
-    if len(known) < LEAST_PATCHES:
-        half, none = np.full((len(z), len(z)), 0.5), np.zeros((len(z), len(z)))
-        return _Beds(types, z, place, 0, half, half, none)
-    place = known
-    share, sigma = shares(part, place, z)
-    errors = (0.5 - share) / np.maximum(sigma, 1e-9)
-    if part.views is None and LIMITS[0] not in types:
-        errors = (0.5 - share) / np.hypot(sigma, SHARE_ERROR)
+    complete = place[np.isfinite(z[:, place]).all(axis=(0, 2))]
+    if len(complete) < LEAST_PATCHES:  # no evidence
+        none = np.zeros((len(types), len(types)))
+        beds = _Beds(types, z, place, 0, none + 0.5, none, none.copy())
+    else:
+        share, sigma = shares(part, complete, z)
+        errors = (0.5 - share) / np.maximum(np.hypot(sigma, SHARE_ERROR * by_images), 1e-9)
         # The maps of a point are chosen by a smooth bed: their likelihood allows for that, the
         # discontinuities do not. But neighbours in sparse clouds show little of their scatter.
-        if place.shape[1] == patches.PATCH_POINTS[0]:
-            likely = in_threads(
-                partial(_log_likelihood, part, place), [*zip(types, z, strict=True)]
-            )
-            for a, b in permutations(range(len(types)), 2):
-                two = frozenset((types[a].words, types[b].words))
-                error = MODEL_ERRORS.get(two, MODEL_ERROR)
-                errors[a, b] = standard_errors(likely[a], likely[b], error)
-    np.fill_diagonal(share, -np.inf)
-    np.fill_diagonal(errors, np.inf)
-    return _Beds(types, z, place, len(place), share, sigma, errors)
+        if by_images and place.shape[1] == patches.PATCH_POINTS[0]:
+            errors = _likelihood_errors(part, complete, types, z)
+        beds = _Beds(types, z, complete, len(complete), share, sigma, errors)
+    np.fill_diagonal(beds.share, -np.inf)
+    np.fill_diagonal(beds.errors, np.inf)
+    return beds
+
+
+def _likelihood_errors(
+    part: Batch, place: IntArray, types: tuple[Reconstruction, ...], z: FloatArray
+) -> FloatArray:
+    """Return the standard errors by which each type is more likely than each other one, (h, h)."""
+    likely = in_threads(partial(_log_likelihood, part, place), [*zip(types, z, strict=True)])
+    errors = np.zeros((len(types), len(types)))
+    for a, b in permutations(range(len(types)), 2):
+        model_error = MODEL_ERRORS.get(frozenset((types[a].words, types[b].words)), MODEL_ERROR)
+        errors[a, b] = standard_errors(likely[a], likely[b], model_error)
+    return errors
 
 
 def _log_likelihood(
@@ -376,9 +388,9 @@ def _log_likelihood(
     one, z = bed
     candidates = Candidates(z[:, None], np.ones((len(z), 1)))
     if one.words in (_MAPS, _SINGLE):  # which of several images made a point is unknown
-        from pcfix.refract.depth_maps import candidates_of
+        from pcfix.refract.depth_maps import likely_beds
 
-        candidates = candidates_of(with_rays(_as(part, one)))
+        candidates = likely_beds(with_rays(_as(part, one)))
     each = Candidates(*(values[place] for values in candidates))
     terms = patches.smooth_surfaces(part.xyz[place])
     level = part.surface.height_m[place]
@@ -387,26 +399,25 @@ def _log_likelihood(
 
 def _with_prior(beds: _Beds, is_dense: bool, hint: Hint | None) -> tuple[_Beds, str]:
     """Add what is known of the types by density and software; return what decided, if these did."""
-    words = [one.words for one in beds.types]
-    is_single = np.array([one.is_single for one in beds.types])
-    tracks = np.array([one == _TRACKS for one in words])
-    prior = (
-        PRIOR_TRACKS[0] * tracks
-        if is_dense
-        else PRIOR_TRACKS[1] * tracks - PRIOR_SPARSE * is_single
-    )
-    errors = beds.errors + prior[:, None] - prior
-    if hint is not None:
-        likely = np.array([PRIOR_SOFTWARE * (one in hint.words) for one in words])
-        errors += likely[:, None] - likely
-    known = beds._replace(errors=errors)
-    among = list(range(len(words)))
-    best = known.rank(among)[0]
-    if beds.patches and beds.rank(among)[0] == best:
+    prior = np.array([_prior(one, is_dense, hint) for one in beds.types])
+    known = beds._replace(errors=beds.errors + prior[:, None] - prior)
+    every = list(range(len(prior)))
+    best = known.rank(every)[0]
+    if beds.patches and beds.rank(every)[0] == best:
         return known, ""
-    if hint is not None and words[best] in hint.words:
+    if hint is not None and beds.types[best].words in hint.words:
         return known, f"its software, {hint.source}"
     return known, "the spacing of its points"
+
+
+def _prior(one: Reconstruction, is_dense: bool, hint: Hint | None) -> float:
+    """Return by how many standard errors a type is likely before its points are looked at."""
+    prior = PRIOR_SOFTWARE if hint is not None and one.words in hint.words else 0.0
+    if one.words == _TRACKS:
+        prior += PRIOR_TRACKS[0 if is_dense else 1]
+    if one.is_single and not is_dense:
+        prior -= PRIOR_SPARSE
+    return prior
 
 
 def _remarks(part: Batch, place: IntArray) -> tuple[str, ...]:
@@ -441,9 +452,7 @@ def _model_uncertainty(part: Batch, beds: _Beds, at: int, among: list[int]) -> M
 
     def left(a: int, b: int, most: float) -> float:
         difference = (np.abs((beds.z[a] - beds.z[b])[beds.place]) / depth)[deep]
-        # by the probability of the other type
-        wrong = 0.5 * math.erfc(beds.errors[a, b] / math.sqrt(2.0))
-        share = float(np.interp(wrong, OPEN, (0.0, 1.0)))
+        share = float(np.interp(_chance(beds.errors[a, b]), OPEN, (0.0, 1.0)))
         # single maps predict discontinuities at few places only
         if not (beds.types[a].is_single or beds.types[b].is_single):
             by_steps = max(float(beds.share[a, b]), 0.0) + float(beds.sigma[a, b])
@@ -482,15 +491,11 @@ def _heights(part: Batch, around: Batch, one: Reconstruction) -> FloatArray:
     part = _as(part, one)
     settings, learned = part.survey.settings, part.survey.learned
     if part.views is None and settings.chooses_maps and learned.matcher is not None:
-        from pcfix.refract.depth_maps import likely_beds
-        from pcfix.refract.matcher import bed_of
+        from pcfix.refract.bed import bed_around
 
-        # the bed identifies the images of a point: it must be that of other points
-        likely = likely_beds(with_rays(_as(around, one)))
-        bed = (
-            bed_of(around.xyz, likely, patches.gsd_m(around)) if np.isfinite(likely).any() else None
-        )
-        # not interpolated, as a smooth bed would make any choice look smooth
+        # the bed identifies the images of a point: it must be that of other points, and not
+        # interpolated, as a smooth bed would make any choice look smooth
+        bed = bed_around(_as(around, one))
         bed = None if bed is None else bed._replace(between=False)
         part = replace(part, survey=replace(part.survey, learned=learned._replace(bed=bed)))
     found = correct(part)

@@ -97,6 +97,17 @@ def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
             " Check that they are positive down and in the cloud's CRS.",
             slope=float(line.slope),
         )
+    notes = []
+    if len(x) < FEW:
+        notes.append(
+            f"The regression has only {len(x)} check depths; with fewer than {FEW} its standard"
+            " errors are unreliable."
+        )
+    if not 1.0 <= line.slope <= 2.0:
+        notes.append(
+            f"The slope {line.slope:.3f} of the regression is not that of refraction (1.33 to 1.6)."
+            " Check the water level and the check depths."
+        )
     residual = y - (line.intercept + line.slope * x)
     leverage = 1.0 / len(x) + (x - x.mean()) ** 2 / ((x - x.mean()) ** 2).sum()
     # without value i the line is off it by residual_i / (1 - h_i), with the diagonal h of the hat
@@ -116,24 +127,8 @@ def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
         shallowest_m=float(x.min()),
         deepest_m=float(x.max()),
         covariance_m=float(-x.mean() * line.stderr**2),
-        notes=notes_of(len(x), float(line.slope)),
+        notes=tuple(notes),
     )
-
-
-def notes_of(count: int, slope: float) -> tuple[str, ...]:
-    """Return the notes on a line fitted to this number of check depths."""
-    notes = []
-    if count < FEW:
-        notes.append(
-            f"The regression has only {count} check depths; with fewer than {FEW} its standard"
-            " errors are unreliable."
-        )
-    if not 1.0 <= slope <= 2.0:
-        notes.append(
-            f"The slope {slope:.3f} of the regression is not that of refraction (1.33 to 1.6)."
-            " Check the water level and the check depths."
-        )
-    return tuple(notes)
 
 
 NEIGHBOURS = 16

@@ -47,7 +47,8 @@ from pcfix.lens.algebra import (
     transposed_times,
     vector,
 )
-from pcfix.lens.imaging import KIND, PERSPECTIVE, PLAIN, Plain, image_and_slopes, plain_lens
+from pcfix.lens.formulas import KIND, PERSPECTIVE, PLAIN
+from pcfix.lens.imaging import Plain, image_and_slopes, plain_lens
 from pcfix.model import BoolArray, FloatArray, IntArray, Outcome, Views
 from pcfix.refract import tiling
 from pcfix.refract.batch import (
@@ -74,39 +75,48 @@ CLOSE_M = 2e-4
 """Largest distance of the median from P before the last step, which leaves some millionths."""
 ABSENT = -1
 
-# Columns of the result.
-_DISTANCE, _OUTCOME, _FOUND, _WIDTH = 3, 4, 5, 6
-
 # Columns of a search: Q, the nearest Q so far, F there and its size, the share of a step, whether
-# it goes on, and the ratio of true to apparent depth at the start.
-_, _NEAREST, _AT_NEAREST, _BEST, _SHARE, _IS_ACTIVE, _RATIO, _WIDTH_OF_SEARCH = slots(
-    3, 3, 3, 1, 1, 1, 1
-)  # fmt: skip
+# it goes on, and the ratio of true to apparent depth at the start. Of the result: the shift, the
+# distance from the rays, and the outcome.
+(
+    _, _NEAREST, _AT_NEAREST, _BEST, _SHARE, _IS_ACTIVE, _RATIO,
+    _SHIFT, _DISTANCE, _OUTCOME, _WIDTH,
+) = slots(3, 3, 3, 1, 1, 1, 1, 3, 1, 1)  # fmt: skip
 
 # Runs of `TILE` numbers of a ray: the gradient of the scale of its image by place, and of the image
 # of Q G'G, G'G e and |G e|^2.
 _BY_PLACE, _SQUARE, _RIGHT, _REST, RAY = slots(3, 6, 3, 1)
 
 
-class Block(NamedTuple):
+class PairInputs(NamedTuple):
     """All points and cameras, the pairs, and the searches, for kernels."""
 
     points: Chosen
     images: Images
     rig: Rig
     rule: Rule
-    search: FloatArray  # (m, `_WIDTH_OF_SEARCH`)
+    search: FloatArray  # (m, `_WIDTH`)
     derivative: FloatArray  # (m, 3, 3), B: of Q by the median
     partners: IntArray  # (k, ...), the partners of each image, each pair once
 
 
-class Pairs(NamedTuple):
-    """The pairs of a tile of m points, for kernels."""
+class PairTile(NamedTuple):
+    """A tile of m points, the k rays of its cameras and the p pairs of these, for kernels."""
 
-    rays: IntArray  # (p, 2), the rays of each pair: rows of the images near the tile
+    rows: IntArray  # (m,), the rows of the points
+    near: IntArray  # (k,), the cameras
+    ray: IntArray  # of each camera of the block, its row among those near, or `ABSENT`
+    marks: FloatArray  # (k, m), whether the camera is in a pair of the point
+    pairs: IntArray  # (p, 2), the two rays of each pair
     own: IntArray  # (3, m, most), the pairs of each point in the order of their x, y and z
     wide: IntArray  # (m,), how many these are
     narrow: IntArray  # (m,), and how many more without a base
+    points: FloatArray  # runs of `TILE` numbers: those of `tiling.gather`, and the original P
+    sums: FloatArray  # those of `add_camera`
+    now: FloatArray  # Q
+    rays: FloatArray  # (k, `RAY`)
+    places: FloatArray  # (p, 3), X_ab
+    values: FloatArray  # (most,), for the median
 
 
 def invert_pairs(batch: Batch) -> Intersection:
@@ -124,26 +134,26 @@ def invert_pairs(batch: Batch) -> Intersection:
     if matcher is None:
         raise ValueError("a model of the matcher is needed")
     images, rule = images_of(batch.original_model, survey.cameras), rule_of(survey)
-    search, derivative = np.zeros((len(batch), _WIDTH_OF_SEARCH)), np.zeros((len(batch), 3, 3))
-    block = Block(
+    search, derivative = np.zeros((len(batch), _WIDTH)), np.zeros((len(batch), 3, 3))
+    given = PairInputs(
         batch.chosen(), images, rig_of(survey), rule._replace(least_cosine2=0.0), search,
         derivative, _each_once(matcher.matched),
     )  # fmt: skip
-    used, result = np.zeros(len(batch.rays.camera), np.bool_), np.zeros((len(batch), _WIDTH))
-    rows = tiling.spatial_order(batch.xyz)
+    used, rows = np.zeros(len(batch.rays.camera), np.bool_), tiling.spatial_order(batch.xyz)
     for steps in range(0, MAX_STEPS, STEPS):
         in_tiles(
-            _search, -(-len(rows) // TILE), rows, block, steps == 0, used, result,
+            _search, -(-len(rows) // TILE), rows, given, steps == 0, used,
             points=0 if steps else len(batch),
         )  # fmt: skip
         rows = rows[search[rows, _IS_ACTIVE] > 0.0]
-    outcome = result[:, _OUTCOME].astype(np.uint8)
+    outcome = search[:, _OUTCOME].astype(np.uint8)
     moved = outcome == Outcome.CORRECTED
-    warn_of_unsolved("stereo pairs: no solution", result[moved, _FOUND] > 0.0)
+    warn_of_unsolved("stereo pairs: no solution", search[moved, _BEST] <= CLOSE_M)
     count = np.concatenate([[0], np.cumsum(used)])
     in_pairs = Views(count[batch.rays.start], np.asarray(batch.rays.camera)[used])
-    found = replace(batch, views=in_pairs)
-    return found.result(result[:, :3], outcome=outcome, ray_miss_m=result[:, _DISTANCE])
+    return replace(batch, views=in_pairs).result(
+        search[:, _SHIFT:_DISTANCE], outcome=outcome, ray_miss_m=search[:, _DISTANCE]
+    )
 
 
 def _each_once(matched: IntArray) -> IntArray:
@@ -157,81 +167,78 @@ def _each_once(matched: IntArray) -> IntArray:
 
 
 @kernel(allocates=True)
-def _search(
-    span: Span, order: IntArray, block: Block, first: bool, used: BoolArray, result: FloatArray
-) -> None:
+def _search(span: Span, order: IntArray, given: PairInputs, first: bool, used: BoolArray) -> None:
     """Search the points of some tiles, the first time from `snell`'s solution, by a few steps."""
-    points, k = block.points, len(block.rig.centres)
-    row, now = np.full(k, ABSENT), np.empty(3 * TILE)
+    points, k = given.points, len(given.rig.centres)
+    ray = np.empty(k, np.int64)
     for t in range(*span):
-        rows = order[t * TILE : (t + 1) * TILE]
-        tile, sums = np.empty(10 * TILE), np.zeros(11 * TILE)
-        tiling.gather(tile, rows, points)
-        for j in range(rows.size):
-            put(tile, 7 * TILE + j, row_of(points.original_xyz, rows[j]))
+        rows, runs = order[t * TILE : (t + 1) * TILE], np.empty(10 * TILE)
+        tiling.gather(runs, rows, points)
+        tiling.gather_three(runs[7 * TILE :], rows, points.original_xyz)
         near, marks = tiling.marks_of_lists(points.start, points.camera, rows, k)
-        row[:] = ABSENT
+        ray[:] = ABSENT
         for q in range(near.size):
-            row[near[q]] = q
-        # the pairs of the tile; the marks become those of cameras in a pair
-        pairs = _pairs_of(rows, marks, row, tile, block)
+            ray[near[q]] = q
+        # the marks become those of cameras in a pair
+        pairs, own, wide, narrow = _pairs_of(rows, marks, ray, runs, given)
+        tile = PairTile(
+            rows, near, ray, marks, pairs, own, wide, narrow, runs, np.zeros(11 * TILE),
+            np.empty(3 * TILE), np.empty((near.size, RAY * TILE)),
+            np.empty((len(pairs), 3 * TILE)), np.empty(own.shape[2]),
+        )  # fmt: skip
         for q in range(near.size):
-            add_camera(sums, tile, marks[q], block.rig, near[q], block.rule, None, None)
+            add_camera(tile.sums, runs, marks[q], given.rig, near[q], given.rule, None, None)
         if first:
-            _start(rows, tile, marks, row, sums, pairs, block, used, result)
-        rays = np.empty((near.size, RAY * TILE))
-        places = np.empty((len(pairs.rays), 3 * TILE))
-        values = np.empty(pairs.own.shape[2])
+            _start(tile, given, used)
         for _ in range(STEPS):
-            if not _step(rows, rays, places, values, now, tile, near, pairs, block):
+            if not _step(tile, given):
                 break
         # a search that is done, or came near enough, replaces the intersection
         for j in range(rows.size):
-            found, one = result[rows[j]], block.search[rows[j]]
-            if found[_OUTCOME] == CORRECTED and one[_BEST] <= CLOSE_M:
-                found[0], found[1], found[2] = vector(one)
-                found[_DISTANCE] = ray_distance(sums[9 * TILE + j], nine(sums, j), vector(one))
-                found[_FOUND] = 1.0
+            one = given.search[rows[j]]
+            if one[_OUTCOME] == CORRECTED and one[_BEST] <= CLOSE_M:
+                k_rays, sums = tile.sums[9 * TILE + j], nine(tile.sums, j)
+                one[_SHIFT], one[_SHIFT + 1], one[_SHIFT + 2] = vector(one)
+                one[_DISTANCE] = ray_distance(k_rays, sums, vector(one))
 
 
 @device(allocates=True)
 def _pairs_of(
-    rows: IntArray, marks: FloatArray, row: IntArray, tile: FloatArray, block: Block
-) -> Pairs:
-    """Return the pairs of the points of a tile, and mark the cameras that are in one.
+    rows: IntArray, marks: FloatArray, ray: IntArray, runs: FloatArray, given: PairInputs
+) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Return the pairs of a tile, as in `PairTile`: pairs, own, wide and narrow.
 
-    `marks`, a row for each of the images near the tile, say which cameras each point has; `row`,
-    which row is that of a camera.
+    The marks say which cameras each point has, and afterwards which of them are in a pair.
     """
-    points, k, step = block.points, len(marks), block.partners.shape[1]
+    points, k, step = given.points, len(marks), given.partners.shape[1]
     most = 0
     for i in rows:
         most = max(most, (points.start[i + 1] - points.start[i]) * step)
     # the number of each pair of rays, in the order in which the points have them
     number, total = np.full((k, k), ABSENT), 0
-    rays = np.empty((min(k * k, rows.size * most), 2), np.int64)
+    pairs = np.empty((min(k * k, rows.size * most), 2), np.int64)
     own = np.empty((3, rows.size, most), np.int64)
-    count, narrow = np.zeros(rows.size, np.int64), np.zeros(rows.size, np.int64)
+    wide, narrow = np.zeros(rows.size, np.int64), np.zeros(rows.size, np.int64)
     in_pair = np.zeros(marks.shape)
     for j in range(rows.size):
         for a in points.camera[points.start[rows[j]] : points.start[rows[j] + 1]]:
-            for b in block.partners[a]:
+            for b in given.partners[a]:
                 # both cameras must be among those of the point
-                if b < 0 or row[b] < 0 or not marks[row[b], j] > 0.0:
+                if b < 0 or ray[b] < 0 or not marks[ray[b], j] > 0.0:
                     continue
-                if not _is_wide(a, b, j, tile, points):
+                if not _is_wide(a, b, j, runs, points):
                     narrow[j] += 1
                     continue
-                ray_a, ray_b = row[a], row[b]
-                if number[ray_a, ray_b] < 0:
-                    number[ray_a, ray_b], rays[total, 0], rays[total, 1] = total, ray_a, ray_b
+                one, other = ray[a], ray[b]
+                if number[one, other] < 0:
+                    number[one, other], pairs[total, 0], pairs[total, 1] = total, one, other
                     total += 1
                 for axis in range(3):
-                    own[axis, j, count[j]] = number[ray_a, ray_b]
-                count[j] += 1
-                in_pair[ray_a, j], in_pair[ray_b, j] = 1.0, 1.0
+                    own[axis, j, wide[j]] = number[one, other]
+                wide[j] += 1
+                in_pair[one, j], in_pair[other, j] = 1.0, 1.0
     marks[:] = in_pair
-    return Pairs(rays[:total], own, count, narrow)
+    return pairs[:total], own, wide, narrow
 
 
 @device
@@ -250,86 +257,78 @@ def _is_wide(a: int, b: int, j: int, tile: FloatArray, points: Chosen) -> bool:
 
 
 @device
-def _start(
-    rows: IntArray, tile: FloatArray, marks: FloatArray, row: IntArray, sums: FloatArray,
-    pairs: Pairs, block: Block, used: BoolArray, result: FloatArray,
-) -> None:  # fmt: skip
+def _start(tile: PairTile, given: PairInputs, used: BoolArray) -> None:
     """Set the start of each search, the outcome, and which cameras are used."""
-    points = block.points
-    for j in range(rows.size):
-        i, one = rows[j], block.search[rows[j]]
+    points, runs = given.points, tile.points
+    for j in range(tile.rows.size):
+        i, one = tile.rows[j], given.search[tile.rows[j]]
         first, last = points.start[i], points.start[i + 1]
-        if pairs.wide[j] == 0:
+        if tile.wide[j] == 0:
             # no pair has a base, or there is none
             few = ONE_CAMERA if last > first else NO_CAMERA
-            result[i, _OUTCOME] = PARALLEL if pairs.narrow[j] else few
+            one[_OUTCOME] = PARALLEL if tile.narrow[j] else few
             continue
         for at in range(first, last):
-            used[at] = marks[row[points.camera[at]], j] > 0.0
-        fixed, q, distance = nearest_point(sums[9 * TILE + j], nine(sums, j))
-        result[i, _OUTCOME] = CORRECTED if fixed else PARALLEL
+            used[at] = tile.marks[tile.ray[points.camera[at]], j] > 0.0
+        fixed, q, distance = nearest_point(tile.sums[9 * TILE + j], nine(tile.sums, j))
+        one[_OUTCOME] = CORRECTED if fixed else PARALLEL
         if fixed:
-            result[i, 0], result[i, 1], result[i, 2] = q
-            result[i, _DISTANCE] = distance
             one[0], one[1], one[2] = q
-            one[_BEST], one[_SHARE], one[_IS_ACTIVE] = np.inf, 1.0, 1.0
+            one[_SHIFT], one[_SHIFT + 1], one[_SHIFT + 2] = q
+            one[_BEST], one[_SHARE], one[_IS_ACTIVE], one[_DISTANCE] = np.inf, 1.0, 1.0, distance
             # a place sinks as the true point does, times the ratio of their depths
-            depth = tile[3 * TILE + j] - tile[2 * TILE + j]
+            depth = runs[3 * TILE + j] - runs[2 * TILE + j]
             one[_RATIO] = 1.0 - q[2] / depth if depth > 0.0 else 1.0
-            _start_derivative(block.derivative[i], one)
+            _start_derivative(given.derivative[i], one)
 
 
 @device
-def _step(
-    rows: IntArray, rays: FloatArray, places: FloatArray, values: FloatArray, now: FloatArray,
-    tile: FloatArray, near: IntArray, pairs: Pairs, block: Block,
-) -> bool:  # fmt: skip
+def _step(tile: PairTile, given: PairInputs) -> bool:
     """Do one step of all searches of a tile; return whether any goes on."""
-    optics, search, is_active = block.images.original, block.search, False
-    for j in range(rows.size):
-        put(now, j, vector(search[rows[j]]))
-    for q in range(near.size):
-        lens = optics.lenses[optics.row[near[q]]]
+    optics, places, is_active = given.images.original, tile.places, False
+    for j in range(tile.rows.size):
+        put(tile.now, j, vector(given.search[tile.rows[j]]))
+    for q in range(tile.near.size):
+        lens = optics.lenses[optics.row[tile.near[q]]]
         # numba compiles a version of `_see` for each kind of argument
         if lens[PLAIN] != 0.0:
-            _see(rays[q], now, tile, rows.size, near[q], block, plain_lens(lens))
+            _see(tile.rays[q], tile.near[q], tile, given, plain_lens(lens))
         else:
-            _see(rays[q], now, tile, rows.size, near[q], block, None)
-    for p in range(len(pairs.rays)):
-        _meet(places[p], rays[pairs.rays[p, 0]], rays[pairs.rays[p, 1]], rows.size)
-    for j in range(rows.size):
-        if search[rows[j], _IS_ACTIVE] > 0.0:
+            _see(tile.rays[q], tile.near[q], tile, given, None)
+    for p in range(len(tile.pairs)):
+        one, other = tile.rays[tile.pairs[p, 0]], tile.rays[tile.pairs[p, 1]]
+        _meet(places[p], one, other, tile.rows.size)
+    for j in range(tile.rows.size):
+        search, count = given.search[tile.rows[j]], tile.wide[j]
+        if search[_IS_ACTIVE] > 0.0:
             # the median is relative to P, so that it is F itself
-            x = _median(places, values, pairs.own[0, j, : pairs.wide[j]], j)
-            y = _median(places, values, pairs.own[1, j, : pairs.wide[j]], TILE + j)
-            z = _median(places, values, pairs.own[2, j, : pairs.wide[j]], 2 * TILE + j)
-            _advance(search[rows[j]], block.derivative[rows[j]], (x, y, z))
-            is_active = is_active or search[rows[j], _IS_ACTIVE] > 0.0
+            x = _median(places, tile.values, tile.own[0, j, :count], j)
+            y = _median(places, tile.values, tile.own[1, j, :count], TILE + j)
+            z = _median(places, tile.values, tile.own[2, j, :count], 2 * TILE + j)
+            _advance(search, given.derivative[tile.rows[j]], (x, y, z))
+            is_active = is_active or search[_IS_ACTIVE] > 0.0
     return is_active
 
 
 @device
-def _see(
-    ray: FloatArray, now: FloatArray, tile: FloatArray, count: int, c: int, block: Block,
-    plain: Plain | None,
-) -> None:  # fmt: skip
+def _see(ray: FloatArray, c: int, tile: PairTile, given: PairInputs, plain: Plain | None) -> None:
     """Write the normal equations of the images of Q: G'G, G'G e and |G e|^2; see `RAY`.
 
     The direction w, in the original model, is scaled to the distance of P, so that G is that there.
     The scale of an image depends on the distance, relative to that of P: along the axis in a
     perspective image, from the centre in other projections.
     """
-    points, images = block.points, block.images
+    points, images, runs = given.points, given.images, tile.points
     centre, original, optics = row_of(points.centres, c), row_of(images.centres, c), images.original
     r, lens, offset = optics.rotations[c], optics.lenses[optics.row[c]], points.offset[c]
     axis = row_of(r, 2)
     is_flat = lens[KIND] == PERSPECTIVE
-    for j in range(count):
-        p, normal = three(tile, j), three(tile, 4 * TILE + j)
-        above = normal[2] * (tile[3 * TILE + j] - p[2] + offset)
-        k, _, _, _, s = light_near(three(now, j), minus(centre, p), normal, above, points.n)
+    for j in range(tile.rows.size):
+        p, normal = three(runs, j), three(runs, 4 * TILE + j)
+        above = normal[2] * (runs[3 * TILE + j] - p[2] + offset)
+        k, _, _, _, s = light_near(three(tile.now, j), minus(centre, p), normal, above, points.n)
         w = in_other(images.adjusted, optics, c, minus(scaled(k, s), normal))
-        e = minus(original, three(tile, 7 * TILE + j))
+        e = minus(original, three(runs, 7 * TILE + j))
         size2, ahead = dot(e, e), -dot(axis, e)
         # behind a perspective camera the depth along the axis has no meaning
         flat = is_flat and ahead > 0.0
@@ -390,9 +389,9 @@ def _solve_two(
     right = _sum(a, b, _RIGHT * TILE + j, of_a, of_b)
     right = beyond(right, g_a, three(a, _BY_PLACE * TILE + j))
     right = beyond(right, g_b, three(b, _BY_PLACE * TILE + j))
-    xx, xy, xz = _sum(a, b, _SQUARE * TILE + j, of_a, of_b)
-    yy, yz, zz = _sum(a, b, (_SQUARE + 3) * TILE + j, of_a, of_b)
-    return solved((xx, xy, xz, yy, yz, zz), right)[1]
+    first = _sum(a, b, _SQUARE * TILE + j, of_a, of_b)
+    last = _sum(a, b, (_SQUARE + 3) * TILE + j, of_a, of_b)
+    return solved(first + last, right)[1]
 
 
 @device(forceinline=True)

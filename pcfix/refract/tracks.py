@@ -31,7 +31,8 @@ import numpy as np
 
 from pcfix.kernels import device
 from pcfix.lens.algebra import beyond, dot, minus, row_of, scaled
-from pcfix.lens.imaging import PLAIN, Plain, image_and_slopes, image_of, plain_image, plain_lens
+from pcfix.lens.formulas import PLAIN
+from pcfix.lens.imaging import Plain, image_and_slopes, image_of, plain_image, plain_lens
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Optics
 from pcfix.refract.choice import Rig

@@ -48,14 +48,13 @@ Neglected is the turn of M, and of J, times the residual, which is of second ord
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import (
     NO_SQUARES,
-    Nine,
     Symmetric,
     Vector,
     beyond,
@@ -183,40 +182,6 @@ def budget_of(survey: Survey) -> Budget:
 _ABOVE, RAYS, BY_LEVEL, BY_N, IMAGES, BY_Q, NOISE, ROOM = slots(1, 1, 3, 3, 6, 9, 6)
 
 
-class Camera(NamedTuple):
-    """One camera, for kernels: plain numbers, which stay in registers."""
-
-    centre: Vector
-    offset: float  # how much higher the water stood
-    axis: Vector  # optical axis; zeros for images of nearly equal angles
-    square: float  # squared focal length, px^2
-    ratio: float  # 1 / n
-
-
-class Ray(NamedTuple):
-    """One ray, for kernels; see the docstring of the module."""
-
-    times: float  # how often it counts
-    e: Vector
-    d: Vector  # e across N
-    normal: Vector  # N
-    height: float  # H
-    length2: float  # L^2
-    rho2: float  # d.d
-    h: float
-    y: float
-    ratio: float  # r, 1 where light goes straight
-    kappa: float
-    inv_h: float  # 1 / H
-    lean: float  # r / kappa: the tangent in water for each metre across in air
-    away: float  # 1 - m
-    beta: float
-
-
-Effect: TypeAlias = tuple[Vector, float, float, float]
-"""g, c, b and v: how a displacement of a ray goes into the sums."""
-
-
 @device(allocates=True)
 def room_of(tile: FloatArray, shift: FloatArray, rows: IntArray) -> FloatArray:
     """Return room for the sums of a tile, which start at zero."""
@@ -227,41 +192,19 @@ def room_of(tile: FloatArray, shift: FloatArray, rows: IntArray) -> FloatArray:
 
 
 @device(forceinline=True)
-def _ray_of(room: FloatArray, tile: FloatArray, marks: FloatArray, j: int, image: Camera) -> Ray:
-    """Return the ray of a point; one that does not count goes straight up."""
-    p, normal = three(tile, j), three(tile, 4 * TILE + j)
-    e = minus(image.centre, p) if marks[j] > 0.0 else normal
-    height, length2 = dot(normal, e), dot(e, e)
-    rho2 = length2 - height * height
-    h = normal[2] * (tile[3 * TILE + j] - (p[2] - image.offset))
-    # light of a point above the water goes straight
-    ratio, y = image.ratio if h > 0.0 else 1.0, h + room[_ABOVE * TILE + j]
-    kappa = np.sqrt(length2 - ratio * ratio * rho2)
-    # one division for two
-    share = 1.0 / (height * kappa)
-    inv_k, inv_h = share * height, share * kappa
-    lean, d = ratio * inv_k, beyond(e, -height, normal)
-    away, beta = 1.0 - h * inv_h + y * lean, y * lean * inv_k * inv_k * (ratio * ratio - 1.0)
-    return Ray(
-        marks[j], e, d, normal, height, length2, rho2, h, y, ratio, kappa, inv_h, lean, away, beta
-    )
-
-
-@device(forceinline=True)
-def _weight(ray: Ray, image: Camera) -> Symmetric:
-    """Return J'J of a camera at P.
+def _weight(times: float, e: Vector, length2: float, axis: Vector, focal_px: float) -> Symmetric:
+    """Return W = J'J of a camera at P, times how often the ray e counts.
 
     With the optical axis z and Z = -z.e it is (f / Z)^2 (I + x z' + z x'), x = e / Z +
     L^2 / (2 Z^2) z; without an axis (zeros), of angles, (f / L)^2 (I - e e' / L^2).
     """
-    axis, e, length2 = image.axis, ray.e, ray.length2
     # cameras without an axis, such as fisheyes, have equal angles per pixel
     flat = axis[0] != 0.0 or axis[1] != 0.0 or axis[2] != 0.0
     # depth along the axis, or the squared distance
     deep = -dot(axis, e) if flat else length2
-    inv = 1.0 / deep if ray.times > 0.0 else 0.0
+    inv = 1.0 / deep if times > 0.0 else 0.0
     # (f / Z)^2 or (f / L)^2; 0 for rays that do not count
-    w = ray.times * image.square * (inv * inv if flat else inv)
+    w = times * focal_px * focal_px * (inv * inv if flat else inv)
     a = inv if flat else -0.5 * inv
     b = 0.5 * length2 * inv * inv if flat else 0.0
     zx, zy, zz = axis[0] if flat else e[0], axis[1] if flat else e[1], axis[2] if flat else e[2]
@@ -273,77 +216,73 @@ def _weight(ray: Ray, image: Camera) -> Symmetric:
 
 
 @device(forceinline=True)
-def _effect(ray: Ray, w: Symmetric) -> Effect:
-    """Return the effect of a displacement of a ray on the residuals in the images."""
-    # one division for two: c, and S d = W d / (1 - m + beta rho^2), where W d = -H W N
-    outer = ray.away + ray.beta * ray.rho2
-    share = 1.0 / (ray.away * outer)
-    c, b = share * outer, -ray.beta * share * outer
-    g = scaled(-ray.height * share * ray.away, product(w, ray.normal))
-    return g, c, b, (1.0 - b * ray.rho2) * ray.inv_h
-
-
-@device(forceinline=True)
 def _add_six(sums: FloatArray, at: int, c: float, m: Symmetric) -> None:
     """Add c m."""
     add_three(sums, at, c, (m[0], m[1], m[2]))
     add_three(sums, at + 3 * TILE, c, (m[3], m[4], m[5]))
 
 
-@device(forceinline=True)
-def _add_nine(sums: FloatArray, at: int, c: float, m: Symmetric, g: Vector, q: Vector) -> None:
-    """Add c m + g q'."""
-    add_three(sums, at, 1.0, beyond(scaled(c, (m[0], m[1], m[2])), g[0], q))
-    add_three(sums, at + 3 * TILE, 1.0, beyond(scaled(c, (m[1], m[3], m[4])), g[1], q))
-    add_three(sums, at + 6 * TILE, 1.0, beyond(scaled(c, (m[2], m[4], m[5])), g[2], q))
-
-
 @device
-def _add_common(room: FloatArray, tile: FloatArray, marks: FloatArray, image: Camera) -> None:
-    """Add one camera's rays to the sums of a tile's points: what moves Q, level and index."""
-    for j in range(marks.size):
-        ray = _ray_of(room, tile, marks, j, image)
-        w, lean = _weight(ray, image), ray.lean
-        g, c, b, v = _effect(ray, w)
-        # S T
-        _add_nine(room, BY_Q * TILE + j, c, w, g, beyond(scaled(b, ray.d), v - lean, ray.normal))
-        # delta by n over d: y r^2 L^2 / kappa^3
-        inv_k2 = 1.0 / (ray.kappa * ray.kappa)
-        by_n = ray.y * lean * ray.ratio * ray.length2 * inv_k2 if ray.ratio < 1.0 else 0.0
-        room[RAYS * TILE + j] += ray.times
-        add_three(room, BY_LEVEL * TILE + j, ray.inv_h - lean, g)
-        add_three(room, BY_N * TILE + j, by_n, g)
-        _add_six(room, IMAGES * TILE + j, 1.0, w)
-
-
-@device
-def _add_noise(
-    room: FloatArray, tile: FloatArray, marks: FloatArray, image: Camera, budget: Budget
-) -> None:
-    """Add the noise of one camera's rays to the normal equations of the straight rays.
+def _add_rays(
+    room: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, k: int, ratio: float,
+    budget: Budget | None,
+) -> None:  # fmt: skip
+    """Add one camera's rays to the sums of a tile's points, with a budget the noise of each ray.
 
     An error that moves the straight ray at P by z, of covariance C, moves its image by J z and
     adds W C W. A turned camera has C = attitude^2 L^2 times what is across the ray, a moved one
     centre_m^2. A wave of slope tau at the piercing point moves the refracted ray at depth y by
     -y (1 - r H / kappa) (tau + r^2 / kappa^2 d (d.tau)), which adds S delta delta' S in images.
     """
+    centre, axis, focal_px = row_of(rig.centres, k), row_of(rig.axes, k), rig.focal_px[k]
+    offset = rig.offset[k]
     for j in range(marks.size):
-        ray = _ray_of(room, tile, marks, j, image)
-        w = _weight(ray, image)
-        g, c, b, v = _effect(ray, w)
-        # S delta = across (c W tau + along (d.tau) g), with tau across N, where c W N = -v g
-        across = budget.waves * ray.y * (1.0 - ray.height * ray.lean)
-        along = b + ray.lean * ray.lean
-        by_wave = along * (2.0 * v * ray.height + along * ray.rho2) - v * v
-        # variance of the place of P from attitude, centre and waves, in all directions
-        by_place = budget.attitude**2 * ray.length2 + budget.centre_m**2 + (across * c) ** 2
-        # W W, as W is symmetric: the sum of the squares of its rows
-        square = plus_square(NO_SQUARES, (w[0], w[1], w[2]))
-        square = plus_square(plus_square(square, (w[1], w[3], w[4])), (w[2], w[4], w[5]))
-        at = NOISE * TILE + j
-        _add_six(room, at, budget.image_px**2, w)
-        _add_six(room, at, by_place, square)
-        _add_six(room, at, across * across * by_wave, plus_square(NO_SQUARES, g))
+        p, normal, times = three(tile, j), three(tile, 4 * TILE + j), marks[j]
+        # e, H, L^2, rho^2 and h of the ray; one that does not count goes straight up
+        e = minus(centre, p) if times > 0.0 else normal
+        height, length2 = dot(normal, e), dot(e, e)
+        rho2 = length2 - height * height
+        h = normal[2] * (tile[3 * TILE + j] - (p[2] - offset))
+        # light of a point above the water goes straight
+        r, y = ratio if h > 0.0 else 1.0, h + room[_ABOVE * TILE + j]
+        kappa = np.sqrt(length2 - r * r * rho2)
+        # one division for two: 1 / kappa and 1 / H; then r / kappa, d, 1 - m and beta
+        share = 1.0 / (height * kappa)
+        inv_k, inv_h = share * height, share * kappa
+        lean, d = r * inv_k, beyond(e, -height, normal)
+        away, beta = 1.0 - h * inv_h + y * lean, y * lean * inv_k * inv_k * (r * r - 1.0)
+        w = _weight(times, e, length2, axis, focal_px)
+        # again for two: c, and g = S d = W d / (1 - m + beta rho^2), where W d = -H W N
+        outer = away + beta * rho2
+        share = 1.0 / (away * outer)
+        c, b = share * outer, -beta * share * outer
+        g, v = scaled(-height * share * away, product(w, normal)), (1.0 - b * rho2) * inv_h
+        # S T = c W + g t', row by row
+        t, at = beyond(scaled(b, d), v - lean, normal), BY_Q * TILE + j
+        add_three(room, at, 1.0, beyond(scaled(c, (w[0], w[1], w[2])), g[0], t))
+        add_three(room, at + 3 * TILE, 1.0, beyond(scaled(c, (w[1], w[3], w[4])), g[1], t))
+        add_three(room, at + 6 * TILE, 1.0, beyond(scaled(c, (w[2], w[4], w[5])), g[2], t))
+        # delta by h and by n, over d: 1 / H - r / kappa, and y r^2 L^2 / kappa^3
+        inv_k2 = 1.0 / (kappa * kappa)
+        by_n = y * lean * r * length2 * inv_k2 if r < 1.0 else 0.0
+        room[RAYS * TILE + j] += times
+        add_three(room, BY_LEVEL * TILE + j, inv_h - lean, g)
+        add_three(room, BY_N * TILE + j, by_n, g)
+        _add_six(room, IMAGES * TILE + j, 1.0, w)
+        if budget is not None:
+            # S delta = across (c W tau + along (d.tau) g), with tau across N, where c W N = -v g
+            across = budget.waves * y * (1.0 - height * lean)
+            along = b + lean * lean
+            by_wave = along * (2.0 * v * height + along * rho2) - v * v
+            # variance of the place of P from attitude, centre and waves, in all directions
+            by_place = budget.attitude**2 * length2 + budget.centre_m**2 + (across * c) ** 2
+            # W W, as W is symmetric: the sum of the squares of its rows
+            square = plus_square(NO_SQUARES, (w[0], w[1], w[2]))
+            square = plus_square(plus_square(square, (w[1], w[3], w[4])), (w[2], w[4], w[5]))
+            at = NOISE * TILE + j
+            _add_six(room, at, budget.image_px**2, w)
+            _add_six(room, at, by_place, square)
+            _add_six(room, at, across * across * by_wave, plus_square(NO_SQUARES, g))
 
 
 @kernel(allocates=True)
@@ -372,13 +311,11 @@ def add_errors(
     `marks`, a row for each of the cameras `near`, say how often each ray counts.
     """
     for k in range(len(marks)):
-        c = near[k]
-        image = Camera(
-            row_of(rig.centres, c), rig.offset[c], row_of(rig.axes, c), rig.focal_px[c] ** 2, ratio
-        )
-        _add_common(room, tile, marks[k], image)
+        # numba compiles a version of `_add_rays` for each kind of argument
         if budget.by_ray:
-            _add_noise(room, tile, marks[k], image, budget)
+            _add_rays(room, tile, marks[k], rig, near[k], ratio, budget)
+        else:
+            _add_rays(room, tile, marks[k], rig, near[k], ratio, None)
 
 
 @device(allocates=True)
@@ -401,11 +338,12 @@ def finish_tile(
         # half the trace: k for k rays in space, as in `nearest_point`
         half = 0.5 * (m[0] + m[4] + m[8])
         solved = (k >= 2.0) & (det >= MIN_DETERMINANT * half * half * half)
-        noise = _product(b, _symmetric(sums, NOISE * TILE + j))
+        # B R B': R times each row of B, times each row
+        noise = three(sums, NOISE * TILE + j) + three(sums, (NOISE + 3) * TILE + j)
         x, y, z = b[0:3], b[3:6], b[6:9]
+        by_x, by_y, by_z = product(noise, x), product(noise, y), product(noise, z)
         cov = (
-            dot(noise[0:3], x), dot(noise[0:3], y), dot(noise[0:3], z),
-            dot(noise[3:6], y), dot(noise[3:6], z), dot(noise[6:9], z),
+            dot(x, by_x), dot(x, by_y), dot(x, by_z), dot(y, by_y), dot(y, by_z), dot(z, by_z),
         )  # fmt: skip
         # the level rises along the vertical, h is along N
         level = scaled(tile[6 * TILE + j], three(sums, BY_LEVEL * TILE + j))
@@ -418,19 +356,3 @@ def finish_tile(
     for j in range(rows.size):
         for at in range(6):
             result[rows[j], at] = out[at * TILE + j] if sums[RAYS * TILE + j] > 0.0 else 0.0
-
-
-@device(forceinline=True)
-def _symmetric(sums: FloatArray, at: int) -> Nine:
-    """Return the matrix of which six runs hold xx, xy, xz, yy, yz and zz."""
-    (xx, xy, xz), (yy, yz, zz) = three(sums, at), three(sums, at + 3 * TILE)
-    return xx, xy, xz, xy, yy, yz, xz, yz, zz
-
-
-@device(forceinline=True)
-def _product(a: Nine, b: Nine) -> Nine:
-    """Return a matrix times a matrix."""
-    x = product_of(a, (b[0], b[3], b[6]))
-    y = product_of(a, (b[1], b[4], b[7]))
-    z = product_of(a, (b[2], b[5], b[8]))
-    return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]

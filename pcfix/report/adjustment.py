@@ -5,17 +5,14 @@ All text is derived from the plain values of `adjustment_dict`, which a resumed 
 
 from __future__ import annotations
 
-import numpy as np
+import math
 
 from pcfix.adjust.parameters import words_of
 from pcfix.adjust.result import Plain
 from pcfix.report.page import Report, Table, render
 from pcfix.report.text import Rows, RowTable, filled, share, wrapped
 
-TITLE = "Refractive bundle adjustment"
 WHERE = (("land", "on land"), ("water", "under water"))
-MOST_LISTED = 12
-"""Surveyed points in the text; the page has all of them."""
 _FACTS: RowTable = (
     ("Water", "{water}", "water"),
     ("Port", "--port {port}", "port"),
@@ -57,7 +54,7 @@ def adjustment_text(d: Plain) -> str:
     lines = [_head(d), *_change_table(d).lines()]
     lines += [wrapped(f"  {label:<29} ", words) for label, words in _facts(d)]
     if (surveyed := _survey_table(d)).rows:
-        lines += surveyed.lines()[: 1 + MOST_LISTED]
+        lines += surveyed.lines()[:13]  # a header and twelve points; the page has all of them
     return "\n".join([*lines, *(wrapped("", f"Note: {note}") for note in all_notes(d))])
 
 
@@ -66,10 +63,10 @@ def adjustment_page(d: Plain) -> str:
     how = "without refraction" if d["water"] is None else "with refraction at the water"
     how = "with refraction at the housing port" if d["port"] else how
     lead = f"{_head(d)}, {how}. Residuals: {_residuals(d)} (RMS of a coordinate)."
-    head = Table("In short", [], [list(row) for row in _facts(d)])
+    head = Table("In short", [], _facts(d))
     tables = [_change_table(d), _residual_table(d), _survey_table(d)]
     tables = [table for table in tables if table.rows]
-    return render(Report(TITLE, lead, head, all_notes(d), tables))
+    return render(Report("Refractive bundle adjustment", lead, head, all_notes(d), tables))
 
 
 def _head(d: Plain) -> str:
@@ -126,15 +123,10 @@ def _change_table(d: Plain) -> Table:
         if r["points"]:
             before, after = fixed(r["rms_before_px"], 3), fixed(r["rms_px"], 3)
             rows.append([f"Residuals {where} ({unit})", before, after, ""])
-    if (gnss := d["gnss"]) is not None:
-        before, after = (fixed(_length(gnss[name]), 3) for name in ("rms_before_m", "rms_m"))
-        rows.append(["Centres minus GNSS (m)", before, after, ""])
+    if (gnss := d["gnss"]) is not None:  # the lengths of vectors, of their known components
+        lengths = (math.hypot(*filter(None, gnss[name])) for name in ("rms_before_m", "rms_m"))
+        rows.append(["Centres minus GNSS (m)", *(fixed(one, 3) for one in lengths), ""])
     return Table("Before and after", ["", "before", "after", "standard error"], rows)
-
-
-def _length(values: list[float | None]) -> float:
-    """Return the length of a vector, of its known components."""
-    return float(np.sqrt(sum(value**2 for value in values if value is not None)))
 
 
 def _survey_table(d: Plain) -> Table:

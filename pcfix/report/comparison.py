@@ -11,30 +11,28 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.grid.maps import DIFFERENCE, Extent
+from pcfix.grid.lattice import Lattice
+from pcfix.grid.maps import DIFFERENCE
 from pcfix.model import FloatArray
 from pcfix.options.steps import LAYERS
 from pcfix.report.page import AFTER, BEFORE, WATER, Picture, Table, map_figure, name_of, new_figure
-from pcfix.report.text import Plain, aligned, share, wrapped
+from pcfix.report.text import Plain, RowTable, aligned, filled, wrapped
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from pcfix.compare.figures import Comparison
-
 TIMES = (("before", "uncorrected", BEFORE), ("after", "corrected", AFTER))
-NAMES = {"apparent": "uncorrected"}
 FURTHER = ("#6a3d9a", "#33804d", "#c51b7d", "#8c6d1f", "#5f6b73")
 """Colours of further clouds, in turn."""
 KINDS = {
-    "vertical": ("dZ", "Vertical error"),
-    "bed": ("dZ bed", "Bed, vertical error"),
-    "land": ("dZ land", "Land, vertical error"),
-    "m3c2": ("M3C2", "M3C2 distance"),
-    "c2c": ("C2C", "C2C to reference"),
-    "c2c_from_reference": ("C2C from reference", "C2C from reference"),
+    "vertical": "Vertical error",
+    "bed": "Bed, vertical error",
+    "land": "Land, vertical error",
+    "m3c2": "M3C2 distance",
+    "c2c": "C2C to reference",
+    "c2c_from_reference": "C2C from reference",
 }
-"""The errors of a comparison: their names in the tables of Python and of the page."""
+"""The errors of a comparison, and their titles."""
 MOMENTS = {
     "mean": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m", "median": "median_m",
 }  # fmt: skip
@@ -43,9 +41,7 @@ MOMENTS = {
 class Errors(NamedTuple):
     """One kind of error of one cloud."""
 
-    name: str  # in the tables of Python
-    title: str  # on the page
-    cloud: str
+    title: str  # with the name of the cloud
     colour: str
     found: Plain  # statistics, with a histogram where there is one
 
@@ -54,62 +50,49 @@ def errors_of(compared: Plain, *kinds: str) -> list[Errors]:
     """Return the errors of some of `KINDS`, one kind after the other."""
     rows = []
     for kind in kinds:
-        name, title = KINDS[kind]
+        title = KINDS[kind]
         if kind == "c2c" and compared["measured_at"] == "reference":
             title = "C2C from check points"
         pair = compared[kind] or {}
         for when, cloud, colour in TIMES:
             if (found := pair.get(when)) is not None:
-                both = pair["before"] is not None
-                label, cloud = (f"{name} {when}", cloud) if both else (name, "cloud")
-                rows.append(Errors(label, title, cloud, colour, found))
-        for number, one in enumerate(compared["also"]):
+                name = cloud if pair["before"] else "cloud"
+                rows.append(Errors(f"{title}, {name}", colour, found))
+        for one, colour in zip(compared["also"], cycle(FURTHER), strict=False):
             if one.get(kind) is not None:
-                colour = FURTHER[number % len(FURTHER)]
-                rows.append(Errors(f"{name} {one['name']}", title, one["name"], colour, one[kind]))
+                rows.append(Errors(f"{title}, {one['name']}", colour, one[kind]))
     return rows
-
-
-def measured_of(compared: Plain) -> Plain:
-    """Return the statistics of the vertical errors of the bed, or else of all, before and after."""
-    if compared["bed"] is not None:
-        return dict(compared["bed"])
-    return {when: of and of["statistics"] for when, of in compared["vertical"].items()}
 
 
 # Words
 
+_FACTS: RowTable = (
+    ("Compared", "{counts[compared]:,} {is_checks:?check points|points}"
+     " ({counts[compared]:of in_all})", ""),
+    ("", "{counts[cloud_excluded]:,} ignored: withheld or noise", "counts[cloud_excluded]"),
+    ("", "{counts[not_submerged]:,} ignored: not submerged", "counts[not_submerged]"),
+    ("", "{counts[outside_overlap]:,} ignored: outside the overlap", "counts[outside_overlap]"),
+    ("C2C from", "{counts[reference_compared]:,} points of the reference"
+     " ({counts[reference_compared]:of in_reference})", "counts[reference_compared]"),
+    ("M3C2", "{m3c2[after][statistics][count]:,} of {m3c2[after][core_points]:,} core points,"
+     " normals {m3c2[after][normal_radius_m]:.2f} m, cylinder {m3c2[after][cylinder_radius_m]:.2f}"
+     " m; mean level of detection {m3c2[after][mean_level_of_detection_m]:.3f} m,"
+     " {m3c2[after][significant_share]:.0f %} of the distances beyond it", "m3c2"),
+)  # fmt: skip
 
-def comparison_text(c: Comparison) -> str:
+
+def comparison_text(compared: Plain) -> str:
     """Return the summary of a comparison; metres throughout."""
-    plain, n, checks = c.as_dict(), c.counts, c.measured_at == "reference"
-    in_reference = n.reference - n.reference_excluded
-    compared = share(n.compared, in_reference if checks else n.cloud)
-    rows = [("Compared", f"{n.compared:,} {'check points' if checks else 'points'} ({compared})")]
-    ignored = {
-        "withheld or noise": n.cloud_excluded,
-        "not submerged": n.not_submerged,
-        "outside the overlap": n.outside_overlap,
-    }
-    rows += [("", f"{count:,} ignored: {why}") for why, count in ignored.items() if count]
-    if n.reference_compared:
-        of = share(n.reference_compared, in_reference)
-        rows.append(("C2C from", f"{n.reference_compared:,} points of the reference ({of})"))
-    if c.m3c2 is not None:
-        m = c.m3c2.after
-        rows.append(("M3C2", f"{m.statistics.count:,} of {m.core_points:,} core points, normals"
-                     f" {m.normal_radius_m:.2f} m, cylinder {m.cylinder_radius_m:.2f} m; mean level"
-                     f" of detection {m.mean_level_of_detection_m:.3f} m,"
-                     f" {100 * m.significant_share:.0f} % of the distances beyond it"))  # fmt: skip
-    head = f"Compared {c.cloud} with {c.reference} in {c.seconds:.1f} s"
-    tables = [line for table in _tables(plain) for line in ("", *table.lines())]
-    notes = [wrapped("", f"Note: {note}") for note in c.notes]
+    counts, is_checks = compared["counts"], compared["measured_at"] == "reference"
+    in_reference = counts["reference"] - counts["reference_excluded"]
+    rows = filled(_FACTS, compared | {
+        "is_checks": is_checks, "in_reference": in_reference,
+        "in_all": in_reference if is_checks else counts["cloud"],
+    })  # fmt: skip
+    head = "Compared {cloud} with {reference} in {seconds:.1f} s".format_map(compared)
+    tables = [line for table in _tables(compared) for line in ("", *table.lines())]
+    notes = [wrapped("", f"Note: {note['message']}") for note in compared["notes"]]
     return "\n".join([aligned(head, rows), *tables, *notes])
-
-
-def signed(value_m: float) -> str:
-    """Return metres with their sign, which is plus for what rounds to zero."""
-    return f"{round(value_m, 3) + 0.0:+.3f} m"
 
 
 # Tables
@@ -122,20 +105,16 @@ def _tables(compared: Plain) -> list[Table]:
         s = one.found.get("statistics", one.found)
         marks = s["percentiles_m"]
         values = [*(s[key] for key in MOMENTS.values()), marks["p5"], marks["p95"], s["max_m"]]
-        title = f"{one.title}, {one.cloud}"
-        rows.append([title, f"{s['count']:,}", *(f"{value:z.3f}" for value in values)])
+        rows.append([one.title, f"{s['count']:,}", *(f"{value:z.3f}" for value in values)])
     title = f"Against {name_of(compared['reference'])} (m)"
     tables = [Table(title, ["", "points", *MOMENTS, "5 %", "95 %", "max"], rows)]
 
     header, rows = [""], []
     for one in errors_of(compared, "c2c", "c2c_from_reference"):
-        s, bands = one.found["statistics"], one.found["shares"]
-        header = ["", "mean (m)", "std.dev. (m)", "classes"]
-        header += [f"{band['low_m']:g} to {band['high_m']:g} m" for band in bands]
-        classes = str(len(one.found["histogram"]["counts"]))
-        row = [f"{one.title}, {one.cloud}", f"{s['mean_m']:.6f}", f"{s['sd_m']:.6f}", classes]
-        rows.append([*row, *(f"{100 * band['share']:.1f} %" for band in bands)])
-    tables.append(Table("C2C, normal distribution", header, rows))
+        if bands := one.found["shares"]:
+            header = ["", *(f"{band['low_m']:g} to {band['high_m']:g} m" for band in bands)]
+            rows.append([one.title, *(f"{100 * band['share']:.1f} %" for band in bands)])
+    tables.append(Table("Shares of the distances", header, rows))
 
     rows = [
         [name, f"{fit['slope']:.4f}", f"{fit['intercept_m']:+z.3f}", f"{fit['r2']:.4f}"]
@@ -162,15 +141,12 @@ def _tables(compared: Plain) -> list[Table]:
 
 
 def evaluation(
-    compared: Plain,
-    sections: list[Plain],
-    difference_m: FloatArray | None = None,
-    extent_m: Extent = (0.0, 0.0, 0.0, 0.0),
+    compared: Plain, sections: list[Plain], lattice: Lattice, difference_m: FloatArray | None
 ) -> tuple[list[Picture], list[Table]]:
     """Return pictures and tables of a `Comparison.as_dict`.
 
     `sections` have ``distance_m`` and ``heights_m`` as lists, None where nothing is known; the
-    difference of the surfaces has the shape (rows, columns).
+    difference of the surfaces has the shape (rows, columns) of the cells of the lattice.
     """
     pictures, words = [], "histograms with fitted Gaussians; the table has their figures."
     vertical = errors_of(compared, "vertical")
@@ -187,7 +163,7 @@ def evaluation(
             f" lower. 98 % of the cells differ by less than {reach:.2f} m."
         )
         look: dict[str, Any] = {"cmap": DIFFERENCE, "vmin": -reach, "vmax": reach}
-        figure = map_figure(difference_m, extent_m, "Cloud minus reference (m)", **look)
+        figure = map_figure(difference_m, lattice, "Cloud minus reference (m)", **look)
         pictures.append(Picture("dod", "Difference of the surfaces (DoD)", alt, figure))
     if bins := compared["depth_bins"]:
         alt = (
@@ -222,7 +198,7 @@ def _histograms(columns: list[list[Errors]], label: str, *, sharex: bool) -> Fig
     for axes, one in zip(panels.T.flat, (one for some in columns for one in some), strict=True):
         s, histogram = one.found["statistics"], one.found["histogram"]
         edges, counts, mean, sd = histogram["edges_m"], histogram["counts"], s["mean_m"], s["sd_m"]
-        name = f"{one.title}, {one.cloud}; {s['min_m']:.3f} to {s['max_m']:.3f} m"
+        name = f"{one.title}; {s['min_m']:.3f} to {s['max_m']:.3f} m"
         axes.stairs(counts, edges, fill=True, alpha=0.55, color=one.colour, label=name)
         if sd > 1e-12 * abs(mean):
             x = np.linspace(edges[0], edges[-1], 2000)
@@ -260,7 +236,8 @@ def _section(number: int, section: Plain) -> Picture:
     colours |= dict(zip(further, cycle(FURTHER), strict=False))
     for name, colour in colours.items():
         if name in heights:
-            line, label = np.array(heights[name], float), NAMES.get(name, name)
+            line = np.array(heights[name], float)
+            label = "uncorrected" if name == "apparent" else name
             width = 2.5 if name == "reference" else 1.2  # it lies under the others
             axes.plot(section["distance_m"], line, color=colour, linewidth=width, label=label)
     axes.set(xlabel="Distance along the line (m)", ylabel="Height (m)")

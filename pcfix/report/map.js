@@ -35,7 +35,7 @@
   function say(cursor) {
     const east = data.west + (cursor.column + 0.5) * data.cell;
     const north = data.north - (cursor.row + 0.5) * data.cell;
-    const places = data.cell < 0.1 ? 2 : data.cell < 1 ? 1 : 0;
+    const places = data.cell <= 0.1 ? 2 : data.cell <= 1 ? 1 : 0;
     const i = cursor.row * columns + cursor.column;
     return [["X", east.toFixed(places)], ["Y", north.toFixed(places)]]
       .concat(layers.map(layer => [layer.name, valueOf(layer, i)]));

@@ -20,40 +20,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.grid.lattice import Lattice
-from pcfix.grid.maps import (
-    HEIGHT,
-    NO_LIGHT,
-    Extent,
-    contours,
-    depth_interval,
-    hillshade,
-    smoothed,
-    stops_of,
-)
+from pcfix.grid.maps import HEIGHT, contours, depth_interval, hillshade, smoothed, stops_of
 from pcfix.model import FloatArray
 from pcfix.sums import nice_step
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
-FIGURES = 4
-"""Shown; the others are folded."""
 
 BEFORE, AFTER, WATER, REFERENCE = "#b3541e", "#0b5e8a", "#4aa3c7", "#222222"
 """Colours of different lightness, for readers with colour blindness."""
 
 
-def new_figure(
-    width_in: float = 8.0, height_in: float = 4.5, mosaic: Any = None, **grid: Any
-) -> tuple[Figure, Any]:
-    """Return a figure, drawn without a screen, and its axes: a grid, or a mosaic by name."""
+def new_figure(width_in: float = 8.0, height_in: float = 4.5, **grid: Any) -> tuple[Figure, Any]:
+    """Return a figure, drawn without a screen, and its axes, or a grid of them."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
-    if mosaic is not None:
-        return figure, figure.subplot_mosaic(mosaic, **grid)
     return figure, figure.subplots(**grid)
 
 
@@ -69,30 +52,23 @@ def png_of(figure: Figure) -> bytes:
 
 
 def map_figure(
-    values: FloatArray, extent_m: Extent, label: str, shade: FloatArray | None = None, **look: Any
+    values: FloatArray, lattice: Lattice, label: str, shade: FloatArray | None = None, **look: Any
 ) -> Figure:
-    """Draw a map of values over west, east, south and north, metres; `shade` is its relief.
-
-    Values have the shape (rows, columns).
-    """
-    west, east, south, north = extent_m
+    """Draw a map of values of cells, shape (rows, columns); `shade` is its relief, 0 to 1."""
+    west, south, east, north = lattice.bounds_m
+    extent_m = west, east, south, north
     height_in = float(np.clip(6.5 * (north - south) / (east - west) + 0.8, 2.8, 9.0))
     figure, axes = new_figure(8.0, height_in)
-    label_plan(axes)
+    axes.set_aspect("equal")
+    axes.ticklabel_format(style="plain", useOffset=False)  # whole coordinates,
+    axes.tick_params(axis="x", labelrotation=30.0)  # turned so that they have room
+    axes.set(xlabel="East (m)", ylabel="North (m)")
     if shade is not None:
         axes.imshow(shade, extent=extent_m, cmap="gray", vmin=0.0, vmax=1.0)
         look["alpha"] = 0.75
     image = axes.imshow(values, extent=extent_m, **look)
     figure.colorbar(image, ax=axes, label=label, shrink=0.9)
     return figure
-
-
-def label_plan(axes: Axes) -> None:
-    """Name the axes of a plan; equal scales, whole coordinates, turned so that they have room."""
-    axes.set_aspect("equal")
-    axes.ticklabel_format(style="plain", useOffset=False)
-    axes.tick_params(axis="x", labelrotation=30.0)
-    axes.set(xlabel="East (m)", ylabel="North (m)")
 
 
 @dataclass(frozen=True)
@@ -111,10 +87,8 @@ class Picture:
 
     @property
     def data(self) -> str:
-        """The picture for an HTML page; its "/" are no folders (see `_as_read`)."""
-        from markupsafe import Markup
-
-        return Markup(base64.b64encode(self.png).decode())
+        """The picture for an HTML page."""
+        return base64.b64encode(self.png).decode()
 
 
 @dataclass(frozen=True)
@@ -123,12 +97,11 @@ class Table:
 
     title: str
     header: list[str]
-    rows: list[list[str]]
+    rows: Sequence[Sequence[str]]
 
     def lines(self) -> list[str]:
         """Return the table for the terminal, with its columns aligned to the right."""
-        rows = [[self.title if self.header[0] == "" else self.header[0], *self.header[1:]]]
-        rows += self.rows
+        rows = [[self.header[0] or self.title, *self.header[1:]], *self.rows]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         return [
             "  ".join([f"  {row[0]:<{widths[0]}}", *map(str.rjust, row[1:], widths[1:])]).rstrip()
@@ -171,7 +144,7 @@ class Report:
     lattice: Lattice | None = None  # the cells of the map; None for a page without a map
     height_m: FloatArray | None = None  # their heights, shape (rows, columns), shown as relief
     layers: Sequence[Layer] = ()
-    pictures: Sequence[Picture] = ()  # the first `FIGURES` are shown, the others folded
+    pictures: Sequence[Picture] = ()  # the first four are shown, the others folded
     provenance: list[Table] = field(default_factory=list)
     tiles: Sequence[Tile] = ()
     files: Sequence[tuple[str, str]] = ()  # path from the page, and its contents
@@ -188,7 +161,10 @@ def name_of(path: str) -> str:
 
 
 def _as_read(value: Any) -> Any:
-    """Return a value as a reader sees it: files by their names, and a dash for nothing."""
+    """Return a value as a reader sees it: files by their names, and a dash for nothing.
+
+    What the template marks as safe are data, whose "/" are no folders.
+    """
     if isinstance(value, str) and not hasattr(value, "__html__"):
         return _FOLDERS.sub("", value)
     return "-" if value is None else value
@@ -197,7 +173,6 @@ def _as_read(value: Any) -> Any:
 def render(report: Report) -> str:
     """Return the page; it uses no address outside itself, and works without scripts."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
 
     template = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
@@ -205,25 +180,11 @@ def render(report: Report) -> str:
     ).get_template("page.html.j2")  # fmt: skip
     data = None
     if report.lattice is not None and report.height_m is not None:
-        data = Markup(map_json(report.lattice, report.height_m, report.layers))
-    return template.render(report=report, figures=FIGURES, map_data=data)
+        data = map_json(report.lattice, report.height_m, report.layers)
+    return template.render(report=report, map_data=data)
 
 
 _NO_DATA = -32768
-_STEPS = 32_000
-"""Of the 16 bits in which the page holds the values of its map."""
-_SMALLEST_STEP = 0.001
-"""In metres or pixels; finer steps would only be noise that does not pack."""
-_COLOURS = 64
-_TICKS = 7
-SMOOTH_CELLS = 1.5
-"""Single cells are noisy: the shade is of a surface smoothed by this."""
-
-
-def extent_of(lattice: Lattice) -> Extent:
-    """Return west, east, south and north of the cells, metres."""
-    west, south, east, north = lattice.bounds_m
-    return west, east, south, north
 
 
 def map_json(lattice: Lattice, height_m: FloatArray, layers: Sequence[Layer]) -> str:
@@ -258,20 +219,20 @@ def map_json(lattice: Lattice, height_m: FloatArray, layers: Sequence[Layer]) ->
 
 def relief(height_m: FloatArray, cell_m: float) -> FloatArray:
     """Return the shade of a surface lit from the north-west, 45 degrees up, 0 to 1."""
-    smooth = np.pad(smoothed(height_m, SMOOTH_CELLS), 1, constant_values=np.nan)
-    light = hillshade(smooth, cell_m)
-    return np.where(light == NO_LIGHT, np.nan, (light - 1.0) / 254.0)
+    smooth = smoothed(height_m, 1.5)  # as single cells are noisy
+    return hillshade(np.pad(smooth, 1, constant_values=np.nan), cell_m)
 
 
 def _of_layer(layer: Layer) -> dict[str, Any]:
     """Return a layer; the range of its colours is round, and leaves out a percent at each end."""
     known = layer.values[np.isfinite(layer.values)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-    step = max((high - low) / _STEPS, _SMALLEST_STEP)
+    # 16 bits hold 32,000 steps; those below a millimetre would be noise that does not pack
+    step = max((high - low) / 32_000, 0.001)
     shown = np.percentile(known, [1.0, 99.0]) if known.size else np.array([0.0, 1.0])
     if layer.is_centred:
         shown = np.abs(shown).max() * np.array([-1.0, 1.0])
-    tick = nice_step(max(float(shown[1] - shown[0]), 1e-3) / _TICKS)
+    tick = nice_step(max(float(shown[1] - shown[0]), 1e-3) / 7)
     first = np.floor(shown[0] / tick)
     ticks = max(np.ceil(shown[1] / tick) - first, 1.0)
     whole_steps = np.rint((layer.values - low) / step)
@@ -283,7 +244,7 @@ def _of_layer(layer: Layer) -> dict[str, Any]:
         "low": float(first * tick),
         "high": float((first + ticks) * tick),
         "ticks": int(ticks),
-        "colours": [colour for _, colour in stops_of(layer.ramp, _COLOURS)],
+        "colours": [colour for _, colour in stops_of(layer.ramp, 64)],
         "plusMinus": layer.plus_minus,
         "values": _packed(np.where(np.isfinite(whole_steps), whole_steps, _NO_DATA)),
     }

@@ -14,7 +14,6 @@ from pcfix.grid.lattice import Lattice
 from pcfix.grid.maps import DEPTH, DIFFERENCE, UNCERTAINTY, contours, depth_interval
 from pcfix.model import Cameras, FloatArray
 from pcfix.refract.tally import ORDERS, largest_tvu_m
-from pcfix.report.comparison import measured_of, signed
 from pcfix.report.page import (
     AFTER,
     BEFORE,
@@ -25,8 +24,6 @@ from pcfix.report.page import (
     Report,
     Table,
     Tile,
-    extent_of,
-    label_plan,
     map_figure,
     name_of,
     new_figure,
@@ -36,16 +33,12 @@ from pcfix.report.text import Summary, formal_words, summary_rows
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Plain = dict[str, Any]
-FIRST_FIGURES = ("water", "section_1", "depth_bins", "uncertainty", "cameras")
-"""Those that are shown where they are there, the first four of them."""
-SHOWN_NOTES = 3
-REFERENCE_M = 0.03
-"""Noise of a reference such as LiDAR on hard ground; a smaller bias is no cause for a warning."""
-MAP_FACTS = ("Submerged", "Cameras", "Water", "")
-"""Labels of the rows that are also shown beside the map."""
+FIRST_FIGURES = ("section_1", "depth_bins", "uncertainty", "cameras")
+"""They come before the others; the page shows four and folds the rest."""
 
 
 class RunMaps(NamedTuple):
@@ -89,13 +82,14 @@ def run_report(
     rows = summary_rows(s, compared.get("tvu"))
     notes = notes_of(s, maps.heights, compared)
     head = [
-        ["Images", date or "date not stated"],
-        ["CRS", maps.crs or "not stated by the cloud"],
-        ["Heights", maps.heights or "vertical datum not stated by the cloud"],
-        ["Points", f"{s.points:,}"],
-        *([label, words] for label, words in rows if label in MAP_FACTS),
+        ("Images", date or "date not stated"),
+        ("CRS", maps.crs or "not stated by the cloud"),
+        ("Heights", maps.heights or "vertical datum not stated by the cloud"),
+        ("Points", f"{s.points:,}"),
+        *(row for row in rows if row[0] in ("Submerged", "Cameras", "Water", "")),
     ]
-    depths = f"{depth['min']:.2f} to {depth['max']:.2f} m", f"{depth['mean']:.2f} m"
+    depths = [("range", f"{depth['min']:.2f} to {depth['max']:.2f} m")]
+    depths += [("mean", f"{depth['mean']:.2f} m")]
     # the rows of the terminal, and why the method was chosen
     facts = [("Input cloud", name_of(s.input)), ("Points", f"{s.points:,}"), *rows]
     facts += [("Reconstruction", s.reconstruction["because"])] if s.reconstruction else []
@@ -113,9 +107,9 @@ def run_report(
         lead=lead + verdict,
         head=Table("The project", [], head),
         tiles=[
-            Tile("Depth", figures=list(zip(("range", "mean"), depths, strict=True))),
+            Tile("Depth", figures=depths),
             accuracy_tile(s, compared),
-            Tile("Warnings", notes=notes[:SHOWN_NOTES] or ["None."]),
+            Tile("Warnings", notes=notes[:3] or ["None."]),
         ],
         warnings=notes,
         lattice=maps.lattice,
@@ -125,7 +119,7 @@ def run_report(
         tables=list(tables),
         files=files,
         provenance=[
-            Table("In short", [], [list(row) for row in facts]),
+            Table("In short", [], facts),
             Table("Settings", ["setting", "value"], settings),
             *inputs,
             Table("Software", ["name", "version"], versions),
@@ -161,7 +155,7 @@ def _pictures(s: Summary, cameras: Cameras, maps: RunMaps, compared: Plain) -> l
     lattice, depth = maps.lattice, s.depth_m
     interval = depth_interval(maps.depth_m, maps.uncertainty_m)
     shade = relief(maps.height_m, lattice.resolution_m)
-    figure = map_figure(maps.depth_m, extent_of(lattice), "Depth (m)", shade, cmap=DEPTH)
+    figure = map_figure(maps.depth_m, lattice, "Depth (m)", shade, cmap=DEPTH)
     for _, place in contours(maps.depth_m, interval):
         x, y = (place + 0.5).T * lattice.resolution_m  # from the corner of the map
         figure.axes[0].plot(lattice.left_m + x, lattice.top_m - y, color=REFERENCE, linewidth=0.5)
@@ -172,7 +166,8 @@ def _pictures(s: Summary, cameras: Cameras, maps: RunMaps, compared: Plain) -> l
     pictures = [Picture("depth", "Depth", alt, figure)]
     if s.cameras:
         alt = f"Projection centres over the cloud; {s.cameras_used} of {s.cameras} were used."
-        figure = cameras_figure(maps, cameras, s.cameras_unused)
+        figure = map_figure(maps.depth_m, lattice, "Depth (m)", shade, cmap=DEPTH)
+        draw_cameras(figure.axes[0], cameras, s.cameras_unused)
         pictures.append(Picture("cameras", "Cameras", alt, figure))
     known = np.isfinite(maps.depth_m) & np.isfinite(maps.uncertainty_m)
     if s.uncertainty is not None and known.any():
@@ -188,22 +183,15 @@ def _pictures(s: Summary, cameras: Cameras, maps: RunMaps, compared: Plain) -> l
     return pictures
 
 
-def cameras_figure(maps: RunMaps, cameras: Cameras, unused: Sequence[str]) -> Figure:
-    """Draw the projection centres in plan over the cloud."""
-    extent_m = extent_of(maps.lattice)
+def draw_cameras(plan: Axes, cameras: Cameras, unused: Sequence[str]) -> None:
+    """Draw the projection centres on a map."""
     used = ~np.isin(np.array(cameras.labels), unused)
-    figure, plan = new_figure(8.0, 5.0)
-    plan.imshow(maps.height_m, extent=extent_m, cmap="Greys_r", alpha=0.6)
-    depth = plan.imshow(maps.depth_m, extent=extent_m, cmap=DEPTH)
-    figure.colorbar(depth, ax=plan, label="Depth (m)", shrink=0.8)
     for chosen, mark, colour, name in (used, "o", AFTER, "used"), (~used, "x", BEFORE, "not used"):
         if chosen.any():
             x, y, _ = cameras.centres[chosen].T
             plan.plot(x, y, mark, color=colour, label=name, markersize=4)
-    label_plan(plan)
     # above the axes, where it covers no camera
     plan.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False)
-    return figure
 
 
 def tvu_figure(depth_m: FloatArray, tvu_m: FloatArray, measured: Sequence[Plain]) -> Figure:
@@ -242,7 +230,10 @@ def accuracy_tile(s: Summary, compared: Plain) -> Tile:
         ]  # fmt: skip
         why = "No reference was given. The prediction follows from assumed errors without a bias."
         return Tile(title, "predicted", figures, [why])
-    after, before = measured_of(compared)["after"], measured_of(compared)["before"]
+    pair = compared["bed"] or {
+        when: of and of["statistics"] for when, of in compared["vertical"].items()
+    }
+    after, before = pair["after"], pair["before"]
     notes = [
         f"At {after['count']:,} points against {name_of(compared['reference'])}, whose noise is"
         " included"
@@ -250,9 +241,9 @@ def accuracy_tile(s: Summary, compared: Plain) -> Tile:
     ]
     if compared["land"]:
         land = compared["land"]["after"]
-        notes.append(f"Land: bias {signed(land['mean_m'])}, RMSE {land['rmse_m']:.3f} m.")
+        notes.append(f"Land: bias {land['mean_m']:+z.3f} m, RMSE {land['rmse_m']:.3f} m.")
     figures = [
-        ("bias", signed(after["mean_m"])), ("RMSE", f"{after['rmse_m']:.3f} m"),
+        ("bias", f"{after['mean_m']:+z.3f} m"), ("RMSE", f"{after['rmse_m']:.3f} m"),
         ("95 % within", f"{after['within_95_m']:.3f} m"),
     ]  # fmt: skip
     of = "bed" if compared["bed"] else "cloud (bed and land are not separated)"
@@ -266,7 +257,8 @@ def notes_of(s: Summary, heights: str, compared: Plain) -> list[str]:
         notes.append("No reference: the accuracy is predicted. Check points on the bed measure it.")
     elif compared["bed"]:
         bias, sd = (compared["bed"]["after"][key] for key in ("mean_m", "sd_m"))
-        if abs(bias) > max(sd, REFERENCE_M):
+        # LiDAR itself has about 3 cm of noise
+        if abs(bias) > max(sd, 0.03):
             notes.append(
                 f"The bed is too {'high' if bias > 0.0 else 'low'} by {abs(bias):.3f} m on average,"
                 " more than it scatters. Check water level, refractive index, vertical datum and"
@@ -278,8 +270,6 @@ def notes_of(s: Summary, heights: str, compared: Plain) -> list[str]:
         notes.append(
             "The vertical datum is not known: water level, cloud and reference must share it."
         )
-    if s.water_unknown:
-        notes.append(f"{s.water_unknown:,} points have no known water surface above them.")
     notes += [one["message"] for one in s.warnings]
     notes += [one["message"] for one in compared.get("notes", ())]
     return [note[:1].upper() + note[1:] for note in notes]

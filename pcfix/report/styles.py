@@ -11,15 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.grid.maps import DEPTH, HEIGHT, RAYS, UNCERTAINTY, stops_of
+from pcfix.grid.maps import DEPTH, HEIGHT, UNCERTAINTY, stops_of
 from pcfix.io.rasters import preview
 from pcfix.model import FloatArray
 
-RAMPS = {"depth": DEPTH, "height": HEIGHT, "uncertainty": UNCERTAINTY, "RayCount": RAYS}
-"""By the contents of a raster; anything else has that of heights."""
-FROM_ZERO = ("depth", "uncertainty", "RayCount")
-CUT = 0.5
-"""Percent of the cells at either end that share the last colour, so that outliers do not count."""
+RAMPS = {"depth": DEPTH, "height": HEIGHT, "uncertainty": UNCERTAINTY}
+"""By the contents of a raster."""
 
 
 def limits_of(values: FloatArray, what: str) -> tuple[float, float]:
@@ -27,8 +24,9 @@ def limits_of(values: FloatArray, what: str) -> tuple[float, float]:
     known = values[np.isfinite(values)]
     if not known.size:
         return 0.0, 1.0
-    low, high = (float(value) for value in np.percentile(known, (CUT, 100.0 - CUT)))
-    low = 0.0 if what in FROM_ZERO else low
+    # half a percent at either end shares the last colour, so that outliers do not count
+    low, high = (float(value) for value in np.percentile(known, (0.5, 99.5)))
+    low = low if what == "height" else 0.0
     return low, max(high, low + 1e-3)
 
 
@@ -37,7 +35,7 @@ def raster_style(path: Path, what: str) -> str:
     low, high = limits_of(preview(path)[0], what)
     stops = [
         (f"{value:.6g}", "".join(f"{part:02x}" for part in colour), f"{value:.2f}")
-        for share, colour in stops_of(RAMPS.get(what, HEIGHT))
+        for share, colour in stops_of(RAMPS[what])
         for value in (low + share * (high - low),)
     ]
     return _style(stops=stops, low=f"{low:.6g}", high=f"{high:.6g}")

@@ -63,7 +63,6 @@ _CORRECTED: RowTable = (
      "water_fit"),
     ("", "accepted {water_fit[accepted]} of {water_fit[points]} points", "water_fit[points]"),
     ("Uncertainty", "{uncertainty[tvu_95_m][mean]:.3f} m at 95 % (predicted)", "uncertainty"),
-    ("Uncertainty", "not known: without cameras there are no rays", "no_uncertainty"),
     ("Measured", "{measured[tvu_95_m]:.3f} m at 95 %, at {measured[count]:,} points of the bed",
      "measured"),
     ("IHO S-44", "{order}", "order"),
@@ -75,7 +74,7 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
     "correct": ("Corrected {input} -> {output}      {points:,} points in {seconds:.1f} s",
                 _CORRECTED),
     "label": ("Labelled {input} -> {output}      {points:,} points in {seconds:.1f} s", (
-            ("Class 40", "{submerged:,} points ({submerged:of points})", ""),
+        ("Class 40", "{submerged:,} points ({submerged:of points})", ""),
         ("Formerly", "{stale:,} points of class 40 are not submerged; their class stays", "stale"),
         _NO_SURFACE,
         *_LABELLING,
@@ -93,7 +92,7 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
     )),
     "dsm": ("Gridded {input} -> {output}      {points_used:,} of {points:,} points"
             " ({is_bed:?bed, class 40|land and bed}) in {seconds:.1f} s", (
-            ("Raster", "{width:,} x {height:,} cells of {settings[resolution]:g} m"
+        ("Raster", "{width:,} x {height:,} cells of {settings[resolution]:g} m"
          " ({settings[method]})", ""),
         ("Values", "{what} {values[min]:.4g} to {values[max]:.4g}, mean {values[mean]:.4g}"
          "{is_tvu:? m at 95 % (predicted)|}", "values"),
@@ -145,11 +144,6 @@ class Summary(Figures):
     """The results of a correction by name; `as_dict` is what ``--summary`` writes."""
 
     @property
-    def absorbed(self) -> bool | None:
-        """Whether the poses have absorbed the refraction; None if that is unknown."""
-        return None if self.poses is None else self.poses["absorbed"]
-
-    @property
     def why_no_order(self) -> str:
         """Why no order of S-44 is claimed, as the whole bed may be off; empty if one is."""
         found = self.reconstruction or {}
@@ -162,7 +156,7 @@ class Summary(Figures):
             True: "the poses have absorbed the refraction",
             None: "the poses were not checked for absorbed refraction",
             False: "",
-        }[self.absorbed]
+        }[(self.poses or {"absorbed": None})["absorbed"]]
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON; optional parts only if there are any."""
@@ -304,8 +298,6 @@ def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
         "corrected_words": "all corrected" if s.corrected == s.submerged else corrected,
         "method": method,
         "rays_per_point": s.rays / max(s.corrected, 1),
-        "no_uncertainty": s.uncertainty is None and s.settings["dimensions"] == "all"
-        and not s.cameras,
         "measured": measured,
         "order": order_sentence(s, measured),
         "check": check,

@@ -12,9 +12,13 @@ from pcfix.lens.rotations import from_yaw_pitch_roll
 from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterPlane
 from pcfix.options.declare import taken
 from pcfix.options.scenes import SceneOptions
-from pcfix.simulate.settings import Optics, SceneSettings
-from pcfix.simulate.terrain import Terrain
-from pcfix.simulate.tracing import Water, project, rotations_of, triangulate
+from pcfix.simulate.settings import Optics, SceneSettings, Terrain
+from pcfix.simulate.tracing import (
+    anchors_and_normals,
+    piercing_points_of_planes,
+    project,
+    triangulate,
+)
 
 ORIGIN_M = np.array([410_200.0, 4_650_300.0, 0.0])  # in UTM zone 33 north
 EPSG = 32633
@@ -159,7 +163,7 @@ def lay_out(chosen: SceneSettings) -> Site:
     fall_m = chosen.water_tilt * float(np.hypot(*extent)) / 2.0
     return Site(
         terrain, true, true_angles, given, given_angles, chosen.optics,
-        Water(plane, chosen.refractive_index), chosen.water - chosen.depth_m - fall_m,
+        chosen.refractive_index, chosen.water - chosen.depth_m - fall_m,
         chosen.image_noise, chosen.detection, rng, luck,
     )  # fmt: skip
 
@@ -184,9 +188,6 @@ def plane_in_world(plane: WaterPlane) -> WaterPlane:
 
 # Blocks as drones fly them: nadir strips, and obliques around them
 
-OBLIQUE_PITCH_DEG = 20.0
-ATTITUDE_SD_DEG = 1.5
-PLACE_SD_M, USUAL_HEIGHT_M = 0.5, 80.0  # of a drone; below the usual height it shrinks with it
 _RING_BASES, _RING_SPACINGS = 2.0, 1.5  # steps of a ring of obliques in those of the nadir images
 
 
@@ -198,8 +199,8 @@ def fly_block(
     Returns the cameras, and yaw, pitch and roll of each, degrees, shape (k, 3).
     """
     plan, attitude = _plan(extent_m, chosen)
-    attitude = attitude + rng.normal(0.0, ATTITUDE_SD_DEG, attitude.shape)
-    sd = PLACE_SD_M * min(1.0, chosen.flying_height_m / USUAL_HEIGHT_M)
+    attitude = attitude + rng.normal(0.0, 1.5, attitude.shape)  # degrees
+    sd = 0.5 * min(1.0, chosen.flying_height_m / 80.0)  # metres, of a drone; less if it flies low
     height = chosen.water + chosen.flying_height_m + rng.normal(0.0, sd, len(plan))
     centres = np.column_stack([plan + rng.normal(0.0, sd, plan.shape), height])
     cameras = Cameras(
@@ -231,7 +232,7 @@ def _plan(extent_m: tuple[float, float], chosen: SceneSettings) -> tuple[FloatAr
         yaw = np.where(np.rint(nadir[:, 1] / spacing) % 2, 270.0, 90.0)  # to and fro
         places.append(nadir)
         angles.append(np.column_stack([yaw, np.zeros((len(nadir), 2))]))
-    pitch = OBLIQUE_PITCH_DEG if chosen.obliques_deg is None else chosen.obliques_deg
+    pitch = 20.0 if chosen.obliques_deg is None else chosen.obliques_deg
     back = chosen.flying_height_m * np.tan(np.radians(pitch))
     directions = chosen.oblique_directions if chosen.has_obliques else 0
     share = chosen.oblique_share
@@ -280,7 +281,7 @@ class Site:
     given: Cameras
     given_angles: FloatArray
     optics: Optics
-    water: Water
+    refractive_index: float
     lowest_m: float
     image_noise_px: float
     detection: float
@@ -337,14 +338,17 @@ def find_visible(truth: FloatArray, site: Site, rng: np.random.Generator) -> Vis
     cameras = site.true
     # how far from below each camera it can see anything: the most oblique ray of the frame's
     # corner, prolonged as if there were no refraction
-    off_nadir = np.arccos(np.clip(-rotations_of(cameras)[:, 2, 2], -1.0, 1.0))
+    off_nadir = np.arccos(np.clip(-np.asarray(cameras.rotations)[:, 2, 2], -1.0, 1.0))
     widest = np.minimum(np.arctan(site.optics.reach) + off_nadir, np.radians(80.0))
     reach = (cameras.centres[:, 2] - site.lowest_m) * np.tan(widest)
     across = truth[:, None, 0] - cameras.centres[:, 0], truth[:, None, 1] - cameras.centres[:, 1]
     point, camera = np.nonzero(np.hypot(*across) < reach)
-    surface = site.water.piercing_points(truth[point], cameras.centres[camera])
+    planes = anchors_and_normals(site.terrain.water, len(point))
+    pairs = truth[point], cameras.centres[camera]
+    surface = piercing_points_of_planes(*pairs, *planes, site.refractive_index)
     ideal, z = project(surface, cameras, camera, site.optics.lens)
-    inside = (z > 0) & site.optics.frames(site.optics.to_image(ideal))
+    image, size = site.optics.to_image(ideal), [site.optics.lens.width, site.optics.lens.height]
+    inside = (z > 0) & ((image >= 0) & (image < size)).all(axis=1)
     point, camera, ideal = point[inside], camera[inside], ideal[inside]
     taken = np.bincount(point, minlength=len(truth))[point] >= LEAST_VIEWS
     if site.detection < 1.0:

@@ -1,53 +1,44 @@
-"""The settings of a simulated scene, checked together, and its lens."""
+"""The settings of a simulated scene, checked together, its lens and its ground."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.special import expit
 
 from pcfix.errors import SettingError
 from pcfix.lens.imaging import project, unproject
-from pcfix.model import BoolArray, FloatArray, Lens, WaterPlane
-from pcfix.options.scenes import SceneOptions
-from pcfix.simulate.terrain import BEDS
+from pcfix.model import FloatArray, Lens, WaterPlane
+from pcfix.options.scenes import BedKind, SceneOptions
 from pcfix.water.index import index_of
-
-RIVER_TILT_PERCENT = 0.3
 
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """A lens, and the tangent of the angle from its axis to the farthest corner of the frame.
+    """A lens, the same without distortion, and the tangent of the most oblique ray in the frame.
 
-    *Ideal* pixels are those of a pinhole camera, *image* pixels those of the real lens.
+    *Ideal* pixels are those of the pinhole camera, *image* pixels those of the real lens.
     """
 
     lens: Lens
+    pinhole: Lens
     reach: float
 
     def to_image(self, ideal: FloatArray) -> FloatArray:
         """Return image pixels of ideal pixels, shape (m, 2); NaN beyond the fold of the lens."""
         if not self.lens.radial:
             return ideal
-        principal = [self.lens.principal_x, self.lens.principal_y]
-        plane = (ideal - principal) / self.lens.focal
-        return project(self.lens, np.column_stack([plane, np.ones(len(plane))]))
+        return project(self.lens, unproject(self.pinhole, ideal))
 
     def to_ideal(self, image: FloatArray) -> FloatArray:
         """Return ideal pixels of image pixels, shape (m, 2)."""
-        if not self.lens.radial:
-            return image
-        rays = unproject(self.lens, image)
-        principal = [self.lens.principal_x, self.lens.principal_y]
-        return np.asarray(self.lens.focal * rays[:, :2] / rays[:, 2:] + principal)
-
-    def frames(self, image: FloatArray) -> BoolArray:
-        """Return which image points lie in the frame."""
-        inside = (image >= 0) & (image < [self.lens.width, self.lens.height])
-        return np.asarray(inside.all(axis=1))
+        return project(self.pinhole, unproject(self.lens, image)) if self.lens.radial else image
 
 
 class SceneSettings(SceneOptions):
@@ -63,18 +54,12 @@ class SceneSettings(SceneOptions):
         pitch = [mm / px for mm, px in zip(self.sensor_mm, self.sensor_px, strict=True)]
         if not 0.98 < pitch[0] / pitch[1] < 1.02:
             um = [1000 * side for side in pitch]
-            sentence = (
-                f"sensor_mm {self.sensor_mm} and sensor_px {self.sensor_px} make pixels of"
-                f" {um[0]:.3g} x {um[1]:.3g} um. Give square pixels."
-            )
+            sentence = f"sensor_mm makes pixels of {um[0]:.3g} x {um[1]:.3g} um. Give square ones."
             raise SettingError("scene.pixels", sentence, pixel_um=um)
         # above the highest water of the area
         height = self.flying_height_m - self.water_tilt * float(np.hypot(*self.area_m)) / 2.0
         if height <= 0.5 * self.depth_m:
-            sentence = (
-                f"Flying height {height:.4g} m above the highest water is not more than half the"
-                f" greatest depth {self.depth_m:g} m. Fly higher or give a smaller depth or tilt."
-            )
+            sentence = f"{height:.4g} m is too low for a depth of {self.depth_m:g} m. Fly higher."
             raise SettingError("scene.too_low", sentence, height_m=height, depth_m=self.depth_m)
         if self.oblique_share is not None and not self.has_obliques:
             sentence = f"oblique share {self.oblique_share:g} needs obliques. Give their angle."
@@ -94,23 +79,23 @@ class SceneSettings(SceneOptions):
     @property
     def water_tilt(self) -> float:
         """The slope of the mean water plane, m/m."""
-        if self.tilt_percent is None:
-            return RIVER_TILT_PERCENT / 100.0 if self.bed == "river" else 0.0
-        return self.tilt_percent / 100.0
+        usual = 0.3 if self.bed == "river" else 0.0
+        return (usual if self.tilt_percent is None else self.tilt_percent) / 100.0
 
     @cached_property
     def optics(self) -> Optics:
         """The lens of the camera; where it folds the image, nothing is seen."""
         width, height = self.sensor_px
         middle = np.array([width / 2.0, height / 2.0])
-        lens = Lens(self.focal_mm / self.sensor_mm[0] * width, width, height, *middle.tolist())
+        pinhole = Lens(self.focal_mm / self.sensor_mm[0] * width, width, height, *middle.tolist())
+        lens = pinhole
         if any(self.distortion):
             lens = replace(lens, radial=self.distortion[:3], tangential=self.distortion[3:])
         along = np.linspace(-1.0, 1.0, 41)
         side = np.ones_like(along)
         edges = [(along, side), (along, -side), (side, along), (-side, along)]
         rays = unproject(lens, np.hstack(edges).T * middle + middle)
-        return Optics(lens, float(np.nanmax(np.hypot(*(rays[:, :2] / rays[:, 2:]).T))))
+        return Optics(lens, pinhole, float(np.nanmax(np.hypot(*(rays[:, :2] / rays[:, 2:]).T))))
 
     @property
     def base_and_spacing_m(self) -> tuple[float, float]:
@@ -130,3 +115,92 @@ class SceneSettings(SceneOptions):
         heading = math.radians(self.tilt_heading_deg)
         b, c = (-self.water_tilt * part for part in (math.sin(heading), math.cos(heading)))
         return WaterPlane(self.water - (b * extent_m[0] + c * extent_m[1]) / 2.0, b, c)
+
+
+# Made-up ground, as depth below the mean water plane: it tilts with the water
+
+GREATEST_DEPTH_M = 12.0
+STEPS = 6
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """A surface z(x, y) over a rectangle from the origin, below a mean water plane.
+
+    `rocks`, shape (r, 4), are plan position, height and radius, metres, of a shore.
+    """
+
+    kind: BedKind
+    length_m: float
+    width_m: float
+    water: WaterPlane
+    greatest_depth_m: float
+    rocks: FloatArray
+
+    @classmethod
+    def random(
+        cls, kind: BedKind, extent_m: tuple[float, float], water: WaterPlane,
+        greatest_depth_m: float, rng: np.random.Generator,
+    ) -> Terrain:  # fmt: skip
+        """Make a terrain; a shore gets random rocks."""
+        rocks = np.zeros((0, 4))
+        if kind == "shore":
+            count = int(extent_m[0] * extent_m[1] * (1.0 / 150.0))  # one in 150 m2
+            place = rng.uniform(0.0, 1.0, (count, 2)) * extent_m
+            size = np.column_stack([rng.uniform(0.2, 0.8, count), rng.uniform(0.5, 2.0, count)])
+            rocks = np.column_stack([place, size])
+        return cls(kind, *extent_m, water, greatest_depth_m, rocks)
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return z at plan positions, metres; never deeper than `greatest_depth_m`."""
+        above = np.maximum(BEDS[self.kind].above_water(self, x, y), -self.greatest_depth_m)
+        return np.asarray(self.water.a + self.water.b * x + self.water.c * y + above)
+
+
+def _shore(ground: Terrain, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return land at x = 0, then beach and bed with swells, rocks and a ledge to deep water."""
+    size = min(1.0, ground.greatest_depth_m / GREATEST_DEPTH_M)  # shallow shores are smoother
+    land, share = 3.0 * size, np.maximum(x / ground.length_m, 0.0)
+    slope = land - (land + ground.greatest_depth_m) * share**1.2
+    swell = 0.4 * np.sin(x / 7.0) * np.cos(y / 9.0) + 0.15 * np.sin(x / 2.3 + y / 3.1)
+    ledge = -0.6 * expit((x - 0.6 * ground.length_m - 0.1 * y) / 0.3)
+    z = slope + size * swell + size * ledge
+    if len(ground.rocks):
+        distance, rock = cKDTree(ground.rocks[:, :2]).query(np.column_stack([x, y]))
+        height, radius = ground.rocks[rock, 2:].T
+        z = z + size * (height * np.exp(-((distance / radius) ** 2)))
+    return np.asarray(z)
+
+
+def _steps(ground: Terrain, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return `STEPS` level steps of equal length and height along x, as in a flume."""
+    step = np.clip(np.floor(STEPS * (x / ground.length_m)) + 1.0, 1.0, STEPS)
+    return np.asarray(-ground.greatest_depth_m * step / STEPS)
+
+
+def _river(ground: Terrain, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return a winding channel along x with pools, and banks above the water."""
+    turn = 2.0 * np.pi * x / ground.length_m
+    middle = ground.width_m * (0.5 + 0.1 * np.sin(turn))
+    across = (y - middle) / (0.35 * ground.width_m)
+    pools = 0.8 + 0.2 * np.sin(3.0 * turn)
+    deepest = ground.greatest_depth_m
+    return np.asarray(np.minimum(-deepest * pools * (1.0 - across**2), 0.3 * deepest))
+
+
+class Bed(NamedTuple):
+    """A kind of bed: its usual greatest depth, and its height above the water at n places."""
+
+    default_depth_m: float
+    above_water: Callable[[Terrain, FloatArray, FloatArray], FloatArray]
+
+
+BEDS: dict[BedKind, Bed] = {
+    "shore": Bed(GREATEST_DEPTH_M, _shore),
+    "flat": Bed(3.0, lambda ground, x, y: np.full(len(x), -ground.greatest_depth_m)),
+    "slope": Bed(6.0, lambda ground, x, y: -ground.greatest_depth_m * (x / ground.length_m)),
+    "steps": Bed(6.0, _steps),
+    "river": Bed(2.5, _river),
+}
+"""Flat: one depth everywhere; slope: from the waterline at x = 0 to the greatest depth at the end.
+A new kind is an entry here and in `BedKind`."""

@@ -12,14 +12,17 @@ stated otherwise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, WaterPlane
 
-_NEWTON_STEPS = 60
-_CONVERGED_M = 1e-11
+
+def anchors_and_normals(plane: WaterPlane, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return a point of a plane and its unit normal, each of shape (count, 3)."""
+    up = np.array([-plane.b, -plane.c, 1.0])
+    up /= np.linalg.norm(up)
+    anchor = np.array([0.0, 0.0, plane.a])
+    return np.broadcast_to(anchor, (count, 3)), np.broadcast_to(up, (count, 3))
 
 
 def piercing_points_of_planes(
@@ -51,26 +54,20 @@ def _root_of_snell(
     """Return x in [0, reach] with x/|(x, H)| = n (D - x)/|(D - x, h)|; the difference rises."""
     low, high = np.zeros_like(reach), reach.copy()
     x = reach * height / (height + depth / n)
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(60):
         rest = reach - x
         air, water = np.hypot(x, height), np.hypot(rest, depth)
         value = x / air - n * rest / water
         low, high = np.where(value < 0.0, x, low), np.where(value < 0.0, high, x)
+        # Newton by the derivative of the difference, or a bisection where that leaves the bracket
         step = value / (height**2 / air**3 + n * depth**2 / water**3)
         following = x - step
         following = np.where((following < low) | (following > high), (low + high) / 2.0, following)
         moved = np.abs(following - x).max(initial=0.0)
         x = following
-        if moved < _CONVERGED_M:
+        if moved < 1e-11:  # metres
             return x
     raise ArithmeticError("the piercing point was not found")
-
-
-def rotations_of(cameras: Cameras) -> FloatArray:
-    """Return the rotations of simulated cameras, which all have them."""
-    if cameras.rotations is None:
-        raise ValueError("simulated images need cameras with angles")
-    return cameras.rotations
 
 
 def project(
@@ -78,7 +75,7 @@ def project(
 ) -> tuple[FloatArray, FloatArray]:
     """Return pixels, shape (m, 2), and the depth along the optical axis, shape (m,)."""
     ray = targets - cameras.centres[camera]
-    x, y, z = np.einsum("mij,mj->im", rotations_of(cameras)[camera], ray)
+    x, y, z = np.einsum("mij,mj->im", np.asarray(cameras.rotations)[camera], ray)
     u = lens.focal * x / z + lens.principal_x
     v = lens.focal * y / z + lens.principal_y
     return np.column_stack([u, v]), z
@@ -93,13 +90,14 @@ def triangulate(
     Gauss-Newton from a guess, shape (n, 3). Point i has the pairs from ``start[i]`` to
     ``start[i + 1]``, at least two.
     """
-    rows = rotations_of(cameras)[camera]
+    rows = np.asarray(cameras.rotations)[camera]
     owner = np.repeat(np.arange(len(start) - 1), np.diff(start))
     points = guess.copy()
     for _ in range(20):
         seen, z = project(points[owner], cameras, camera, lens)
         offset = (seen - [lens.principal_x, lens.principal_y]) / lens.focal
         scale = (lens.focal / z)[:, None]
+        # the gradients of both image coordinates by the place of the point
         u, v = (scale * (rows[:, i] - offset[:, i : i + 1] * rows[:, 2]) for i in (0, 1))
         residual = pixels - seen
         products = u[:, :, None] * u[:, None] + v[:, :, None] * v[:, None]
@@ -110,23 +108,3 @@ def triangulate(
         if np.abs(step).max(initial=0.0) < 1e-7:
             break
     return points
-
-
-@dataclass(frozen=True, eq=False)
-class Water:
-    """The surface that light is traced through: a plane in the frame of the points."""
-
-    plane: WaterPlane
-    refractive_index: float
-
-    def planes(self, count: int) -> tuple[FloatArray, FloatArray]:
-        """Return a point of the plane and its unit normal, each of shape (count, 3)."""
-        up = np.array([-self.plane.b, -self.plane.c, 1.0])
-        up /= np.linalg.norm(up)
-        anchor = np.array([0.0, 0.0, self.plane.a])
-        return np.broadcast_to(anchor, (count, 3)), np.broadcast_to(up, (count, 3))
-
-    def piercing_points(self, points: FloatArray, centres: FloatArray) -> FloatArray:
-        """Return where the light from each point to its camera passes the surface, (m, 3)."""
-        planes = self.planes(len(points))
-        return piercing_points_of_planes(points, centres, *planes, self.refractive_index)

@@ -27,17 +27,13 @@ from pcfix.water.surface import FoundSurface
 
 LEAST_POINTS = 2_000
 LEAST_RELIEF_M = 0.3
-LEAST_SIGMA_M = 0.015
-"""Least standard error of a waterline, from waves and the thickness of the cloud."""
-MOST_SHORELINE = 2_000
 INSTEAD = "Give the water surface: a level, shoreline points, plane:a,b,c or a mesh."
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WaterProposal(FoundSurface):
-    """A water level found in a cloud; its points are where the ground crosses it."""
+    """A water level found in a cloud."""
 
-    points: FloatArray  # (n, 3), metres, world frame
     sigma_level_m: float
     """Standard error of its height, by resampling tiles of the cloud. It does not include errors
     that all of the shore shares, such as a bank that stops at the water."""
@@ -102,7 +98,8 @@ def find_elsewhere(
         coarse = _scanned(samples)
         gain, heights = _gains(coarse), coarse.heights_m + samples.origin[2]
         here = gain[np.abs(heights) <= DIFFERENT_M].max(initial=0.0)
-        if gain.max() < LEAST_AGREED or here > MOST_RIVAL_AGREED * gain.max():
+        least, most_rival = NEEDED["slope", "red/green"]  # no other cues need less
+        if gain.max() < least or here > most_rival * gain.max():
             return None
         found = _judged(coarse)
     except GeometryError:  # flat ground, or too little evidence
@@ -116,8 +113,10 @@ def find_elsewhere(
 
 COARSE_M, FINE_M, MOST_HEIGHTS = 0.04, 0.01, 800
 FINE_REACH_M, SAME_PLACE_M = 0.6, 0.3
-WATERLINE_M = 0.05
+"""Half of the heights in fine steps, and the largest difference of two heights of one waterline."""
 DRAWS = 120
+LEAST_SIGMA_M = 0.015
+"""Least standard error of a waterline, from waves and the thickness of the cloud."""
 
 
 class Scan(NamedTuple):
@@ -165,14 +164,11 @@ def _gains(scan: Scan, rng: np.random.Generator | None = None) -> FloatArray:
 
 def _refined(coarse: Scan) -> Scan:
     """Return the sums near the best level, in fine steps; it is in the middle of their heights."""
-    level_m = _best(coarse)
-    reach = np.arange(-FINE_REACH_M, FINE_REACH_M + FINE_M / 2.0, FINE_M)
-    return _scan_at(coarse.samples, _best(_scan_at(coarse.samples, level_m + reach)) + reach)
-
-
-def _best(scan: Scan) -> float:
-    """Return the height of the largest gain."""
-    return float(scan.heights_m[int(np.argmax(_gains(scan)))])
+    near, reach = coarse, np.arange(-FINE_REACH_M, FINE_REACH_M + FINE_M / 2.0, FINE_M)
+    for _ in range(2):  # about the best of the coarse steps, then about that of the fine ones
+        best_m = float(near.heights_m[int(np.argmax(_gains(near)))])
+        near = _scan_at(near.samples, best_m + reach)
+    return near
 
 
 def _sigma_level(near: Scan) -> float:
@@ -185,22 +181,24 @@ def _sigma_level(near: Scan) -> float:
     return math.hypot(float(np.sqrt(np.mean(levels**2))), LEAST_SIGMA_M)
 
 
-LEAST_AGREED, LEAST_EACH = 12.0, 3.0
+LEAST_EACH = 3.0  # least gain of a cue that counts
+NEEDED = {
+    ("slope", "red/green"): (12.0, 0.75),
+    ("slope",): (25.0, 0.5),
+    ("red/green",): (40.0, 0.5),
+    (): (25.0, 0.5),
+}
+"""Least total gain, and largest share of it that another height may have, by the cues that count.
+Physics gives the size of the change of slope; colours may change with height on land too, so that
+they need more evidence where they are the only cue."""
 LIFTS = 0.15, 0.75  # range of the change of slope by refraction, about 0.36, on rough ground
-LEAST_SINGLE, LEAST_COLOUR_SINGLE = 25.0, 40.0
-"""Physics gives the size of the change of slope; colours may change with height on land too."""
-MOST_RIVAL_AGREED, MOST_RIVAL_SINGLE = 0.75, 0.5
-MOST_SIGMA_M = 0.2
-LEAST_SHARE = 0.005
 
 
 def _judged(coarse: Scan) -> WaterProposal:
     """Return the best level; GeometryError ``water.not_found`` if its evidence is not enough."""
-    samples, origin = coarse.samples, coarse.samples.origin
-    near = _refined(coarse)
-    sigma_m, middle = _sigma_level(near), len(near.heights_m) // 2
+    near, origin_m = _refined(coarse), float(coarse.samples.origin[2])
+    middle = len(near.heights_m) // 2
     found_m = float(near.heights_m[middle])
-    level, below = found_m + float(origin[2]), found_m - samples.smooth_m
     total, evidence, sentences, strong = 0.0, dict[str, float](), list[str](), list[str]()
     for sums in near.cues:
         cue = sums.cue
@@ -210,83 +208,66 @@ def _judged(coarse: Scan) -> WaterProposal:
         if gain >= LEAST_EACH:
             strong.append(cue.name)
             evidence[f"{cue.name} amplitude"], evidence[f"{cue.name} sigma"] = size, sigma
-            text = f"the logarithm of their ratio falls by {-size:.3f} per metre"
-            if cue == SLOPE:
-                text = f"true slopes are {1.0 + size:.2f} times the apparent ones"
-            sentences.append(f"{cue.meaning}: {text} (standard error {sigma:.3f})")
+            text = cue.meaning.format(1.0 + size if cue is SLOPE else -size)
+            sentences.append(f"{text} (standard error {sigma:.3f})")
     # the rival: the best height elsewhere
     elsewhere = np.abs(coarse.heights_m - found_m) > SAME_PLACE_M
     rivals = np.where(elsewhere, _gains(coarse), 0.0)
     row = int(np.argmax(rivals))
-    rival, rival_m = float(rivals[row]), float(coarse.heights_m[row] + origin[2])
-    wet = float(np.mean(below > 0.0))
-    evidence |= {
-        "rival gain": rival, "rival height": rival_m, "total gain": total, "share below": wet,
-    }  # fmt: skip
-    # what is needed depends on the cues that gain enough to count
-    least, most_rival, lift = LEAST_AGREED, MOST_RIVAL_AGREED, LIFTS[0]
-    if len(strong) < 2:
-        coloured = any(name != SLOPE.name for name in strong)
-        least, most_rival = (LEAST_COLOUR_SINGLE if coloured else LEAST_SINGLE), MOST_RIVAL_SINGLE
-    if strong == [SLOPE.name]:
-        lift = evidence["slope amplitude"]
-    shore = samples.xyz[np.abs(below) <= WATERLINE_M]
-    is_one_sided = not LEAST_SHARE <= wet <= 1.0 - LEAST_SHARE or len(shore) == 0
+    rival, rival_m = float(rivals[row]), float(coarse.heights_m[row]) + origin_m
+    evidence |= {"rival gain": rival, "rival height": rival_m, "total gain": total}
+    least, most_rival = NEEDED[tuple(strong)]
+    # without colours that agree, a bank that is steeper above the water looks the same
+    lift = evidence["slope amplitude"] if strong == ["slope"] else LIFT
     for reason, is_refused, why in (
-        ("no_shoreline", is_one_sided, "nearly all of the cloud is on one side of it"),
         ("bank", not LIFTS[0] <= lift <= LIFTS[1],
          f"slopes change there by a factor of {1.0 + lift:.2f}, refraction gives about 1.36"),
         ("weak", total < least, f"its evidence is {total:.0f}, and {least:.0f} is needed"),
         ("contradictory", rival > most_rival * total,
          f"its evidence is {total:.0f}, and {rival_m:.2f} m has {rival:.0f}, nearly as much"),
-        ("inconsistent", sigma_m > MOST_SIGMA_M, f"parts of the cloud differ by {sigma_m:.2f} m"),
     ):  # fmt: skip
         if is_refused:
             raise GeometryError(
                 "water.not_found",
-                f"No water surface was found. The best candidate is {level:.2f} m, but {why}."
-                f" {INSTEAD}",
+                f"No water surface was found. The best candidate is {found_m + origin_m:.2f} m, but"
+                f" {why}. {INSTEAD}",
                 reason=reason, evidence=evidence,
             )  # fmt: skip
     return WaterProposal(
-        surface=WaterPlane(level),
-        points=shore[:: math.ceil(len(shore) / MOST_SHORELINE)] + origin,
-        sigma_level_m=sigma_m,
-        level_m=level,
+        surface=WaterPlane(found_m + origin_m),
+        sigma_level_m=_sigma_level(near),
+        level_m=found_m + origin_m,
         confidence=float(min(1.0 - rival / total, 1.0 - math.exp(-total / (2.0 * least)))),
         evidence=evidence,
         reasons=tuple(sentences),
     )
 
 
-LEAST_SIDE = 8.0  # least sum of weights of the cells of a tile above a height, and below
-_TINY = 1e-12
-_STEADY_M = 0.3
-
-
 LIFT = 0.36  # n - 1 and a little more for oblique rays: the apparent reduction of slopes
-MOST_FADING = 1.2
-"""Per metre. Clear water has about 0.3, twice the difference in attenuation over the gamma of
-images; faster changes, except in the darkest water, are of the ground: plants, or a wet edge. They
-count less, and not at all from twice as much."""
 
 
 class Cue(NamedTuple):
     """A property of the ground, and its break at the waterline."""
 
     name: str
-    meaning: str
-    is_colour: bool
+    meaning: str  # a sentence about the size of the break
     tile_cells: float  # side of a tile
     window_m: float  # observations weigh less towards this distance above and below
     scale_m: float = math.inf  # D; infinite for a straight line below
-    amplitude: float | None = None  # given by physics, or negative and free
+    amplitude: float | None = None  # given by physics; that of a colour is free, and negative
 
 
-SLOPE = Cue("slope", "the ground is flatter below the surface", False, 12.0, 0.6, amplitude=LIFT)
+SLOPE = Cue(
+    "slope",
+    "the ground is flatter below the surface: true slopes are {:.2f} times the apparent ones",
+    tile_cells=12.0, window_m=0.6, amplitude=LIFT,
+)  # fmt: skip
 RED = Cue(
-    "red/green", "red fades faster than green below the surface", True, 24.0, 0.8, scale_m=0.7
-)
+    "red/green",
+    "red fades faster than green below the surface: the logarithm of their ratio falls by {:.3f}"
+    " per metre",
+    tile_cells=24.0, window_m=0.8, scale_m=0.7,
+)  # fmt: skip
 
 
 class Moments(NamedTuple):
@@ -300,6 +281,13 @@ class Moments(NamedTuple):
     cue: Cue
 
 
+MOST_FADING = 1.2
+"""Per metre. Clear water has about 0.3, twice the difference in attenuation over the gamma of
+images; faster changes, except in the darkest water, are of the ground: plants, or a wet edge. They
+count less, and not at all from twice as much."""
+_TINY, _STEADY_M = 1e-12, 0.3
+
+
 def gain_of(
     moments: Moments, times: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -309,36 +297,42 @@ def gain_of(
     amplitude follows, shape (h,), and the standard error of that from these differences.
     """
     times = np.ones(len(moments.sums)) if times is None else times
-    sums, count = moments.sums * times[:, None, None], moments.number * times[:, None]
+    sums, cue = moments.sums * times[:, None, None], moments.cue
     yy, yx, yf, xx, xf, ff = np.moveaxis(sums.sum(axis=0), -1, 0)
+    # regression of y, then of f, on the height x; what is left of both gives the amplitude
     slope, share = yx / (xx + _TINY), xf / (xx + _TINY)
     sse = np.maximum(yy - slope * yx, 0.0) + _TINY
     cross, own = yf - share * yx, np.maximum(ff - share * xf, _TINY)
     amplitude = cross / own
-    cue = moments.cue
+    trend = slope - amplitude * share
+    # by how much the break reduces the sum of squares
     if cue.amplitude is None:
+        # less for a trend on land that is like the fading, and for a fading that is none of water
         steady = np.clip(2.0 - 2.0 * np.abs(slope / (amplitude + _TINY) - share), 0.0, 1.0)
         likely = np.clip(2.0 - np.abs(amplitude) / MOST_FADING, 0.0, 1.0)
         saved = np.minimum(cross, 0.0) ** 2 / own * steady * likely
     else:
         saved = 2.0 * cue.amplitude * cross - cue.amplitude**2 * own
-    left = np.maximum(sse - saved, 1e-3 * sse)
-    n = count.sum(axis=0)
-    variance = np.maximum(sse - cross**2 / own, 1e-3 * sse) / np.maximum(n, 1.0)
-    trend = slope - amplitude * share
+    n = (moments.number * times[:, None]).sum(axis=0)
+    gain = 0.5 * n * np.log(sse / np.maximum(sse - saved, 1e-3 * sse))
+    # variance of `cross`, expected from the residuals, and found in the scores of the tiles (the
+    # derivatives of their sums of squares by the amplitude), which is larger if the tiles disagree
+    expected = np.maximum(sse - cross**2 / own, 1e-3 * sse) / np.maximum(n, 1.0) * own
     scores = (
         sums[..., 2] - trend * sums[..., 4] - amplitude * sums[..., 5]
         - share * (sums[..., 1] - trend * sums[..., 3] - amplitude * sums[..., 4])
     )  # fmt: skip
     scatter = (scores**2 / np.maximum(times, 1.0)[:, None]).sum(axis=0)
-    held = np.maximum(variance * own, scatter)
-    sigma = np.sqrt(held) / own
-    temper = variance * own / (held + _TINY)
+    found = np.maximum(expected, scatter)
+    # the gain shrinks by their ratio, as a mean over neighbouring heights: that of one is noisy
+    temper = expected / (found + _TINY)
     width = max(1, round(_STEADY_M / (moments.heights_m[1] - moments.heights_m[0])))
     around = np.pad(temper, (width // 2, (width - 1) // 2), "symmetric")
-    steady = np.convolve(around, np.full(width, 1.0 / width), "valid")
-    gain = 0.5 * n * np.log(sse / left) * steady
-    return np.where(own > 1e3 * _TINY, gain, 0.0), amplitude, sigma
+    gain *= np.convolve(around, np.full(width, 1.0 / width), "valid")
+    return np.where(own > 1e3 * _TINY, gain, 0.0), amplitude, np.sqrt(found) / own
+
+
+LEAST_SIDE = 8.0  # least sum of weights of the cells of a tile above a height, and below
 
 
 def tile_moments(
@@ -361,7 +355,7 @@ def tile_moments(
     rows, weight, p = reached[enough], weight[enough], smooth.shape[1]
     below = np.maximum(depth[enough], 0.0)
     f = below if np.isinf(cue.scale_m) else -cue.scale_m * np.expm1(-below / cue.scale_m)
-    x = (at_m - at_m.mean()) * float(cue.is_colour)
+    x = (at_m - at_m.mean()) * float(cue.amplitude is None)
     # the products of all columns, f last, at each height
     fixed = np.column_stack([smooth, y, x])
     products = (fixed[:, :, None] * fixed[:, None, :]).reshape(len(y), -1)
@@ -374,6 +368,7 @@ def tile_moments(
     ridge = 1e-9 * np.trace(inner, axis1=1, axis2=2)[:, None, None] * np.eye(p)
     rest = normal[:, p:, p:] - np.swapaxes(right, 1, 2) @ np.linalg.solve(inner + ridge, right)
     sums[rows] = rest[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    # as many observations of equal weight, less the unknowns of the smooth part
     count[rows] = np.maximum(total[enough] ** 2 / (weight**2).sum(axis=1) - p, 1.0)
     return sums, count
 
@@ -393,10 +388,8 @@ def cue_moments(samples: Samples, cue: Cue, heights_m: FloatArray) -> Moments | 
     for rows in np.split(order, np.flatnonzero(np.diff(tile[order])) + 1):
         if len(rows) < LEAST_TILE_CELLS:
             continue
-        if cue.is_colour:
-            smooth = np.ones((len(rows), 1))
-            y = samples.redness[rows]
-            at = samples.smooth_m[rows]
+        if cue.amplitude is None:
+            smooth, y, at = np.ones((len(rows), 1)), samples.redness[rows], samples.smooth_m[rows]
         else:
             place = xy[rows] - xy[rows].mean(axis=0)
             u, v = (place / max(float(np.ptp(xy[rows])), 1e-9)).T
@@ -413,13 +406,13 @@ def cue_moments(samples: Samples, cue: Cue, heights_m: FloatArray) -> Moments | 
     if not found:
         return None
     sums, count = map(np.array, zip(*found, strict=True))
+    # units of the residual variance of each tile; that of a very smooth one is not believed
     variance = sums[..., 0].sum(axis=1) / count.sum(axis=1)
     sums /= np.maximum(variance, 0.3 * np.median(variance) + _TINY)[:, None, None]
     return Moments(sums, count, heights_m, cue)
 
 
-MOST_CELLS = 100_000
-POINTS_PER_CELL = 4.0
+MOST_CELLS, POINTS_PER_CELL = 100_000, 4.0
 NEIGHBOURS = 8
 _TRIES = 4
 
@@ -448,13 +441,10 @@ def sample_cloud(xyz: FloatArray, rgb: npt.NDArray[Any] | None) -> Samples:
     cell_m = float(np.sqrt(max(np.prod(np.ptp(local[:, :2], axis=0)), 1e-6) / wanted))
     for _ in range(_TRIES):
         cell_m *= np.sqrt(len(np.unique(square_tiles(local, cell_m))) / wanted)
-    _, of_point, count = np.unique(
-        square_tiles(local, cell_m), return_inverse=True, return_counts=True
-    )
-    of_point = of_point.reshape(-1)
-    mean = [np.bincount(of_point, local[:, i]) / count for i in (0, 1)]
-    median = ndimage.median(local[:, 2], of_point, np.arange(len(count)))
-    ground = np.column_stack([*mean, median])
+    tiles = square_tiles(local, cell_m)
+    _, of_point, count = np.unique(tiles, return_inverse=True, return_counts=True)
+    x, y = (np.bincount(of_point, local[:, i]) / count for i in (0, 1))
+    ground = np.column_stack([x, y, ndimage.median(local[:, 2], of_point, np.arange(len(count)))])
     redness = np.zeros(0)
     if rgb is not None and (rgb != rgb[:1]).any():
         light = rgb.astype(np.float64)

@@ -84,6 +84,7 @@ def check_above_water(
     if isinstance(water, WaterDimension):
         return  # known with the points only; see `correct_file`
     height = surface_above(water, cameras.centres).height_m
+    # beyond its border the lowest place of the water, so that no camera is refused wrongly
     level = np.where(np.isnan(height), _heights_of(water).min(initial=np.inf), height)
     offset = 0.0 if level_offset_m is None else level_offset_m
     refuse_under_water(cameras, level + offset, str(water))
@@ -93,13 +94,13 @@ def refuse_under_water(cameras: Cameras, level: FloatArray | float, water: str) 
     """Raise GeometryError for cameras below a level, metres: one for all, or shape (k,)."""
     below = np.flatnonzero(cameras.centres[:, 2] <= level)
     if below.size:
-        first = below[0]
+        first = cameras.labels[below[0]]
         raise GeometryError(
             "cameras.under_water",
             f"{below.size} of {len(cameras)} cameras are below the water ({water}); the first,"
-            f" {cameras.labels[first]}, is at {cameras.centres[first, 2]:.2f} m. Check the vertical"
-            " datum, the order of the columns and the water level.",
-            cameras=int(below.size), first=cameras.labels[first],
+            f" {first}, is at {cameras.centres[below[0], 2]:.2f} m. Check the vertical datum, the"
+            " order of the columns and the water level.",
+            cameras=int(below.size), first=first,
         )  # fmt: skip
 
 
@@ -132,8 +133,9 @@ def check_tilt(water: WaterSurface) -> None:
             row, column = row[::step], column[::step]
             width, height = water.cell_m
             xyz = np.column_stack([column * width, -row * height, water.height_m[row, column]])
+    # the plane of least squares; rcond: places on one line have a slope along it only
     local = xyz - xyz.mean(axis=0)
-    slope = np.linalg.lstsq(local[:, :2], local[:, 2], rcond=1e-6)[0]  # of a line, along it
+    slope = np.linalg.lstsq(local[:, :2], local[:, 2], rcond=1e-6)[0]
     tilt = float(np.hypot(*slope))
     if tilt > MOST_TILT:
         raise GeometryError(
@@ -147,15 +149,15 @@ def check_tilt(water: WaterSurface) -> None:
 
 @dataclass(frozen=True)
 class WaterMeeting(Sums):
-    """Depths and coverage of a cloud below a water surface."""
+    """Depths and coverage of a cloud below a water surface: numbers of points, and extremes."""
 
     points: int
     submerged: int
-    uncovered: int
-    uncovered_low: int
-    doubtful: int
-    too_deep: int
-    low_m: float = field(metadata=LEAST)
+    uncovered: int  # without water above or below them
+    uncovered_low: int  # of these, lower than the highest place of the water
+    doubtful: int  # deeper than `DOUBTFUL_M`
+    too_deep: int  # deeper than `TOO_DEEP_M`
+    low_m: float = field(metadata=LEAST)  # of the cloud's heights
     high_m: float = field(metadata=MOST)
     most_depth_m: float = field(metadata=MOST)
 
@@ -181,11 +183,10 @@ class WaterMeeting(Sums):
 
         `deep` allows depths of more than `TOO_DEEP_M`. Returns the warnings as sentences.
         """
-        found, few = [], DEEP_SHARE * self.submerged
+        found, few = list[PcfixWarning](), DEEP_SHARE * self.submerged
         is_refused = self.too_deep > few and not deep
-        points, limit_m = self.doubtful, DOUBTFUL_M
-        if is_refused:
-            points, limit_m = self.too_deep, TOO_DEEP_M
+        points = self.too_deep if is_refused else self.doubtful
+        limit_m = TOO_DEEP_M if is_refused else DOUBTFUL_M
         if points > few:
             land = "" if self.submerged < self.points else "; no point is left as land"
             words = (
@@ -196,22 +197,17 @@ class WaterMeeting(Sums):
             )
             if is_refused:
                 words += ", or use --deep if the depths are right."
-                depth = self.most_depth_m
-                raise GeometryError(
-                    "water.too_deep", words, path=name, points=points, depth_m=depth
-                )
+                depth = {"points": points, "depth_m": self.most_depth_m}
+                raise GeometryError("water.too_deep", words, path=name, **depth)
             found.append(PcfixWarning("water.deep", f"{words}.", points=points))
         if self.uncovered_low:
-            found.append(
-                PcfixWarning(
-                    "water.not_covered",
-                    f"{name}: the water surface ({water}) does not cover"
-                    f" {100.0 * self.uncovered / self.points:.1f} % of the points;"
-                    f" {self.uncovered_low:,} of them are lower than its highest place and may be"
-                    " under water. They are not corrected.",
-                    points=self.uncovered_low,
-                )
+            words = (
+                f"{name}: the water surface ({water}) does not cover"
+                f" {100.0 * self.uncovered / self.points:.1f} % of the points;"
+                f" {self.uncovered_low:,} of them are lower than its highest place and may be under"
+                " water. They are not corrected."
             )
+            found.append(PcfixWarning("water.not_covered", words, points=self.uncovered_low))
         for one in found:
             warnings.warn(one, stacklevel=2)
         return [str(one) for one in found]

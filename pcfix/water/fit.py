@@ -19,10 +19,10 @@ import numpy as np
 
 from pcfix.errors import GeometryError
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterPlane
+from pcfix.water.checks import check_tilt
 from pcfix.water.surface import FoundSurface
 
 Model = Literal["auto", "level", "plane", "along"]
-MAX_TILT_PERCENT = 5.0
 SIGNIFICANCE = 0.05  # a tilt is significant if chance gives it more rarely
 LINE_RATIO = 0.1
 """Points are on one line if their spread across it is less than this share of that along it."""
@@ -32,17 +32,17 @@ _SAME_PLACE_M = 1e-3
 _FEWEST_FOR_PLANE = 3
 _ON_LINE = 0.01
 _NO_SCATTER_M = 1e-6
-_MOSTLY = 0.6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShoreFit(FoundSurface):
     """The fit of a water surface to its n shoreline points."""
 
-    points: FloatArray  # (n, 3), metres, world frame
+    points: FloatArray  # (n, 3), metres, the cloud's CRS
     residual_m: FloatArray  # (n,), point minus surface; NaN for points without a height
     weight: FloatArray  # (n,), 0 (rejected) to 1
     sigma_m: float  # standard deviation of one accepted point; NaN without redundancy
+    figures: dict[str, Any]  # of the fitted model, as plain values
 
     @property
     def accepted(self) -> BoolArray:
@@ -50,8 +50,9 @@ class ShoreFit(FoundSurface):
         return np.asarray(self.weight > 0.0)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the figures of the points as plain values."""
+        """Return the figures as plain values."""
         return {
+            **self.figures,
             "sigma_point_m": self.sigma_m,
             "points": len(self.weight),
             "accepted": int(self.accepted.sum()),
@@ -61,37 +62,17 @@ class ShoreFit(FoundSurface):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WaterFit(ShoreFit):
-    """A level or a plane, and its accuracy."""
+    """A level or a plane, and its accuracy without errors that all points share."""
 
-    model: Model  # "along" is tilted in the direction of the points, and level across it
-    centre_xy: FloatArray  # (2,), centre of the points, metres, world frame
-    level_m: float  # height of the surface there
-    tilt: FloatArray  # (2,), dz/dx and dz/dy
+    centre_xy: FloatArray  # (2,), centre of the accepted points
     covariance: FloatArray
-    """Of `level_m` and `tilt`, shape (3, 3): zero for what the model does not have, NaN without
-    redundancy. It does not include errors that all points share, as of a wrong datum."""
+    """Of the height there and of dz/dx and dz/dy, shape (3, 3): zero for what the model does not
+    have, NaN without redundancy."""
 
     def sigma_at(self, xy: FloatArray) -> FloatArray:
-        """Return the standard error (m) of that height."""
+        """Return the standard error (m) of the height at places (m, 2)."""
         row = np.column_stack([np.ones(len(xy)), xy - self.centre_xy])
         return np.sqrt(np.einsum("ij,jk,ik->i", row, self.covariance, row))
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the figures as plain values; a level has no downhill direction."""
-        east, north = self.tilt.tolist()
-        steepest = math.hypot(east, north)
-        along = self.tilt / steepest if steepest else np.zeros(2)
-        return {
-            "model": self.model,
-            "level_m": self.level_m,
-            "sigma_level_m": math.sqrt(self.covariance[0, 0]),
-            "at_xy": self.centre_xy.tolist(),
-            "tilt_percent": 100.0 * steepest,
-            "sigma_tilt_percent": 100.0 * math.sqrt(along @ self.covariance[1:, 1:] @ along),
-            # clockwise from the y axis
-            "downhill_deg": math.degrees(math.atan2(-east, -north)) % 360.0 if steepest else None,
-            **super().as_dict(),
-        }
 
 
 _UNKNOWNS: dict[Model, int] = {"level": 1, "along": 2, "plane": 3}
@@ -132,17 +113,14 @@ def fit_water(
     to_world = np.zeros((3, p))
     to_world[0, 0], to_world[1:, 1:] = 1.0, units[:, : p - 1]
     to_world[0] += (centre - origin) @ to_world[1:]
-    level, *tilt = (to_world @ found.beta).tolist()
-    missing = len(xyz) - len(known)
-    if missing:
-        notes.append(f"{missing} points have no height and are ignored.")
+    covariance = to_world @ found.covariance @ to_world.T
+    level, east, north = (to_world @ found.beta).tolist()
+    surface = WaterPlane(level - float(centre @ [east, north]), east, north)
+    check_tilt(surface)
+    steepest = math.hypot(east, north)
+    uphill = np.array([east, north]) / steepest if steepest else np.zeros(2)
     if math.isnan(found.sigma_m):
         notes.append("There is no redundancy, so the accuracy of the surface is unknown.")
-    if accepted.sum() < _MOSTLY * len(known):
-        notes.append(
-            f"Only {accepted.sum()} of {len(known)} points agree with the surface. Check the"
-            " others."
-        )
     if found.sigma_m > WIDE_SCATTER_M:
         notes.append(
             f"The points scatter by {found.sigma_m:.2f} m. They may not belong to one surface, or"
@@ -150,29 +128,26 @@ def fit_water(
         )
     residual, weight = np.full(len(xyz), np.nan), np.zeros(len(xyz))
     residual[known], weight[known] = found.residual_m, found.weight
-    fit = WaterFit(
-        surface=WaterPlane(level - float(centre @ tilt), *tilt),
+    return WaterFit(
+        surface=surface,
         points=xyz,
         notes=tuple(notes),
-        model=model,
-        centre_xy=centre,
-        level_m=level,
-        tilt=np.array(tilt),
-        covariance=to_world @ found.covariance @ to_world.T,
         residual_m=residual,
         weight=weight,
         sigma_m=found.sigma_m,
+        centre_xy=centre,
+        covariance=covariance,
+        figures={
+            "model": model,
+            "level_m": level,
+            "sigma_level_m": math.sqrt(covariance[0, 0]),
+            "at_xy": centre.tolist(),
+            "tilt_percent": 100.0 * steepest,
+            "sigma_tilt_percent": 100.0 * math.sqrt(uphill @ covariance[1:, 1:] @ uphill),
+            # clockwise from the y axis; a level has no downhill direction
+            "downhill_deg": math.degrees(math.atan2(-east, -north)) % 360.0 if steepest else None,
+        },
     )
-    figures = fit.as_dict()
-    if not figures["tilt_percent"] <= MAX_TILT_PERCENT:
-        raise GeometryError(
-            "water.tilt",
-            f"The shoreline points are tilted by {figures['tilt_percent']:.1f} % (standard error"
-            f" {figures['sigma_tilt_percent']:.1f} %), more than {MAX_TILT_PERCENT:g} %. Check"
-            " their heights and units, or fit a level.",
-            tilt=figures["tilt_percent"] / 100.0,
-        )
-    return fit
 
 
 class _Shore(NamedTuple):
@@ -223,22 +198,19 @@ def _regression(shore: _Shore, model: Model) -> Regression:
             f" {across:.2g} m across). Fit a level, or a tilt along them.",
             points=n, least=p,
         )  # fmt: skip
-    found = robust_regression(shore.design[:, :p], shore.z)
-    grown = shared(found.weight, shore.worth, p)
-    return found._replace(covariance=grown * found.covariance)
+    return robust_regression(shore.design[:, :p], shore.z, shore.worth)
 
 
 def _chance_of_tilt(shore: _Shore, fit: Regression) -> float:
     """Return the p-value of a tilt, if the surface is level (Wald's test, F distribution)."""
     from scipy.stats import f
 
-    rise, covariance = fit.beta[1:], fit.covariance[1:, 1:]
-    spare = float(shore.worth[fit.weight > 0.0].sum()) - len(fit.beta)
-    if spare <= 0.0:
-        return 1.0
-    if fit.sigma_m < _NO_SCATTER_M:
-        return float(np.abs(rise).max() < _NO_SCATTER_M)
-    return float(f.sf(rise @ np.linalg.solve(covariance, rise) / len(rise), len(rise), spare))
+    # points without scatter have no covariance, which a micrometre of it makes invertible
+    rise, p = fit.beta[1:], len(fit.beta)
+    covariance = fit.covariance[1:, 1:] + _NO_SCATTER_M**2 * np.eye(p - 1)
+    statistic = rise @ np.linalg.solve(covariance, rise) / len(rise)
+    spare = float(shore.worth[fit.weight > 0.0].sum()) - p
+    return float(np.nan_to_num(f.sf(statistic, p - 1, spare), nan=1.0))  # NaN: no redundancy
 
 
 TUKEY = 4.685061  # Tukey's constant for 95 % efficiency
@@ -265,28 +237,32 @@ class Regression(NamedTuple):
     weight: FloatArray  # (n,), 0 (rejected) to 1
 
 
-def robust_regression(X: FloatArray, z: FloatArray) -> Regression:
+def robust_regression(X: FloatArray, z: FloatArray, worth: FloatArray) -> Regression:
     """Fit z = X beta, which some p of the observations determine.
 
-    The columns of X, shape (n, p), are of similar size; z, shape (n,), is in metres.
+    The columns of X, shape (n, p), are of similar size; z, shape (n,), is in metres, and `worth` is
+    as of `shared`.
     """
     rows = np.unique(np.linspace(0, len(z) - 1, min(len(z), SAMPLE)).astype(np.int64))
     beta = _least_median(X[rows], z[rows])
-    # a few observations are fitted too well (Rousseeuw & Leroy 1987, p. 202)
+    # the scale for Tukey's weights; few observations are fitted too well (Rousseeuw & Leroy 1987,
+    # p. 202)
     few = 1.0 + 5.0 / max(len(z) - X.shape[1], 1)
     scale = few * TO_SIGMA * float(np.median(np.abs(z - X @ beta)))
     limit = TUKEY * max(scale, LEAST_SCALE_M)
     for _ in range(_ROUNDS):
         root = np.sqrt(tukey_weight((z - X @ beta) / limit))
         better, _, rank, _ = np.linalg.lstsq(X * root[:, None], z * root, rcond=1e-10)
-        if rank < X.shape[1]:
+        if rank < X.shape[1]:  # too few weights are left to determine beta
             break
         change, beta = np.abs(X @ (better - beta)).max(), np.asarray(better, np.float64)
         if change < _CONVERGED_M:
             break
     residual = z - X @ beta
     covariance, sigma = _spread(X, residual, limit)
-    return Regression(beta, covariance, sigma, residual, tukey_weight(residual / limit))
+    weight = tukey_weight(residual / limit)
+    covariance *= shared(weight, worth, X.shape[1])
+    return Regression(beta, covariance, sigma, residual, weight)
 
 
 def shared(weight: FloatArray, worth: FloatArray, unknowns: float) -> float:
@@ -310,15 +286,17 @@ def tukey_weight(u: FloatArray) -> FloatArray:
 def _least_median(X: FloatArray, z: FloatArray) -> FloatArray:
     """Return the exact fit to p observations with the least median residual."""
     n, p = X.shape
+    # all subsets of p rows, or a random sample of them: with nearly half of the observations wrong,
+    # one of eight of three rows is right
     if math.comb(n, p) <= SUBSETS:
         rows = np.array(list(combinations(range(n), p)), np.int64).reshape(-1, p)
     else:
         drawn = np.random.default_rng(0).integers(0, n, (2 * SUBSETS, p))
         ordered = np.sort(drawn, axis=1)
         rows = ordered[(np.diff(ordered, axis=1) > 0).all(axis=1)][:SUBSETS]
-    good = rows[np.abs(np.linalg.det(X[rows])) > 1e-9]
+    good = rows[np.abs(np.linalg.det(X[rows])) > 1e-9]  # not at one place, or on one line
     fits = np.linalg.solve(X[good], z[good][..., None])[..., 0]
-    middle = min((n + p) // 2, n - 1)
+    middle = min((n + p) // 2, n - 1)  # p residuals are zero whatever the others are
     median = np.partition(np.abs(z[:, None] - X @ fits.T), middle, axis=0)[middle]
     return np.asarray(fits[np.argmin(median)])
 
@@ -372,13 +350,12 @@ class NearestPoints:
         if not len(points):
             return
         # built faster, as it has few queries
-        tree, k = (
-            cKDTree(points[:, :2], balanced_tree=False, compact_nodes=False),
-            self.rows.shape[1],
-        )
+        tree = cKDTree(points[:, :2], balanced_tree=False, compact_nodes=False)
+        k = self.rows.shape[1]
         distance, at = map(np.asarray, tree.query(self._places, k=range(1, k + 1)))
         rows = np.concatenate([self.rows, points[np.where(np.isfinite(distance), at, 0)]], axis=1)
         distance = np.hstack([self.distance_m, distance])
+        # of equal distances the lower point, whatever the chunks are
         order = np.lexsort((rows[..., 2], distance), axis=-1)[:, :k]
         self.distance_m = np.take_along_axis(distance, order, axis=1)
         self.rows = np.take_along_axis(rows, order[..., None], axis=1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeVar, get_args
+from typing import Any, NamedTuple, TypeVar
 
 from pcfix.errors import SettingError
 from pcfix.options.correct import MethodOptions
@@ -72,19 +72,11 @@ def refractive_index(
         ("wavelength", wavelength_um, WAVELENGTH_UM, "micrometres"),
     ):
         if not (math.isfinite(value) and low <= value <= high):
-            raise SettingError(
-                "option.range",
-                f"{name} {value:g} is outside {low:g} to {high:g}. Give it in {unit}.",
-                option=name,
-                value=value,
-            )
+            text = f"{name} {value:g} is outside {low:g} to {high:g}. Give it in {unit}."
+            raise SettingError("option.range", text, option=name, value=value)
     if formula not in _FORMULAS:
-        raise SettingError(
-            "option.choice",
-            f"The index formula '{formula}' is unknown. Use {' or '.join(get_args(IndexFormula))}.",
-            option="index_formula",
-            value=formula,
-        )
+        text = f"The index formula '{formula}' is unknown. Use {' or '.join(_FORMULAS)}."
+        raise SettingError("option.choice", text, option="index_formula", value=formula)
     return _FORMULAS[formula](float(salinity), float(temperature_c), float(wavelength_um))
 
 
@@ -120,7 +112,7 @@ def with_index(options: Options) -> Options:
     ``option.exclusive`` if both are given.
     """
     own = {name: getattr(options, name, None) for name in Water._fields}
-    given = {name: value for name, value in own.items() if value is not None}
+    given: dict[str, Any] = {name: value for name, value in own.items() if value is not None}
     if given and options.index is not None:
         raise SettingError(
             "option.exclusive",
@@ -129,8 +121,9 @@ def with_index(options: Options) -> Options:
         )
     water = Water(**given) if given else None
     number, origin = index_of(options.index, options.index_formula, water)
-    silent: dict[str, Any] = dict.fromkeys(given)
-    return replace(options, index=number, index_from=origin or options.index_from, **silent)
+    # the number replaces the properties
+    given.update(dict.fromkeys(given), index=number, index_from=origin or options.index_from)
+    return replace(options, **given)
 
 
 def index_of(

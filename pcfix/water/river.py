@@ -40,30 +40,13 @@ Bounds = tuple[float, float, float, float]
 class RiverFit(ShoreFit):
     """A water surface along a river, and its accuracy."""
 
-    axis: Axis  # downstream
-    profile: Profile  # height along the axis, by its station
-
-    def height_at(self, xy: FloatArray) -> FloatArray:
-        """Return the height (m) of the surface at places (m, 2)."""
-        return self.profile.height_at(self.axis.locate(xy)[0])
+    axis: FloatArray  # (a, 2), vertices of the line along the river, downstream
+    profile: Profile  # height along the axis
 
     def sigma_at(self, xy: FloatArray) -> FloatArray:
-        """Return the standard error (m) of that height."""
-        station, sigma = self.profile.station_m, self.profile.sigma_height_m
-        return np.interp(self.axis.locate(xy)[0], station, sigma)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the figures as plain values."""
-        heights = self.profile.height_m
-        return {
-            "model": "river",
-            "length_m": float(np.ptp(self.profile.station_m)),
-            "width_m": self.axis.width_m,
-            "upper_level_m": float(heights[0]),
-            "drop_m": float(heights[0] - heights[-1]),
-            "sigma_level_m": float(self.profile.sigma_height_m.mean()),
-            **super().as_dict(),
-        }
+        """Return the standard error (m) of the height at places (m, 2)."""
+        station = locate(self.axis, xy)[0]
+        return np.interp(station, self.profile.station_m, self.profile.sigma_height_m)
 
 
 def fit_river(
@@ -87,37 +70,44 @@ def fit_river(
             f" different places, and there are {len(known)}. Fit a plane or a level.",
             points=len(known), least=FEWEST,
         )  # fmt: skip
-    axis = flow_axis(used[:, :2])
-    station, _ = axis.locate(used[:, :2])
+    axis, width_m = flow_axis(used[:, :2])
+    station, _ = locate(axis, used[:, :2])
     upper = station <= np.median(station)
-    if not upper.all() and np.median(used[upper, 2]) < np.median(used[~upper, 2]):
-        axis = Axis(axis.xy[::-1].copy(), axis.width_m)  # downstream
-        station, _ = axis.locate(used[:, :2])
+    if np.median(used[upper, 2]) < np.median(used[~upper, 2]):
+        axis = axis[::-1].copy()  # downstream
+        station, _ = locate(axis, used[:, :2])
     order = np.lexsort((used[:, 2], station))
     known, station, z = known[order], station[order], used[order, 2]
     worth = np.ones(len(known)) if counts is None else np.asarray(counts, np.float64)[known]
     profile = _fit_profile(station, z, worth)
-    notes = [
-        f"Beyond the outermost points the surface is constant: {profile.height_m[0]:.2f} m upstream"
-        f" and {profile.height_m[-1]:.2f} m downstream."
-    ]
-    if len(known) < len(points):
-        notes.append(f"{len(points) - len(known)} points have no height and are ignored.")
+    upper_m, lower_m = profile.height_m[[0, -1]].tolist()
+    note = (
+        f"Beyond the outermost points the surface is constant: {upper_m:.2f} m upstream and"
+        f" {lower_m:.2f} m downstream."
+    )
     residual, weight = np.full(len(points), np.nan), np.zeros(len(points))
     residual[known], weight[known] = profile.residual_m, profile.weight
     return RiverFit(
         surface=_raster(axis, profile, bounds, name),
         points=points,
-        notes=tuple(notes),
-        axis=axis,
-        profile=profile,
+        notes=(note,),
         residual_m=residual,
         weight=weight,
         sigma_m=profile.sigma_m,
+        axis=axis,
+        profile=profile,
+        figures={
+            "model": "river",
+            "length_m": float(np.ptp(profile.station_m)),
+            "width_m": width_m,
+            "upper_level_m": upper_m,
+            "drop_m": upper_m - lower_m,
+            "sigma_level_m": float(profile.sigma_height_m.mean()),
+        },
     )
 
 
-def _raster(axis: Axis, profile: Profile, bounds: Bounds, name: str) -> WaterRaster:
+def _raster(axis: FloatArray, profile: Profile, bounds: Bounds, name: str) -> WaterRaster:
     """Return the surface over the bounds, whose corners are centres of cells.
 
     Cross-sections would intersect on the inside of a bend; a raster does not fold.
@@ -131,7 +121,7 @@ def _raster(axis: Axis, profile: Profile, bounds: Bounds, name: str) -> WaterRas
     columns, rows = (int(np.ceil(side / cell)) + 1 for side in (right - left, top - bottom))
     x, y = left + cell * np.arange(columns), bottom + cell * np.arange(rows)[::-1]
     xy = np.column_stack([np.tile(x, rows), np.repeat(y, columns)])
-    height = profile.height_at(axis.locate(xy)[0]).reshape(rows, columns)
+    height = profile.height_at(locate(axis, xy)[0]).reshape(rows, columns)
     return WaterRaster(height, left - cell / 2.0, y[0] + cell / 2.0, (cell, cell), name)
 
 
@@ -139,39 +129,35 @@ REACH = 2.0  # longest edge of the network, relative to the longest that keeps i
 _ROUNDS, _NODES = 10, 300
 
 
-@dataclass(frozen=True, eq=False)
-class Axis:
-    """A line along a river."""
+def locate(line_xy: FloatArray, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the distance along a line of places (n, 2), and their distance from it, m."""
+    import shapely
 
-    xy: FloatArray  # (m, 2), its vertices, metres, world frame
-    width_m: float  # twice the rms distance of the points from it
-
-    def locate(self, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the distance along the line of places (n, 2), and their distance from it, m."""
-        import shapely
-
-        line, places = shapely.linestrings(self.xy), shapely.points(xy)
-        return shapely.line_locate_point(line, places), shapely.distance(line, places)
+    line, places = shapely.linestrings(line_xy), shapely.points(xy)
+    return shapely.line_locate_point(line, places), shapely.distance(line, places)
 
 
-def flow_axis(xy: FloatArray) -> Axis:
-    """Return the axis of a river from points (n, 2) on its banks, metres."""
+def flow_axis(xy: FloatArray) -> tuple[FloatArray, float]:
+    """Return the axis of a river, and its width, from points (n, 2) on its banks, metres.
+
+    The width is twice the rms distance of the points from the axis, (a, 2).
+    """
     origin = xy.mean(axis=0)
     places = xy - origin
     net = np.unique(places, axis=0)
     nodes = _smoothed(net, *_stations(net))
     for _ in range(_ROUNDS):
-        station, away = Axis(nodes, 0.0).locate(places)
+        station, away = locate(nodes, places)
         gap = float(np.quantile(np.diff(np.sort(station)), 0.9))  # one in ten is wider
         bandwidth = max(2.0 * float(np.sqrt(np.mean(away**2))), gap, 1e-3)
         nodes = _smoothed(places, station, bandwidth)
-    _, away = Axis(nodes, 0.0).locate(places)
+    _, away = locate(nodes, places)
     # longer at both ends, so that the outermost points have feet on the line
     outward = nodes[[0, -1]] - nodes[[1, -2]]
     outward /= np.maximum(np.hypot(*outward.T), 1e-9)[:, None]
     first, last = nodes[[0, -1]] + 2.0 * bandwidth * outward
     width = 2.0 * float(np.sqrt(np.mean(away**2)))
-    return Axis(np.vstack([first, nodes, last]) + origin, width)
+    return np.vstack([first, nodes, last]) + origin, width
 
 
 def _stations(xy: FloatArray) -> tuple[FloatArray, float]:
@@ -189,10 +175,12 @@ def _stations(xy: FloatArray) -> tuple[FloatArray, float]:
     reach = REACH * float(tree.data.max())
     near = length <= reach
     net = csr_array((length[near], edges[:, near]), shape=shape)
+    # the place farthest from any one is an end of the river, and the farthest from that the other
     start = np.argmax(dijkstra(net, directed=False, indices=np.array([0])), axis=1)
     from_start = dijkstra(net, directed=False, indices=start)[0]
     end = np.array([np.argmax(from_start)])
     from_end = dijkstra(net, directed=False, indices=end)[0]
+    # both banks agree: half of the way from one end plus what is left to the other
     return (from_start + from_start[end] - from_end) / 2.0, reach
 
 
@@ -204,6 +192,8 @@ def _smoothed(xy: FloatArray, station: FloatArray, bandwidth: float) -> FloatArr
     from_node = station[None] - at[:, None]
     weight = np.exp(-0.5 * (from_node / bandwidth) ** 2)
     s0, s1, s2 = (np.sum(weight * from_node**k, axis=1) for k in range(3))
+    # weights of the intercept of a line through the neighbours; where they are at one station, of
+    # their mean
     local = weight * (s2[:, None] - s1[:, None] * from_node)
     size = s0 * s2 - s1**2
     flat = size <= 1e-9 * s0**2 * bandwidth**2
@@ -258,6 +248,8 @@ def _fit_profile(station: FloatArray, z: FloatArray, worth: FloatArray) -> Profi
     limit = TUKEY * max(TO_SIGMA * float(np.median(missed, axis=1).min()), LEAST_SCALE_M)
     best = PENALTIES[int(np.argmin((np.minimum(missed, limit) ** 2).mean(axis=1)))]
     height, weight, band = _solve(station, z, nodes, best)
+    # the covariance of the heights over the variance of a point; its trace on the points counts the
+    # unknowns that they determine
     inverse = solveh_banded(band, np.eye(len(nodes)), lower=True)
     splines = _splines(station, nodes)
     variance = splines.multiply(splines @ inverse).sum(axis=1)

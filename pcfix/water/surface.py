@@ -36,16 +36,11 @@ class FoundSurface:
     """A water surface that was given; its subclasses are fitted, or found in a cloud."""
 
     surface: WaterSurface
-    points: FloatArray | None = None  # (n, 3), shoreline points, metres, the cloud's CRS
     notes: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any] | None:
         """Return the figures of a fit as plain values; None without a fit."""
         return None
-
-    def height_at(self, xy: FloatArray) -> FloatArray:
-        """Return the height (m) of the surface at places (m, 2); NaN where it is unknown."""
-        return surface_above(self.surface, np.column_stack([xy, xy[:, :1]])).height_m
 
     def sigma_at(self, xy: FloatArray) -> FloatArray | None:
         """Return the standard error (m) of the height at places (m, 2), if there is a fit."""
@@ -153,11 +148,13 @@ def height_at(field: Field, x: float, y: float) -> tuple[float, float, float]:
     """
     k, shape, frame = field.which, field.shape, field.frame
     first, rows, columns = shape[k, 0], shape[k, 1], shape[k, 2]
+    # columns east and rows south of the upper left centre; the comparison refuses NaN too
     u, v = (x - frame[k, 0]) / frame[k, 2], (frame[k, 1] - y) / frame[k, 3]
     if not (-0.5 <= u <= columns - 0.5 and -0.5 <= v <= rows - 0.5):
         return np.nan, 0.0, 0.0
     column = min(max(int(np.floor(u)), 0), columns - 2)
     row = min(max(int(np.floor(v)), 0), rows - 2)
+    # the patch between the centres `at`, east and south of it, and the place in it
     at, s, t = first + row * columns + column, u - column, v - row
     z = field.heights[at]
     east, south = field.heights[at + 1] - z, field.heights[at + columns] - z
@@ -204,6 +201,7 @@ def build_tin(mesh: WaterMesh) -> Tin:
         text = f"{mesh.name}: the water surface has no facet with an area in plan. Export it again."
         raise GeometryError("water.mesh", text, path=mesh.name)
     xyz, normal = xyz[flat], normal[flat]
+    # normal . (x - corner) = 0, solved for z
     slope = -normal[:, :2] / normal[:, 2:]
     a = xyz[:, 0, 2] - (slope * xyz[:, 0, :2]).sum(axis=1)
     corners = np.ascontiguousarray(xyz[:, :, :2])
@@ -217,19 +215,21 @@ def _index_cells(corners: FloatArray) -> tuple[float, int, int, IntArray, IntArr
     cell = float(max(np.sqrt(extent.prod() / len(corners)), extent.max() / 4096, 1e-6))
     columns, rows = (np.floor(extent / cell).astype(int) + 1).tolist()
     low = np.floor(corners.min(axis=1) / cell).astype(np.int64)
-    high = np.floor(corners.max(axis=1) / cell).astype(np.int64)
-    width, height = (high - low + 1).T
-    facet = np.repeat(np.arange(len(corners)), width * height)
-    # number of each cell within the bounding box of its facet
-    within = np.arange(len(facet)) - np.repeat(
-        np.cumsum(width * height) - width * height, width * height
-    )
-    column = low[facet, 0] + within % width[facet]
-    row = low[facet, 1] + within // width[facet]
-    code = row * columns + column
+    width, height = (np.floor(corners.max(axis=1) / cell).astype(np.int64) - low + 1).T
+    # a row for each cell of each facet's bounding box, and which of these it is
+    size = width * height
+    facet = np.repeat(np.arange(len(corners)), size)
+    within = np.arange(len(facet)) - np.repeat(np.cumsum(size) - size, size)
+    code = (low[facet, 1] + within // width[facet]) * columns
+    code += low[facet, 0] + within % width[facet]
     order = np.argsort(code, kind="stable")
-    start = np.searchsorted(code[order], np.arange(rows * columns + 1))
-    return cell, columns, rows, start.astype(np.int64), facet[order].astype(np.int64)
+    return (
+        cell,
+        columns,
+        rows,
+        np.searchsorted(code[order], np.arange(rows * columns + 1)),
+        facet[order],
+    )
 
 
 @device
@@ -242,21 +242,16 @@ def locate(tin: Tin, x: float, y: float) -> int:
     cell = row * tin.columns + column
     for k in range(tin.cell_start[cell], tin.cell_start[cell + 1]):
         facet = tin.cell_facet[k]
-        if _inside(tin.corners[facet], u, v):
+        corners = tin.corners[facet]
+        ax, ay = corners[1, 0] - corners[0, 0], corners[1, 1] - corners[0, 1]
+        bx, by = corners[2, 0] - corners[0, 0], corners[2, 1] - corners[0, 1]
+        px, py = u - corners[0, 0], v - corners[0, 1]
+        # the place is the first corner + s a + t b
+        area = ax * by - ay * bx
+        s, t = (px * by - py * bx) / area, (ax * py - ay * px) / area
+        if s >= -EDGE_TOLERANCE and t >= -EDGE_TOLERANCE and s + t <= 1.0 + EDGE_TOLERANCE:
             return int(facet)
     return -1
-
-
-@device
-def _inside(corners: FloatArray, u: float, v: float) -> bool:
-    """Whether a plan position is in a triangle, edges included."""
-    ax, ay = corners[1, 0] - corners[0, 0], corners[1, 1] - corners[0, 1]
-    bx, by = corners[2, 0] - corners[0, 0], corners[2, 1] - corners[0, 1]
-    px, py = u - corners[0, 0], v - corners[0, 1]
-    area = ax * by - ay * bx
-    s = (px * by - py * bx) / area
-    t = (ax * py - ay * px) / area
-    return bool(s >= -EDGE_TOLERANCE and t >= -EDGE_TOLERANCE and s + t <= 1.0 + EDGE_TOLERANCE)
 
 
 @device

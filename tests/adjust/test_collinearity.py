@@ -16,9 +16,10 @@ from pcfix.adjust.collinearity import (
     workspace,
 )
 from pcfix.adjust.parameters import CODES, PLANES, PORT, SHAPE, Unknowns, moved_lens
-from pcfix.adjust.problem import port_of, port_row, prepare
-from pcfix.lens.imaging import coefficients
+from pcfix.adjust.problem import port_of, prepare
+from pcfix.lens.formulas import coefficients
 from pcfix.model import Cameras, Lens, TiePoints, Views, WaterPlane
+from pcfix.port.light import window_of
 from pcfix.port.shapes import DomePort, FlatPort
 from tests.utils.compiled import compiled
 
@@ -65,7 +66,7 @@ def pose(seed: int):
 
 def state_of(q, centre, rotation, lens, water, port=None):
     numbers = np.pad(np.asarray(water, float), (0, PLANES - len(water)))
-    port = port_row(port_of(SimpleNamespace(port=port), numbers))
+    port = window_of(port_of(SimpleNamespace(port=port), numbers))
     return State(centre[None], rotation[None], lens[None], q[None], numbers, port)
 
 

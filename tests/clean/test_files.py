@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.errors import InputError, SettingError
 from pcfix.flow.clean import clean_file
 from pcfix.io.las.source import read_xyz
 from pcfix.options.steps import CleanRules
@@ -25,7 +24,6 @@ from tests.utils.clouds import (
     write_las,
 )
 from tests.utils.codes import refused
-from tests.utils.program import run_pcfix
 
 MANY = {"deviations": 0.5, "fences": 0.2}
 """On a cloud of white noise, a third of the points."""
@@ -41,18 +39,13 @@ def _before(raw: RawLas) -> np.ndarray:
 def _assert_nothing_lost(before: RawLas, after: RawLas, noise: np.ndarray) -> None:
     """All is as it was but for class and withheld flag of the noise."""
     old, new = fields(before), fields(after)
-    assert set(old) <= set(new)
+    old["class"] = np.where(noise, 7, old["class"])
+    old["withheld"] = np.where(noise, 1, old["withheld"])
+    if before.point_format < 6:
+        old["angle"] = np.rint(old["angle"] / 0.006)
     for name, values in old.items():
-        if name == "angle" and before.point_format < 6:
-            values = np.rint(values / 0.006)
-        expected = values.copy()
-        if name == "class":
-            expected[noise] = 7
-        elif name == "withheld":
-            expected[noise] = 1
-        assert np.array_equal(new[name], expected), name
-    assert after.scales == before.scales
-    assert after.offsets == before.offsets
+        assert np.array_equal(new[name], values), name
+    assert (after.scales, after.offsets) == (before.scales, before.offsets)
     records = [r for r in after.foreign() if r.kind != OURS]
     foreign_records = [r for r in records if r in before.foreign()]
     assert foreign_records == before.foreign()
@@ -144,18 +137,6 @@ def test_restore_after_cleaning(tmp_path: Path) -> None:
     assert (tmp_path / "c.las").read_bytes() == (tmp_path / "a.las").read_bytes()
 
 
-def test_command(tmp_path: Path) -> None:
-    s = spoilt_scene(20_000, 100)
-    source = write_las(tmp_path / "in.laz", s.xyz, crs=None)
-    words = [str(source), str(tmp_path / "out.laz"), "--water", str(s.water_level_m)]
-    done = run_pcfix("clean", *words, "--summary", tmp_path / "s.json")
-    assert done.returncode == 0, done.stderr
-    recorded = json.loads((tmp_path / "s.json").read_text())
-    assert f"{recorded['noise']:,}" in done.stdout
-    assert recorded["settings"]["neighbours"] == 20
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["in.laz", "out.laz", "s.json"]
-
-
 def test_refused_files(tmp_path: Path) -> None:
     s = spoilt_scene(20_000, 100)
     good = write_las(tmp_path / "good.las", s.xyz, crs=None)
@@ -164,7 +145,6 @@ def test_refused_files(tmp_path: Path) -> None:
     las.classification[:] = 18
     las.write(tmp_path / "noise.las")
     (tmp_path / "cut.las").write_bytes(good.read_bytes()[:-500])
-    (tmp_path / "there.las").write_bytes(b"work")
     before = sorted(p.name for p in tmp_path.iterdir())
     out = tmp_path / "out.las"
     with refused("cloud.too_few_points", points=5):
@@ -173,16 +153,8 @@ def test_refused_files(tmp_path: Path) -> None:
         clean_file(tmp_path / "noise.las", out)
     with refused("water.below_cloud"):
         clean_file(good, out, water=-500.0)
-    for kind, files, options in [
-        (InputError, (tmp_path / "nowhere.las", out), {}),
-        (InputError, (tmp_path / "cut.las", out), {}),
-        (InputError, (good, out), {"water": "dim:Level"}),
-        (SettingError, (good, good), {"overwrite": True}),
-        (SettingError, (good, tmp_path / "there.las"), {}),
-        (SettingError, (good, tmp_path / "out.txt"), {}),
-        (SettingError, (good, out), {"jobs": 0}),
-    ]:
-        with pytest.raises(kind):
-            clean_file(*files, **options)
+    with refused("cloud.damaged"):
+        clean_file(tmp_path / "cut.las", out)
+    with refused("cloud.no_dimension"):
+        clean_file(good, out, water="dim:Level")
     assert sorted(p.name for p in tmp_path.iterdir()) == before
-    assert (tmp_path / "there.las").read_bytes() == b"work"

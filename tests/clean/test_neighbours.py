@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from pcfix.clean.neighbours import Neighbours, make_tiles
-from pcfix.clean.points import Reason
 from pcfix.libraries import load_open3d
 from pcfix.options.steps import CleanRules
 from tests.clean.scenes import reasons_of, spoilt_scene
@@ -44,18 +43,6 @@ def test_neighbours_of_all_pairs() -> None:
                 far = np.linalg.norm(difference, axis=2)
                 np.testing.assert_allclose(far, found[cut.row[piece]], rtol=1e-12)
             np.testing.assert_allclose(found, twin, rtol=1e-12)
-
-
-@pytest.mark.parametrize("points", mostly_nightly([100, 1000, 5000], 100))
-def test_tiles_do_not_matter(points: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    s = spoilt_scene(FEW, OUTLIERS)
-    settings = CleanRules(deviations=2.0, radius=1.0)
-    whole = reasons_of(s.xyz, water=s.water_level_m, rules=settings)
-    monkeypatch.setattr("pcfix.clean.neighbours.POINTS_PER_TILE", points)
-    cut = reasons_of(s.xyz, water=s.water_level_m, rules=settings)
-    assert np.array_equal(cut, whole)
-    for reason in (Reason.STATISTICAL, Reason.RADIUS, Reason.BELOW_BED, Reason.FLOATING):
-        assert (whole & reason).any()
 
 
 OPEN3D = [

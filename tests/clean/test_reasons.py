@@ -1,24 +1,11 @@
 """Noise that is found, terrain that is spared, and input that is refused."""
 
 import numpy as np
-import pytest
 
 from pcfix.clean.points import Reason
-from pcfix.errors import SettingError
 from pcfix.options.steps import CleanRules
 from tests.clean.scenes import reasons_of, spoilt_scene
-
-
-def _scene_reasons(settings: CleanRules | None = None) -> np.ndarray:
-    s = spoilt_scene()
-    return reasons_of(
-        s.xyz,
-        water=s.water_level_m,
-        RayCount=s.ray_count,
-        RayMiss=s.ray_miss_m,
-        Incidence=s.incidence_deg,
-        rules=settings,
-    )
+from tests.utils.codes import refused
 
 
 def test_outliers_found() -> None:
@@ -29,7 +16,9 @@ def test_outliers_found() -> None:
     some have another outlier near: a twentieth again. The fences leave one in some 10,000 points
     of a normal distribution outside, the floors nearly all of these inside.
     """
-    s, reasons = spoilt_scene(), _scene_reasons()
+    s = spoilt_scene()
+    rays = {"RayCount": s.ray_count, "RayMiss": s.ray_miss_m, "Incidence": s.incidence_deg}
+    reasons = reasons_of(s.xyz, water=s.water_level_m, **rays)
     assert (reasons[s.below] & Reason.BELOW_BED > 0).mean() > 0.95
     assert (reasons[s.floating] & Reason.FLOATING > 0).mean() > 0.95
     assert (reasons[s.air] & Reason.STATISTICAL > 0).mean() > 0.95
@@ -76,19 +65,7 @@ def test_weak_intersections() -> None:
     ]
 
 
-ALL_OFF = {"deviations", "min_rays", "max_ray_miss", "max_incidence", "below", "floating"}
-
-
-@pytest.mark.parametrize(
-    "choice",
-    [
-        {"neighbours": 5}, {"neighbours": 20.5}, {"deviations": 0.0}, {"deviations": np.nan},
-        {"radius": -1.0}, {"radius_neighbours": 0}, {"min_rays": 1}, {"max_ray_miss": np.inf},
-        {"max_incidence": 91.0}, {"bed_neighbours": 501}, {"fences": 0.0}, {"below": "deep"},
-        {"floating": -0.1}, dict.fromkeys(sorted(ALL_OFF)),
-    ],
-    ids=str,
-)  # fmt: skip
-def test_settings_refused(choice: dict) -> None:
-    with pytest.raises(SettingError):
-        CleanRules(**choice)
+def test_all_tests_off() -> None:
+    names = {"deviations", "min_rays", "max_ray_miss", "max_incidence", "below", "floating"}
+    with refused("option.no_test"):
+        CleanRules(**dict.fromkeys(names))

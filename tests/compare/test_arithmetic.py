@@ -22,23 +22,14 @@ def scattered(count, seed, side_m=40.0):
     return np.column_stack([xy[:, 0] + EAST_M, xy[:, 1] + NORTH_M, z])
 
 
-def lifted(xyz, by_m):
-    return xyz + np.array([0.0, 0.0, by_m])
-
-
-def tilted_grid(side=30, step_m=0.5):
-    """Return a grid on the plane z = 2 + 0.1 x - 0.2 y (x, y from the grid's corner)."""
-    x, y = (a.ravel() * step_m for a in np.meshgrid(np.arange(side), np.arange(side)))
-    return np.column_stack([x + EAST_M, y + NORTH_M, 2.0 + 0.1 * x - 0.2 * y])
-
-
 def test_nearest_height_without_plane():
     """Neighbours on a line, places far outside, and coincident points."""
     line = np.column_stack([np.arange(20.0), np.zeros(20), np.arange(20.0)])
-    outside = np.array([[EAST_M - 30.0, NORTH_M]])
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(9.0), np.arange(9.0)))
+    grid = np.column_stack([x, y, 2.0 + 0.1 * x - 0.2 * y])
     for xy, surface, expected in (
         (np.array([[3.2, 0.1], [7.9, 0.3]]), line, [3.0, 8.0]),
-        (outside, tilted_grid(), [2.0]),  # the corner
+        (np.array([[-30.0, 0.0]]), grid, [2.0]),  # the corner
         (np.zeros((3, 2)), np.tile([0.0, 0.0, 7.0], (8, 1)), [7.0] * 3),
     ):
         assert heights_at(xy, surface, 8).tolist() == expected
@@ -92,7 +83,8 @@ def test_bins():
 def test_section():
     cloud = scattered(4000, 16)
     line = parse_line(f"{EAST_M + 5},{NORTH_M + 5},{EAST_M + 35},{NORTH_M + 25}")
-    section = section_along(line, {"corrected": cloud, "reference": lifted(cloud, 1.5)}, 2.0)
+    layers = {"corrected": cloud, "reference": np.add(cloud, (0, 0, 1.5))}
+    section = section_along(line, layers, 2.0)
     east, north = 30.0 / math.hypot(30, 20), 20.0 / math.hypot(30, 20)
     for station in (3, 10, 20):
         s = section.distance_m[station]

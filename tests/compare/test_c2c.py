@@ -21,21 +21,18 @@ BANDS = [(0.6, 1.0), (3.0, 6.0)]
 """Those of which Skarlatos & Agrafiotis 2018 give the share, at Amathounta and at Agia Napa."""
 
 
-def words(*names):
-    return {"cameras": SCENE / "cameras.csv", "water": 0.37, **dict(names)}
-
-
 @pytest.fixture(scope="module")
 def corrected(tmp_path_factory):
     path = tmp_path_factory.mktemp("c2c") / "corrected.laz"
-    pcfix.correct_file(SCENE / "cloud.laz", path, **words())
+    pcfix.correct_file(SCENE / "cloud.laz", path, cameras=SCENE / "cameras.csv", water=0.37)
     return path
 
 
 @pytest.fixture(scope="module")
 def other(tmp_path_factory):
     path = tmp_path_factory.mktemp("c2c") / "other.laz"
-    pcfix.correct_file(SCENE / "cloud.laz", path, **words(("method", "dietrich")))
+    given = {"cameras": SCENE / "cameras.csv", "water": 0.37, "method": "dietrich"}
+    pcfix.correct_file(SCENE / "cloud.laz", path, **given)
     return path
 
 

@@ -10,13 +10,13 @@ import warnings
 import laspy
 import numpy as np
 import pytest
-import rasterio
 from pyproj import CRS
 
 import pcfix
 from pcfix.flow.compare import compare_clouds
 from tests.utils.clouds import write_las
 from tests.utils.codes import refused
+from tests.utils.rasters import write_raster
 from tests.utils.shared import SCENE
 
 LIDAR = SCENE / "lidar.laz"
@@ -159,12 +159,8 @@ def test_raster(tmp_path):
     y = NORTH_M + side * step - (np.arange(side) + 0.5) * step
     height = -2.0 - 0.05 * (x[np.newaxis] - EAST_M) + 0.02 * (y[:, np.newaxis] - NORTH_M)
     height[:5, :5] = -9999.0
-    with rasterio.open(
-        tmp_path / "ref.tif", "w", driver="GTiff", width=side, height=side, count=1,
-        dtype="float64", nodata=-9999.0, crs="EPSG:32633",
-        transform=rasterio.transform.from_origin(EAST_M, NORTH_M + side * step, step, step),
-    ) as grid:  # fmt: skip
-        grid.write(height, 1)
+    corner = EAST_M, NORTH_M + side * step
+    write_raster(tmp_path / "ref.tif", height, *corner, step, nodata=-9999.0, crs="EPSG:32633")
     rng = np.random.default_rng(11)
     u, v = rng.uniform(2.0, 40.0, (2, 5000))
     xyz = np.column_stack([u + EAST_M, v + NORTH_M, -2.0 - 0.05 * u + 0.02 * v + 0.25])

@@ -1,7 +1,4 @@
-"""Figures do not depend on tiles, blocks, threads and arrays on disk.
-
-They are compared with brute force, or NumPy over the whole array.
-"""
+"""Figures do not depend on tiles, blocks, threads and arrays on disk."""
 
 import json
 
@@ -10,7 +7,6 @@ import pytest
 
 from pcfix import running
 from pcfix.clean import neighbours
-from pcfix.clean.neighbours import nearest_distance
 from pcfix.compare import m3c2
 from pcfix.errors import InputError
 from pcfix.flow.compare import compare_clouds
@@ -32,38 +28,6 @@ def bed(count, seed, lift_m=0.0):
     xy = rng.uniform((0.0, 0.0), (40.0, 60.0), (count, 2))
     z = np.sin(xy[:, 0] / 6.0) + rng.normal(0.0, 0.03, count) + lift_m - 4.0
     return np.round(np.column_stack([xy + np.array([500_000.0, 5_000_000.0]), z]), 3)
-
-
-def least_distances(cloud, reference):
-    difference = cloud[:, None] - reference
-    return np.sqrt((difference**2)[..., 0] + (difference**2)[..., 1] + (difference**2)[..., 2]).min(
-        axis=1
-    )
-
-
-def clustered(seed):
-    """Return islands far apart, so that a nearest point lies several tiles away."""
-    rng = np.random.default_rng(seed)
-    middles = rng.uniform(0.0, 900.0, (9, 3))
-    return np.round(middles[rng.integers(0, 9, 1500)] + rng.normal(0.0, 2.0, (1500, 3)), 3)
-
-
-def lattice(seed):
-    """Return points on the very borders of tiles, equally far from several others."""
-    some = np.array(list(np.ndindex(40, 40, 1)), float)
-    return some + 0.5 * (seed % 2) * np.array([1.0, 1.0, 0.0])
-
-
-@pytest.mark.parametrize("make", [clustered, lattice, lambda seed: bed(1500, seed, seed % 2 * 30)])
-def test_distances(make, monkeypatch):
-    cloud, reference = make(1), make(2)
-    expected = least_distances(cloud, reference)
-    whole = nearest_distance(cloud, reference)
-    np.testing.assert_array_equal(whole, expected)
-    for points, jobs in ((60, None), (200, 1), (700, 2)):
-        in_small_tiles(monkeypatch, points, rows=350)
-        with threads(jobs):
-            np.testing.assert_array_equal(nearest_distance(cloud, reference), expected)
 
 
 def figures(folder, name):

@@ -18,7 +18,6 @@ from tests.utils.clouds import (
     fields,
     read_raw,
     write_cloud,
-    write_las,
 )
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
@@ -153,29 +152,13 @@ def test_corrects_what_is_labelled(path, tmp_path, mask, choices):
     np.testing.assert_array_equal(out.xyz[~submerged], las.xyz[~submerged])
 
 
-def test_separate_pools(tmp_path):
-    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(0, 60, 0.5), np.arange(0, 40, 0.5)))
-    pit = np.hypot(x - 50, y - 20) < 3
-    z = np.where((x < 30) | pit, -1.0, 1.0)
-    write_las(tmp_path / "in.las", np.column_stack([EAST_M + x, NORTH_M + y, z]), crs=None)
-    found = label_file(tmp_path / "in.las", tmp_path / "out.las", water=0, connected=True)
-    separate = found.labelling["separate"]
-    assert (separate["pools"], separate["points"]) == (1, pit.sum())
-    wet = np.asarray(laspy.read(tmp_path / "out.las").classification) == 40
-    np.testing.assert_array_equal(wet, x < 30)
-    every = label_file(tmp_path / "in.las", tmp_path / "all.las", water=0)
-    assert every.labelling is None and every.submerged == ((x < 30) | pit).sum()
-
-
-@pytest.mark.parametrize(
-    ("area", "code"),
-    [
-        (shapely.Point(EAST_M, NORTH_M), "mask.no_area"),
-        (shapely.box(10, 20, 30, 40), "mask.no_points"),
-    ],
-)
-def test_masks_refused(path, tmp_path, area, code):
-    bad = write_area(tmp_path / "mask.geojson", area)
-    with refused(code):
-        label_file(path, tmp_path / "out.las", water=WATER_M, water_mask=bad)
+def test_masks_refused(path, tmp_path):
+    elsewhere = {"bounds": (10.0, 20.0, 30.0, 40.0)}
+    for area, code, values in (
+        (shapely.Point(EAST_M, NORTH_M), "mask.no_area", {}),
+        (shapely.box(10, 20, 30, 40), "mask.no_points", elsewhere),
+    ):
+        bad = write_area(tmp_path / "mask.geojson", area)
+        with refused(code, **values):
+            label_file(path, tmp_path / "out.las", water=WATER_M, water_mask=bad)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.las", "mask.geojson"]

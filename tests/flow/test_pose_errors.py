@@ -127,9 +127,6 @@ def test_same_as_twin(moved):
     np.testing.assert_allclose(np.sqrt(found), np.sqrt(wanted), rtol=0.01)
 
 
-"""Most of an error is common to a bed, so that it lies within its bounds whole, or not at all."""
-
-
 def members_of(cameras, sigma_m):
     """Return members in which the block stands higher or lower as a whole."""
     up = np.array([-1.0, 1.0])[:, None, None] * np.array([0.0, 0.0, sigma_m])

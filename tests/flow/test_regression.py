@@ -71,18 +71,6 @@ def test_known_line(tmp_path):
     assert 0.1 < found.shallowest_m < found.deepest_m < 5.0
 
 
-def test_leave_one_out():
-    rng = np.random.default_rng(7)
-    x = rng.uniform(0.2, 5.0, 12)
-    y = A + B * x + rng.normal(0, 0.2, 12)
-    missed = []
-    for i in range(12):
-        keep = np.arange(12) != i
-        slope, intercept = np.polyfit(x[keep], y[keep], 1)
-        missed.append(y[i] - intercept - slope * x[i])
-    assert fit_depths(x, y).cv_rmse_m == pytest.approx(math.sqrt(np.mean(np.square(missed))), 1e-9)
-
-
 def test_definitions():
     rng = np.random.default_rng(8)
     x = rng.uniform(0.2, 5.0, 15)
@@ -97,6 +85,11 @@ def test_definitions():
     assert found.covariance_m == pytest.approx(covariance[0, 1], rel=1e-9)
     assert found.rmse_m == pytest.approx(math.sqrt(squares / 15), rel=1e-9)
     assert found.r2 == pytest.approx(1.0 - squares / ((y - y.mean()) ** 2).sum(), rel=1e-9)
+    missed = []  # each one, by the line of the others
+    for i in range(15):
+        slope, intercept = np.polyfit(np.delete(x, i), np.delete(y, i), 1)
+        missed.append(y[i] - intercept - slope * x[i])
+    assert found.cv_rmse_m == pytest.approx(math.sqrt(np.mean(np.square(missed))), 1e-9)
 
 
 def test_heights(tmp_path):
@@ -143,39 +136,22 @@ def test_check_depths_off_the_cloud(tmp_path):
     assert "line 5" in str(found.notes[0])
 
 
-def sorted_places():
-    xy = places(10)
+def test_depths_refused(tmp_path):
+    xy, far, flat = places(10), places(5), cloud()
     xy[:, 0] = np.sort(xy[:, 0])
-    return xy
-
-
-@pytest.mark.parametrize(
-    ("depths", "column", "code"),
-    [
-        (lambda xy: np.full(len(xy), 3.0) + np.arange(len(xy)) % 2, "depth", "low_r2"),
-        (lambda xy: 9.0 - true_at(xy), "depth", "falling"),
-        (lambda xy: np.full(len(xy), 12.5), "z", "above_water"),
-    ],
-)
-def test_depths_refused(tmp_path, depths, column, code):
-    xy = sorted_places()
-    with refused(f"check_depths.{code}") as error:
-        fit_check_depths(table(tmp_path, xy, depths(xy), column), parts(cloud()))
-    assert "checks.csv" in str(error.value)
-
-
-def test_few_depths(tmp_path):
-    far, flat = places(5), cloud()
     far[1:4] += 300.0
     flat[:, 2] = 10.0
-    for xy, values, points, code in (
-        (far, true_at(far), cloud(), "no_bed"),
-        (far, true_at(far), cloud() - [0, 0, -50.0], "no_bed"),
-        (far[:2], true_at(far[:2]), cloud(), "no_bed"),
-        (places(9), np.full(9, 2.7), flat, "one_depth"),
+    for code, at, values, column, points in (
+        ("low_r2", xy, 3.0 + np.arange(10) % 2, "depth", cloud()),
+        ("falling", xy, 9.0 - true_at(xy), "depth", cloud()),
+        ("above_water", xy, np.full(10, 12.5), "z", cloud()),
+        ("no_bed", far, true_at(far), "depth", cloud()),
+        ("no_bed", far, true_at(far), "depth", cloud() - [0, 0, -50.0]),
+        ("one_depth", places(9), np.full(9, 2.7), "depth", flat),
     ):
-        with refused(f"check_depths.{code}", GeometryError):
-            fit_check_depths(table(tmp_path, xy, values), parts(points))
+        with refused(f"check_depths.{code}", GeometryError) as error:
+            fit_check_depths(table(tmp_path, at, values, column), parts(points))
+        assert "checks.csv" in str(error.value)
 
 
 def test_applied(tmp_path):

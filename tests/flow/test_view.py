@@ -22,19 +22,23 @@ def folder(tmp_path_factory):
 
 
 def test_scene(folder, tmp_path, monkeypatch):
-    shown = []
-    monkeypatch.setattr(view, "view_figure", lambda *a: (shown.append(a[0]), view_figure(*a))[1])
+    drawn = []
+    monkeypatch.setattr(view, "view_figure", lambda *a: (drawn.append(a[:2]), view_figure(*a))[1])
     pcfix.view_clouds(
         [folder / "corrected.laz"], cameras=folder / "cameras.csv", water=0.37,
         reference=folder / "lidar.laz", image=tmp_path / "view.png",
     )  # fmt: skip
-    (scene,) = shown
-    assert scene.names == ["corrected.laz before", "corrected.laz", "reference lidar.laz"]
+    ((shown, lines),) = drawn
+    assert [one.name for one in shown] == [
+        "corrected.laz before",
+        "corrected.laz",
+        "reference lidar.laz",
+    ]
     assert (tmp_path / "view.png").stat().st_size > 20_000
-    before, after, _ = scene.xyz
-    grey = (scene.rgb[1] == GREY).all(axis=1)
+    before, after, _ = (one.xyz for one in shown)
+    grey = (shown[1].rgb == GREY).all(axis=1)
     assert np.abs(before[grey] - after[grey]).max() < 1e-6
-    water, axes = scene.lines["water"], scene.lines["cameras"]
+    water, axes = lines["water"], lines["cameras"]
     level = water[0, 0, 2]
     assert np.ptp(water[..., 2]) == 0.0
     assert (grey == (after[:, 2] >= level - 1e-3)).mean() > 0.999

@@ -1,4 +1,4 @@
-"""Every cell of a small cloud against a slow implementation."""
+"""Every cell of a small cloud against a slow implementation; shades and contours."""
 
 from fractions import Fraction
 
@@ -7,7 +7,7 @@ import pytest
 
 from pcfix.flow.dsm import grid_dsm
 from pcfix.grid.lattice import cells_of
-from pcfix.grid.maps import hillshade
+from pcfix.grid.maps import contours, depth_interval, hillshade
 from tests.grid.clouds import EAST, NORTH, SCALE, scattered, write
 from tests.grid.twins import exact, slow_hillshade, slow_raster
 from tests.utils.nightly import mostly_nightly
@@ -42,16 +42,10 @@ def test_every_cell(cloud, tmp_path, method, resolution):
     summary = grid_dsm(path, files[0], **options)
     steps = np.rint((xyz - (EAST, NORTH, 0.0)) / float(SCALE))
     axes = [exact(steps[:, i], SCALE, (int(EAST), int(NORTH), 0)[i]) for i in range(3)]
-    if method == "tin":
-        axes = one_a_place(*axes)
-    widest = (summary.hole_m or 0.0) / float(resolution)
-    left, top, height, count, spread = slow_raster(*axes, Fraction(resolution), method, widest)
+    side, widest = Fraction(resolution), (summary.hole_m or 0.0) / float(resolution)
+    left, top, height, count, spread = slow_raster(*axes, side, method.replace("tin", "mean"))
     if method == "tin":  # points and spread are still of all points
-        *_, count, spread = slow_raster(
-            *(exact(steps[:, i], SCALE, (int(EAST), int(NORTH), 0)[i]) for i in range(3)),
-            Fraction(resolution),
-            "mean",
-        )
+        height = slow_raster(*one_a_place(*axes), side, method, widest)[2]
     raster = read_raster(files[0])
     array = np.vstack([raster.array, read_raster(files[1]).array])
     found = np.where(array == raster.nodata, np.nan, array)
@@ -94,3 +88,29 @@ def test_hillshade():
     around[1:-1, 1:-1] = height
     light = hillshade(around, 0.5)
     np.testing.assert_array_equal(light, slow_hillshade(height, 0.5, 315.0, 45.0))
+
+
+def test_rings_of_a_cone():
+    """A bowl of 1 in 10 about the middle: the ring of a level has ten times its radius."""
+    row, column = np.mgrid[:201, :201]
+    depth = 0.1 * np.hypot(row - 100.0, column - 80.0)
+    depth[:40, 150:] = np.nan
+    found = contours(depth, 2.0)
+    assert {level for level, _ in found} == {2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0}
+    for level, place in found:
+        radius = np.hypot(*(place - (80.0, 100.0)).T)
+        away = place[:, 1] > 43.0  # by the gap the filter takes one side alone
+        np.testing.assert_allclose(radius[away], 10.0 * level, atol=0.6)
+        inside = np.rint(place).astype(int)
+        assert np.isfinite(depth[inside[:, 1], inside[:, 0]]).all()
+    assert contours(np.full((5, 5), np.nan), 1.0) == []
+
+
+def test_depth_interval():
+    depth, unknown = np.array([[0.0, 1.0], [np.nan, 12.0]]), np.array([np.nan, 1.5, 1.5])
+    assert depth_interval(depth, np.zeros(0)) == 1.0
+    assert depth_interval(np.array([1.0]), np.zeros(0)) == pytest.approx(0.1)
+    assert depth_interval(np.array([1.0]), np.array([0.3])) == pytest.approx(0.5)
+    assert depth_interval(np.array([80.0]), np.zeros(0)) == 10.0
+    assert depth_interval(depth, unknown) == 2.0
+    assert depth_interval(np.full((2, 2), np.nan), unknown) == 2.0

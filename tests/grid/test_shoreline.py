@@ -13,7 +13,7 @@ from pcfix.grid import shoreline
 from pcfix.grid.shoreline import NearWater
 from pcfix.io.scenes import write_scene
 from pcfix.simulate.scene import ORIGIN_M
-from pcfix.simulate.terrain import Terrain
+from pcfix.simulate.settings import Terrain
 
 LEVEL_M, SIGMA_M = 0.37, 0.03
 
@@ -85,7 +85,7 @@ def test_islands_and_pools(monkeypatch, most):
     monkeypatch.setattr(shoreline, "MOST_POINTS", most)
     points, near = island_and_pool(), NearWater()
     for part in np.array_split(points, 7):
-        near += NearWater.of(part + np.array([4e5, 4e6, 0.0]), part[:, 2])
+        near += NearWater.of(part + np.array([4e5, 4e6, 0.0]), part[:, 2], np.zeros(len(part)))
     lines = near.lines(lambda xy: np.full(len(xy), 0.01))
     expected = [60.0, 16.0 * math.pi, 12.0 * math.pi, 8.0 * math.pi]
     assert [one.length_m for one in lines] == pytest.approx(expected, rel=0.05)
@@ -104,6 +104,6 @@ def test_flat_water():
     rng = np.random.default_rng(2)
     x, y = rng.uniform(0.0, 50.0, (2, 20_000))
     above = -0.05 + rng.normal(0.0, 0.03, 20_000)
-    near = NearWater.of(np.column_stack([x, y, above]), above)
+    near = NearWater.of(np.column_stack([x, y, above]), above, np.zeros(len(x)))
     assert sum(one.length_m for one in near.lines(lambda xy: np.full(len(xy), 0.02))) < 10.0
     assert NearWater().lines(lambda xy: np.zeros(len(xy))) == []

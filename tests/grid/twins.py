@@ -65,7 +65,7 @@ def slow_hillshade(height, resolution, azimuth, altitude):
     """Light one cell after the other; the normal and the sun are vectors."""
     a, e = math.radians(azimuth), math.radians(altitude)
     sun = np.array([math.sin(a) * math.cos(e), math.cos(a) * math.cos(e), math.sin(e)])
-    out = np.zeros(height.shape, np.uint8)
+    out = np.full(height.shape, np.nan)
     for row, column in np.ndindex(height.shape):
         own = height[row, column]
         if math.isnan(own):
@@ -81,5 +81,5 @@ def slow_hillshade(height, resolution, azimuth, altitude):
                 dx += weight * right * there / (8.0 * resolution)
                 dy -= weight * down * there / (8.0 * resolution)
         normal = np.array([-dx, -dy, 1.0])
-        out[row, column] = round(1 + 254 * max(0.0, normal @ sun / np.linalg.norm(normal)))
+        out[row, column] = round(254 * max(0.0, normal @ sun / np.linalg.norm(normal))) / 254
     return out

@@ -6,7 +6,6 @@ import pytest
 pytest.importorskip("cv2", reason="photographs need the extra 'photos'")
 
 import cv2
-import rasterio
 
 import pcfix
 from pcfix.flow.photos import map_photos
@@ -17,6 +16,7 @@ from pcfix.photos.mapping import Photo
 from pcfix.photos.waves import View, bed_places, slopes_of
 from pcfix.water.surface import surface_above
 from tests.utils.codes import refused
+from tests.utils.rasters import write_raster
 from tests.utils.renderer import Relief, Texture, rendered
 from tests.utils.waves import Sea, bed_seen, frame
 
@@ -152,12 +152,7 @@ def mapped(place, folder, with_own):
     one.mkdir(exist_ok=True)
     (one / "f07.png").write_bytes((folder / "f07.png").read_bytes())
     (place / "poses.csv").write_text(poses(place / "cameras.csv").read_text().replace("f00", "f07"))
-    ground = bed()
-    with rasterio.open(
-        place / "bed.tif", "w", driver="GTiff", width=120, height=120, count=1, dtype="float64",
-        transform=rasterio.Affine(0.25, 0.0, 85.0, 0.0, -0.25, 65.0),
-    ) as target:  # fmt: skip
-        target.write(ground.height_m, 1)
+    write_raster(place / "bed.tif", *bed())
     map_photos(
         one, place / f"dry_{with_own}", cameras=place / "poses.csv", water="0",
         dsm=place / "bed.tif", water_per_image=place / "calm_water" if with_own else None,

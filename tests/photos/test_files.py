@@ -7,15 +7,14 @@ import pytest
 
 pytest.importorskip("cv2", reason="photographs need the extra 'photos'")
 
-import rasterio
 from PIL import Image
-from rasterio.transform import from_origin
 
 import pcfix
 from pcfix.io.photographs import read_photograph
 from tests.photos.test_mapping import GSD_M, LEVEL_M, photo, relief
 from tests.utils.nightly import mostly_nightly
 from tests.utils.program import run_pcfix
+from tests.utils.rasters import write_raster
 from tests.utils.renderer import Texture, rendered
 
 CORNER = np.array([500_000.0, 4_000_000.0, 0.0])
@@ -42,13 +41,8 @@ def project(tmp_path_factory):
     (folder / "sensor.csv").write_text(
         "focal,sensor_x,sensor_y\n" + f"{600 * mm},{480 * mm},{360 * mm}\n"
     )
-    ground = relief()
-    with rasterio.open(
-        folder / "bed.tif", "w", driver="GTiff", width=450, height=450, count=1, dtype="float64",
-        crs="EPSG:32633", nodata=-9999.0,
-        transform=from_origin(CORNER[0] - 45.0, CORNER[1] + 45.0, 0.2, 0.2),
-    ) as raster:  # fmt: skip
-        raster.write(ground.height_m, 1)
+    place = CORNER[0] - 45.0, CORNER[1] + 45.0, 0.2
+    write_raster(folder / "bed.tif", relief().height_m, *place, crs="EPSG:32633", nodata=-9999.0)
     return folder
 
 

@@ -13,6 +13,7 @@ from pcfix.model import WaterPlane
 from pcfix.photos.mapping import Ground, Photo, Scene
 from pcfix.photos.ortho import Picture, mosaic, picture_of, seen_at
 from tests.photos.test_mapping import GSD_M, LEVEL_M, displacement_px, photo, relief
+from tests.utils.rasters import write_raster
 from tests.utils.renderer import Texture, rendered
 
 TEXTURE = Texture(5.0 * GSD_M, 1.5)
@@ -94,12 +95,8 @@ def block(tmp_path, pictures):
         ("P0", "P1"), np.array([one.centre for one in PHOTOS]) + shift,
         np.array([one.rotation for one in PHOTOS]), tuple(one.lens for one in PHOTOS),
     )  # fmt: skip
-    ground = relief()
-    with rasterio.open(
-        tmp_path / "dsm.tif", "w", driver="GTiff", width=450, height=450, count=1, dtype="float32",
-        crs="EPSG:32636", transform=rasterio.Affine(0.2, 0, 499_955.0, 0, -0.2, 3_800_045.0),
-    ) as raster:  # fmt: skip
-        raster.write(ground.height_m.astype(np.float32), 1)
+    place = 499_955.0, 3_800_045.0, 0.2
+    write_raster(tmp_path / "dsm.tif", relief().height_m, *place, crs="EPSG:32636")
     return folder, {"cameras": cameras, "dsm": tmp_path / "dsm.tif", "water": LEVEL_M}
 
 

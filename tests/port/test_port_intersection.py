@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from pcfix import Cameras
 from pcfix.model import Outcome
-from pcfix.options.correct import BudgetOptions, ScienceOptions
-from pcfix.port.light import coefficients, ray_through, window_of
+from pcfix.options.correct import ScienceOptions
+from pcfix.port.light import ray_through, window_of
 from pcfix.port.methods import correct_through_port
 from pcfix.port.shapes import DomePort, FlatPort
 from tests.utils.codes import refused
@@ -17,11 +17,10 @@ from tests.utils.compiled import compiled
 from tests.utils.port_scenes import images_of, simulate_port
 from tests.utils.twins import stacked_intersection
 
-ray_through, window_of = compiled(ray_through), compiled(window_of)
+ray_through = compiled(ray_through)
 
 FLAT = FlatPort(0.02, 0.008, 1.49, (0.02, -0.01, 1.0))
 DOME = DomePort(0.05, 0.004, 1.49, (0.001, -0.002, -0.01))
-CONSISTENT = ScienceOptions(method="consistent")
 NOISE_PX = 0.5
 
 
@@ -44,7 +43,8 @@ def errors_of(scene, found):
     return scene.apparent + found.shift_m - scene.truth
 
 
-def run(scene, settings, views=None):
+def run(scene, views=None, **settings):
+    settings = ScienceOptions(method="consistent", **settings)
     return correct_through_port(scene.apparent, scene.cameras, scene.port, settings, views)
 
 
@@ -53,14 +53,14 @@ def test_consistent(scene):
     # Newton's method stops at 1e-7 m, beyond which a further step would go
     before = rms(scene.apparent - scene.truth)
     assert before[2] > 0.1
-    found = run(scene, CONSISTENT, scene.views)
+    found = run(scene, scene.views)
     assert np.abs(errors_of(scene, found)).max() < 5e-9
     assert found.ray_count.tolist() == np.diff(scene.views.start).tolist()
     assert found.camera_used.all()
 
 
 def test_without_list(scene):
-    found = run(scene, CONSISTENT)
+    found = run(scene)
     right = np.abs(errors_of(scene, found)).max(axis=1) < 5e-9
     assert right.mean() > 0.6
     # several sets of cameras may image the point that they lead to; at the border of an image a
@@ -74,8 +74,8 @@ def test_without_list(scene):
 
 def test_ray_distance(scene):
     """The rays through the apparent point one by one, about the point that is nearest to them."""
-    found = run(scene, CONSISTENT, scene.views)
-    window, start = window_of(coefficients(scene.port)), scene.views.start
+    found = run(scene, scene.views)
+    window, start = window_of(scene.port), scene.views.start
     for i in range(0, len(scene.apparent), 50):
         places, rays, point = [], [], scene.apparent[i]
         for c in scene.views.camera[start[i] : start[i + 1]]:
@@ -90,9 +90,7 @@ def test_ray_distance(scene):
 
 def test_covariance_of_noise(noisy):
     # three thousand normalised squares have a mean of 1 within 4 sigma = 0.15 (correlations aside)
-    budget = BudgetOptions(sigma_image=NOISE_PX, sigma_index=0.0)
-    settings = ScienceOptions(method="consistent", **vars(budget))
-    found = run(noisy, settings, noisy.views)
+    found = run(noisy, noisy.views, sigma_image=NOISE_PX, sigma_index=0.0)
     errors = errors_of(noisy, found)
     c = found.covariance_m2
     full = np.stack([c[:, [0, 1, 2]], c[:, [1, 3, 4]], c[:, [2, 4, 5]]], axis=1)
@@ -104,33 +102,26 @@ def test_covariance_of_noise(noisy):
 def test_covariance_of_poses():
     # one camera errs at a time: its centre by 0.1 mm, its attitude by 0.1 mrad, in turn
     scene = simulate_port(FLAT, points=25, seed=3)
-    for budget, change in (
-        (BudgetOptions(sigma_image=0.0, sigma_index=0.0, sigma_centre=1e-4), shifted),
-        (BudgetOptions(sigma_image=0.0, sigma_index=0.0, sigma_attitude=np.degrees(1e-4)), turned),
-    ):
-        settings = dataclasses.replace(CONSISTENT, **vars(budget))
+    for budget in ({"sigma_centre": 1e-4}, {"sigma_attitude": np.degrees(1e-4)}):
         total = np.zeros(len(scene.truth))
         for camera in range(len(scene.cameras)):
             for axis in range(3):
-                other = adjusted_again(scene, change(scene.cameras, camera, axis, 1e-4))
+                other = adjusted_again(scene, moved(scene.cameras, camera, axis, *budget))
                 total += (other - scene.truth)[:, 2] ** 2
-        found = run(scene, settings, scene.views)
+        found = run(scene, scene.views, sigma_image=0.0, sigma_index=0.0, **budget)
         # first order: the steps are 1e-4, second order a few thousandths of the result
         assert found.sigma_z_m == pytest.approx(np.sqrt(total), rel=0.01)
 
 
-def shifted(cameras, camera, axis, step):
-    centres = cameras.centres.copy()
-    centres[camera, axis] += step
-    return dataclasses.replace(cameras, centres=centres)
-
-
-def turned(cameras, camera, axis, step):
-    turn = np.zeros(3)
-    turn[axis] = step
-    rotations = cameras.rotations.copy()
-    rotations[camera] = Rotation.from_rotvec(turn).as_matrix() @ rotations[camera]
-    return dataclasses.replace(cameras, rotations=rotations)
+def moved(cameras, camera, axis, what):
+    """Return cameras of which one is shifted or turned along an axis."""
+    centres, rotations, step = cameras.centres.copy(), cameras.rotations.copy(), np.zeros(3)
+    step[axis] = 1e-4
+    if what == "sigma_centre":
+        centres[camera] += step
+    else:
+        rotations[camera] = Rotation.from_rotvec(step).as_matrix() @ rotations[camera]
+    return dataclasses.replace(cameras, centres=centres, rotations=rotations)
 
 
 def adjusted_again(scene, cameras):
@@ -161,12 +152,9 @@ def adjusted_again(scene, cameras):
 
 
 def test_limits(scene):
-    def limited(**limits):
-        return run(scene, dataclasses.replace(CONSISTENT, **limits), scene.views)
-
-    widest = limited().incidence_deg.max()
+    widest = run(scene, scene.views).incidence_deg.max()
     limit = 0.3 * widest
-    narrow = limited(max_angle=limit)
+    narrow = run(scene, scene.views, max_angle=limit)
     assert narrow.incidence_deg.max() <= limit < widest
     few = narrow.outcome != Outcome.CORRECTED
     assert few.any()

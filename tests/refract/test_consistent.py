@@ -9,12 +9,14 @@ from scipy.spatial.transform import Rotation
 
 import pcfix
 from pcfix.errors import SettingError
-from pcfix.model import Cameras, Lens, Outcome, Views, WaterMesh, WaterPlane, WaterRaster
+from pcfix.model import Cameras, Lens, Outcome, Views, WaterMesh, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.intersect import consistent, intersect
 from pcfix.refract.methods import correct
 from pcfix.simulate.tracing import triangulate
 from pcfix.water.surface import surface_above
+from tests.refract import test_surfaces as surfaces
+from tests.refract.test_surfaces import UTM, in_utm
 from tests.utils.batches import batch_of
 from tests.utils.codes import refused, warned
 from tests.utils.consistent_twin import (
@@ -28,7 +30,6 @@ from tests.utils.consistent_twin import (
 from tests.utils.depth_map_twin import looking
 from tests.utils.nightly import mostly_nightly
 
-UTM = np.array([512_345.0, 4_987_654.0, 0.0])
 MICROMETRE, NANOMETRE = 1e-6, 1e-9
 N_WATER, HEIGHT_M = 1.34, 80.0
 PLAIN = Lens(3600.0, 5472.0, 3648.0, 2736.0, 1824.0)
@@ -53,23 +54,17 @@ def nadir_block(rng, lens=PLAIN):
 
 def oblique_block(rng, lens=PLAIN):
     """Return a nadir block with obliques of 35 degrees from four sides."""
-    nadir, parts = nadir_block(rng, lens), []
-    for heading in (0.0, 90.0, 180.0, 270.0):
-        x, y = np.meshgrid([-20.0, 20.0], [-20.0, 20.0])
-        back = (
-            -HEIGHT_M
-            * np.tan(np.radians(35.0))
-            * Rotation.from_euler("z", heading, degrees=True).apply([1.0, 0.0, 0.0])
-        )
-        centres = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, HEIGHT_M)]) + back
-        parts.append(looking(centres, np.full(x.size, 35.0), np.full(x.size, heading), lens))
-    every = [nadir, *parts]
-    names = tuple(map(str, range(sum(map(len, every)))))
+    nadir, every = nadir_block(rng, lens), np.arange(16) // 4
+    x, y = np.tile(np.reshape(np.meshgrid([-20.0, 20.0], [-20.0, 20.0]), (2, 4)), 4)
+    turn = Rotation.from_euler("z", 90.0 * every[:, None], degrees=True)
+    back = turn.apply([-HEIGHT_M * np.tan(np.radians(35.0)), 0.0, 0.0])
+    centres = np.column_stack([x, y, np.full(16, HEIGHT_M)]) + back
+    oblique = looking(centres, np.full(16, 35.0), 90.0 * every, lens)
     return Cameras(
-        names,
-        np.vstack([part.centres for part in every]),
-        np.vstack([part.rotations for part in every]),
-        (lens,) * len(names),
+        tuple(map(str, range(len(nadir) + 16))),
+        np.vstack([nadir.centres, oblique.centres]),
+        np.vstack([nadir.rotations, oblique.rotations]),
+        nadir.lenses + oblique.lenses,
     )
 
 
@@ -118,16 +113,8 @@ def apparent_of(points, cameras, lists, planes_of, n=N_WATER):
     return np.array(found)
 
 
-def in_utm(plane):
-    a, b, c = plane
-    return WaterPlane(a - b * UTM[0] - c * UTM[1], b, c)
-
-
-def as_raster(plane, half=60.0, cell=1.0):
-    a, b, c = plane
-    at = np.arange(-half + cell / 2, half, cell)
-    heights = a + b * at[None, :] + c * at[::-1, None]
-    return WaterRaster(heights, UTM[0] - half, UTM[1] + half, (cell, cell))
+def as_raster(plane):
+    return surfaces.raster(surfaces.plane(*plane))
 
 
 def as_mesh(plane, half=60.0, count=25):
@@ -210,9 +197,7 @@ def test_waves():
         ways = [path_under(waves, point, cameras.centres[c], N_WATER) for c in mine]
         seen = np.array([image_in(cameras, c, way) for c, way in zip(mine, ways, strict=True)])
         apparent.append(triangulated_straight(seen, cameras, mine, point))
-    at = np.arange(-59.875, 60.0, 0.25)
-    water = WaterRaster(waves(at[None, :], at[::-1, None]), UTM[0] - 60, UTM[1] + 60, (0.25, 0.25))
-    miss = {}
+    water, miss = surfaces.raster(waves, (0.25, 0.25)), {}
     for method in ("snell", "consistent"):
         result = run(
             np.array(apparent) + UTM, moved(cameras, UTM), water, views_of(lists), method=method
@@ -301,14 +286,9 @@ def many():
 
 
 def test_counts_as_snell(many):
-    points, cameras, water, views = many
-    one, other = (
-        run(points, cameras, water, views),
-        run(points, cameras, water, views, method="snell"),
-    )
-    assert np.array_equal(one.outcome, other.outcome)
-    assert np.array_equal(one.ray_count, other.ray_count)
-    assert np.array_equal(one.camera_used, other.camera_used)
+    one, other = (run(*many, method=method) for method in ("consistent", "snell"))
+    for name in ("outcome", "ray_count", "camera_used"):
+        assert np.array_equal(getattr(one, name), getattr(other, name))
     assert one.incidence_deg == pytest.approx(other.incidence_deg, abs=1e-9)
     # the solution of snell is the nearest to the refracted rays, nothing else can be nearer
     assert (one.ray_miss_m >= other.ray_miss_m - NANOMETRE).all()
@@ -333,10 +313,8 @@ def test_ray_miss(many):
 
 def test_unsolved_keep_snell():
     # the second camera looks away: it has no image of the point, and no list gives it a ray
-    cameras, water = (
-        looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0, 170.0], [0.0, 0.0]),
-        WaterPlane(0.0),
-    )
+    cameras = looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0, 170.0], [0.0, 0.0])
+    water = WaterPlane(0.0)
     points, views = np.array([[0.0, 0, -3], [0.0, 1, -2]]), views_of([[0, 1], [0, 1]])
     listed = run(points, cameras, water, views)
     assert (listed.outcome == Outcome.ONE_CAMERA).all()
@@ -348,11 +326,10 @@ def test_unsolved_keep_snell():
     assert result.shift_m == pytest.approx(expected.shift_m, abs=NANOMETRE)
 
 
-def test_no_orientation():
-    cameras = looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0, 15.0], [0.0, 180.0])
-    for missing in (["lenses"], ["angles", "lenses"]):
-        bare = replace(cameras, lenses=None)
-        if "angles" in missing:
-            bare = replace(bare, rotations=None)
-        with refused("cameras.no_orientation", SettingError, missing=missing):
-            pcfix.correct_points(np.array([[0.0, 0, -3]]), bare, 0.0, method="consistent")
+@pytest.mark.parametrize("missing", [["lenses"], ["angles", "lenses"]])
+def test_no_orientation(missing):
+    bare = replace(looking([[-20.0, 0, 70], [20.0, 0, 70]], [15.0] * 2, [0.0, 180.0]), lenses=None)
+    if "angles" in missing:
+        bare = replace(bare, rotations=None)
+    with refused("cameras.no_orientation", SettingError, missing=missing):
+        pcfix.correct_points(np.array([[0.0, 0, -3]]), bare, 0.0, method="consistent")

@@ -21,6 +21,7 @@ from tests.utils.batches import batch_of
 from tests.utils.depth_map_twin import LENS, fused_slowly, looking
 from tests.utils.matchers import matched_scene
 from tests.utils.nightly import mostly_nightly
+from tests.utils.rendered import block_of, cloud_of, truth_m
 from tests.utils.shared import needs
 
 RENDERED, rendered = needs("rendered_a")
@@ -38,6 +39,7 @@ MATCHED = np.array(
         [0, 1, 4, 6, 2], [2, 1, 0, 3, 5], [3, 2, 4, 1, 6],
     ]
 )  # fmt: skip
+PARTNERS = [[j for j in row if j >= 0] for row in MATCHED]
 NADIR, MIXED = (0, 1, 2, 3, 4), (0, 2, 4, 5, 7)
 
 
@@ -68,9 +70,8 @@ def listed(lists, weights=None):
 
 def test_depth_needs_partner():
     none = matcher(matched=np.full((8, 5), -1))
-    result = run(
-        np.array([[3.0, 4, -4.5]]), WaterPlane(0.3), listed([NADIR]), Learned(matcher=none)
-    )
+    xyz = np.array([[3.0, 4, -4.5]])
+    result = run(xyz, WaterPlane(0.3), listed([NADIR]), Learned(matcher=none))
     assert result.outcome.tolist() == [Outcome.ONE_CAMERA]
     assert np.abs(result.shift_m).max() == 0.0
 
@@ -85,9 +86,8 @@ def inverted(maps, slope, metric, water, offset):
     """Return what the correction makes of a twin's point, and what that point shows."""
     planes = [(water[0] + up, *water[1:]) for up in offset]
     weights = 1.0 / ((CAMERAS.centres[list(maps)] - [3.0, 4.0, -4.0]) ** 2).sum(axis=1)
-    matched = [[j for j in row if j >= 0] for row in MATCHED]
     made, true = fused_slowly(
-        np.array([3.0, 4.0, -4.3]), maps, weights, CAMERAS, matched, planes, (-6.0, *slope),
+        np.array([3.0, 4.0, -4.3]), maps, weights, CAMERAS, PARTNERS, planes, (-6.0, *slope),
         N_WATER, TOLERANCE, metric,
     )  # fmt: skip
     views = listed([maps], [weights / weights.sum()])
@@ -202,7 +202,7 @@ def test_block_without_list(name, most, monkeypatch):
     # 1.3 and 5.2: with fewer wild points the bias of the wrong groups shows
     assert abs(error.mean()) < 5.7
     assert rms(error) < 0.6 * rms(errors_gsd(name, method="snell", camera_set="all"))
-    monkeypatch.setattr("pcfix.refract.learning._learn_bed", lambda *_: None)
+    monkeypatch.setattr("pcfix.refract.bed.bed_around", lambda *_: None)
     without_ties = errors_gsd(name, method="consistent", camera_set="mvs")
     # 3.5 and 42 GSD: the images of a group see the bed at heights that are a metre apart
     assert rms(error) < {"nadir": 0.9, "half oblique": 0.4}[name] * rms(without_ties)
@@ -232,11 +232,7 @@ def test_any_chunk():
 
 @lru_cache
 def rendered_cloud():
-    import laspy
-
-    local = pcfix.read_cameras(RENDERED / "colmap")
-    cameras = replace(local, centres=local.centres + np.loadtxt(RENDERED / "offset.txt"))
-    xyz = np.ascontiguousarray(laspy.read(RENDERED / "cloud.las").xyz)
+    xyz, cameras = cloud_of(RENDERED / "cloud.las"), block_of(RENDERED)[1]
     match = ViewMatch(read_views(RENDERED / "dense.vis", cameras), cameras, points=len(xyz))
     rows = np.arange(0, len(xyz), 6)
     return xyz[rows], cameras, match.views_of(xyz, 0)[0].take(rows)
@@ -244,36 +240,20 @@ def rendered_cloud():
 
 def rendered_errors_gsd(**choices):
     """Return z minus the true surface at the corrected place, under more than 0.2 m of water."""
-    import rasterio
-    from scipy.ndimage import map_coordinates
-
     xyz, cameras, _ = rendered_cloud()
     result = pcfix.correct_points(xyz, cameras, 0.37, method="consistent", **choices)
-    with rasterio.open(RENDERED / "truth_dsm.tif") as raster:
-        heights, place = raster.read(1).astype(float), ~raster.transform
-
-    def truth(at):
-        column = place.a * at[:, 0] + place.b * at[:, 1] + place.c
-        row = place.d * at[:, 0] + place.e * at[:, 1] + place.f
-        return map_coordinates(heights, np.array([row - 0.5, column - 0.5]), order=1, cval=np.nan)
-
     found = xyz + result.shift_m
-    wet = (truth(xyz) < 0.37 - 0.2) & (result.outcome == Outcome.CORRECTED)
-    error = (found[:, 2] - truth(found))[wet] / 0.05
+    wet = (truth_m(RENDERED, xyz) < 0.37 - 0.2) & (result.outcome == Outcome.CORRECTED)
+    error = (found[:, 2] - truth_m(RENDERED, found))[wet] / 0.05
     return error[np.isfinite(error)]
 
 
 @rendered
-def test_real_cloud_with_list():
-    error = rendered_errors_gsd(views=replace(rendered_cloud()[2], kind="depth-maps"))
+@pytest.mark.parametrize("with_list", [True, False], ids=["list", "no list"])
+def test_real_cloud(with_list):
+    views = replace(rendered_cloud()[2], kind="depth-maps")
+    error = rendered_errors_gsd(**({"views": views} if with_list else {"camera_set": "mvs"}))
     assert len(error) > 10_000
-    assert rms(error) < 1.2  # 0.9 GSD; triangulated at once the same points have 1.3 to 1.9
-    assert abs(error.mean()) < 0.3
-
-
-@rendered
-def test_real_cloud_without_list():
-    error = rendered_errors_gsd(camera_set="mvs")
-    assert len(error) > 10_000
-    assert rms(error) < 1.2  # 1.05 GSD
+    # 0.9 and 1.05 GSD; triangulated at once the same points have 1.3 to 1.9
+    assert rms(error) < 1.2
     assert abs(error.mean()) < 0.3

@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import pcfix
 from pcfix.model import WaterPlane, WaterRaster
@@ -25,23 +26,14 @@ RNG = np.random.default_rng(7)
 N = 2 * TILE + 17  # fewer than tell how a list was made, which SigmaZ would have
 
 
-def lens():
-    return pcfix.Lens(3000.0, 4000.0, 3000.0, 2010.0, 1490.0)
-
-
-def framed_cameras(k=25):
+@pytest.fixture(scope="module")
+def cameras(k=25):
     """Return nadir cameras with some tilt; each sees part of the points."""
-    from scipy.spatial.transform import Rotation
-
     centres = np.column_stack([RNG.uniform(0, 100, (k, 2)), RNG.uniform(55, 65, k)])
     tilt = Rotation.from_euler("zyx", RNG.normal(0, [90, 5, 5], (k, 3)), degrees=True)
     rotations = np.diag([1.0, -1.0, -1.0]) @ tilt.as_matrix().transpose(0, 2, 1)
-    return pcfix.Cameras(tuple(map(str, range(k))), centres, rotations, (lens(),) * k)
-
-
-@pytest.fixture(scope="module")
-def cameras():
-    return framed_cameras()
+    lens = pcfix.Lens(3000.0, 4000.0, 3000.0, 2010.0, 1490.0)
+    return pcfix.Cameras(tuple(map(str, range(k))), centres, rotations, (lens,) * k)
 
 
 @pytest.fixture(scope="module")

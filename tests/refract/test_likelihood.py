@@ -20,12 +20,17 @@ from pcfix.refract.patches import smooth_surfaces
 GSD_M, LEVEL_M, POINTS = 0.05, 0.0, 32
 
 
-def patches(count, rng, relief=1.0):
+def patches(count, rng):
     """Return points of patches 3 m wide, and the heights of a curved bed 4 m deep at them."""
     xy = rng.uniform(-1.5, 1.5, (count, POINTS, 2))
-    slope, bow = rng.normal(0.0, 0.05 * relief, (2, count, 1))
-    bed = -4.0 + slope * xy[..., 0] + bow * xy[..., 1] ** 2
-    return xy, bed
+    slope, bow = rng.normal(0.0, 0.05, (2, count, 1))
+    return xy, -4.0 + slope * xy[..., 0] + bow * xy[..., 1] ** 2
+
+
+def likelihoods(xy, apparent, *candidates):
+    """Return the log likelihoods of patches for candidates of several types."""
+    terms, level = smooth_surfaces(np.dstack([xy, apparent])), np.full_like(apparent, LEVEL_M)
+    return [log_likelihood(terms, apparent, level, one, GSD_M) for one in candidates]
 
 
 def test_slow_twin():
@@ -34,9 +39,7 @@ def test_slow_twin():
     xy, bed = patches(6, rng)
     apparent = bed / 1.34 + rng.normal(0.0, GSD_M, bed.shape)
     true, terms = 1.34 * apparent, smooth_surfaces(np.dstack([xy, apparent]))
-    level = np.full_like(apparent, LEVEL_M)
-    one = Candidates(true[..., None], np.ones((*true.shape, 1)))
-    found = log_likelihood(terms, apparent, level, one, GSD_M)
+    (found,) = likelihoods(xy, apparent, Candidates(true[..., None], np.ones((*true.shape, 1))))
 
     def rest_of(sigma):
         rest = np.empty_like(true)
@@ -75,13 +78,9 @@ def test_mixture(is_mixed):
     ratio = 1.34 + 0.05 * np.arange(5)
     used_ratio = ratio[rng.integers(0, 5, bed.shape)] if is_mixed else np.mean(ratio)
     apparent = bed / used_ratio + rng.normal(0.0, 0.5 * GSD_M, bed.shape)
-    terms, level = smooth_surfaces(np.dstack([xy, apparent])), np.full_like(apparent, LEVEL_M)
     several = Candidates(apparent[..., None] * ratio, np.ones((*bed.shape, 5)))
     mean = Candidates(apparent[..., None] * np.mean(ratio), np.ones((*bed.shape, 1)))
-    of_several, of_mean = (
-        log_likelihood(terms, apparent, level, one, GSD_M) for one in (several, mean)
-    )
-    errors = standard_errors(of_several, of_mean)
+    errors = standard_errors(*likelihoods(xy, apparent, several, mean))
     assert (errors > 2.33) if is_mixed else (errors < -2.33)
 
 
@@ -90,13 +89,10 @@ def test_missing_candidates():
     rng = np.random.default_rng(3)
     xy, bed = patches(20, rng)
     apparent = bed / 1.34
-    terms, level = smooth_surfaces(np.dstack([xy, apparent])), np.full_like(apparent, LEVEL_M)
     height = np.dstack([1.34 * apparent, np.full(bed.shape, np.nan)])
     padded = Candidates(height, np.ones(height.shape))
     single = Candidates(height[..., :1], np.ones((*bed.shape, 1)))
-    with_none, without = (
-        log_likelihood(terms, apparent, level, one, GSD_M) for one in (padded, single)
-    )
+    with_none, without = likelihoods(xy, apparent, padded, single)
     # the starts of the search differ, by the spread of the candidates: 0 here
     assert with_none == pytest.approx(without, abs=1e-9)
 

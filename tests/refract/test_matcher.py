@@ -1,14 +1,11 @@
 """Which images are matched with which: loops over the formula, and what real software chose."""
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 
-import pcfix
 from pcfix.io.cameras import read_tie_points
 from pcfix.refract.matcher import matcher_of, matcher_of_ties
 from tests.utils.matchers import matched_scene
+from tests.utils.rendered import block_of, cloud_of
 from tests.utils.shared import needs
 
 RENDERED, rendered = needs("rendered_a")
@@ -25,15 +22,14 @@ def test_simulated_partners(obliques):
 
 
 def real_block():
-    local = pcfix.read_cameras(RENDERED / "colmap")
-    offset = np.loadtxt(RENDERED / "offset.txt")
+    local, cameras = block_of(RENDERED)
     rows = {name.rpartition(".")[0]: i for i, name in enumerate(local.labels)}
     partners = {}
     for line in (RENDERED / "neighbours.txt").read_text().splitlines():
         if not line.startswith("#"):
             mine, *others = (rows[name.rpartition(".")[0]] for name in line.split())
             partners[mine] = others
-    return local, replace(local, centres=local.centres + offset), partners
+    return local, cameras, partners
 
 
 def share_found(matched, partners):
@@ -42,18 +38,11 @@ def share_found(matched, partners):
 
 
 @rendered
-def test_real_partners_of_places():
-    import laspy
-
-    _, cameras, partners = real_block()
-    xyz = np.ascontiguousarray(laspy.read(RENDERED / "cloud.las").xyz[::60])
+def test_real_partners():
+    local, cameras, partners = real_block()
+    of_places = matcher_of(cameras, cloud_of(RENDERED / "cloud.las")[::60])
     # 147 of 160; the software went by tie points, and the cloud is denser where texture is good
-    assert share_found(matcher_of(cameras, xyz).matched, partners) >= 0.88
-
-
-@rendered
-def test_real_partners_of_ties():
-    local, _, partners = real_block()
-    ties = read_tie_points(RENDERED / "colmap", local)
+    assert share_found(of_places.matched, partners) >= 0.88
+    of_ties = matcher_of_ties(local, read_tie_points(RENDERED / "colmap", local))
     # 156 of 160, from a seventh of the tie points that the software had
-    assert share_found(matcher_of_ties(local, ties).matched, partners) >= 0.95
+    assert share_found(of_ties.matched, partners) >= 0.95

@@ -9,10 +9,18 @@ from scipy.spatial.transform import Rotation
 from pcfix.model import Outcome, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Learned, OriginalModel
-from pcfix.refract.matcher import Bed
+from pcfix.refract.fusion import Bed
 from pcfix.refract.methods import correct, on_land, shift_of_land
 from pcfix.water.surface import surface_above
-from tests.refract.test_depth_maps import CAMERAS, MATCHED, MIXED, N_WATER, NADIR, TOLERANCE, listed
+from tests.refract.test_depth_maps import (
+    CAMERAS,
+    MIXED,
+    N_WATER,
+    NADIR,
+    PARTNERS,
+    TOLERANCE,
+    listed,
+)
 from tests.refract.test_depth_maps import FUSED as OTHERS
 from tests.refract.test_depth_maps import matcher as plain_matcher
 from tests.utils.batches import batch_of
@@ -48,19 +56,8 @@ def matcher(cameras, averages=False):
 
 def run(xyz, views, learned, original_model, kind="depth-maps"):
     settings = ScienceOptions(method="consistent", index=N_WATER, dimensions="none", matcher=kind)
-    above = surface_above(WATER, xyz)
-    return correct(
-        batch_of(
-            xyz,
-            above,
-            WATER,
-            CAMERAS,
-            settings,
-            views,
-            learned=learned,
-            original_model=original_model,
-        )
-    )
+    given = surface_above(WATER, xyz), WATER, CAMERAS, settings, views
+    return correct(batch_of(xyz, *given, learned=learned, original_model=original_model))
 
 
 def some_points():
@@ -75,18 +72,15 @@ def test_maps_of_original_model(maps, metric):
     """Fused by a slow twin that traces light in one geometry and matches in the other."""
     original = absorbed()
     weights = 1.0 / ((original.centres[list(maps)] - [3.0, 4.0, -4.0]) ** 2).sum(axis=1)
-    matched = [[j for j in row if j >= 0] for row in MATCHED]
     planes = [(WATER.a, WATER.b, WATER.c)] * 8
     apparent, true = fused_slowly(
-        np.array([3.0, 4.0, -4.3]), maps, weights, CAMERAS, matched, planes, (-6.0, 0.0, 0.0),
+        np.array([3.0, 4.0, -4.3]), maps, weights, CAMERAS, PARTNERS, planes, (-6.0, 0.0, 0.0),
         N_WATER, TOLERANCE, metric, original,
     )  # fmt: skip
     views = replace(listed([maps]), weight=(weights / weights.sum()).astype(np.float32))
     learned = Learned(matcher=matcher(original))
-    for start in (
-        apparent,
-        apparent + np.array([0.3, -0.2, 0.4]),
-    ):  # the place it is counted from does not matter
+    # the place it is counted from does not matter
+    for start in (apparent, apparent + np.array([0.3, -0.2, 0.4])):
         result = run(start[None], views, learned, OriginalModel(apparent[None], original))
         assert result.outcome.tolist() == [Outcome.CORRECTED]
         # ways are balanced as shares of the distances, and angles stand for pixels, so that other
@@ -135,9 +129,8 @@ def test_land(with_list):
     """A twin fuses land, that is, a bed in water that does not refract."""
     original, maps = absorbed(), MIXED if with_list else (0,)
     weights = 1.0 / ((original.centres[list(maps)] - [3.0, 4.0, 2.0]) ** 2).sum(axis=1)
-    matched = [[j for j in row if j >= 0] for row in MATCHED]
     apparent, true = fused_slowly(
-        np.array([3.0, 4.0, 2.2]), maps, weights, CAMERAS, matched, [(50.0, 0.0, 0.0)] * 8,
+        np.array([3.0, 4.0, 2.2]), maps, weights, CAMERAS, PARTNERS, [(50.0, 0.0, 0.0)] * 8,
         (2.0, 0.0, 0.0), 1.0, TOLERANCE, "angles", original,
     )  # fmt: skip
     settings = ScienceOptions(method="consistent", index=N_WATER)

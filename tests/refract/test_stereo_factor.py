@@ -59,10 +59,9 @@ def test_simulated_block(scene):
 
 def test_auto(scene):
     found = stereo_factor(scene.cameras, scene.water.a, N)
+    given = scene.xyz, scene.cameras, scene.water
     auto, told = (
-        pcfix.correct_points(
-            scene.apparent_xyz, scene.cameras, scene.water, method="factor", depth_factor=factor
-        )
+        pcfix.correct_points(*given, method="factor", depth_factor=factor)
         for factor in ("auto", found.factor)
     )
     assert np.array_equal(auto.xyz, told.xyz)
@@ -78,15 +77,14 @@ def test_refused(scene):
     cameras, level = scene.cameras, scene.water.a
     bare = pcfix.Cameras(cameras.labels, cameras.centres)
     with refused("cameras.no_orientation", SettingError):
-        pcfix.correct_points(
-            scene.apparent_xyz, bare, scene.water, method="factor", depth_factor="auto"
-        )
+        pcfix.correct_points(scene.xyz, bare, scene.water, method="factor", depth_factor="auto")
     far = replace(cameras, centres=cameras.centres * [20.0, 20.0, 1.0])
-    with refused("cameras.no_overlap", GeometryError):
-        stereo_factor(far, level, N)
     aside = replace(cameras, rotations=np.broadcast_to(np.eye(3), (40, 3, 3)))
-    with refused("cameras.no_stereo", GeometryError, nadir=0):
-        stereo_factor(aside, level, N)
     one = replace(cameras, centres=np.broadcast_to(cameras.centres[0], (40, 3)))
-    with refused("cameras.no_overlap", GeometryError, base_m=0.0):
-        stereo_factor(one, level, N)
+    for wrong, code, values in (
+        (far, "cameras.no_overlap", {}),
+        (aside, "cameras.no_stereo", {"nadir": 0}),
+        (one, "cameras.no_overlap", {"base_m": 0.0}),
+    ):
+        with refused(code, GeometryError, **values):
+            stereo_factor(wrong, level, N)

@@ -39,6 +39,12 @@ def plane(a, b, c):
     return lambda x, y: a + b * x + c * y
 
 
+def in_utm(abc):
+    """Return z = a + b x + c y, x and y from `UTM`."""
+    a, b, c = abc
+    return pcfix.WaterPlane(a - b * UTM[0] - c * UTM[1], b, c)
+
+
 def waves(x, y):
     return 0.3 + 0.003 * x + 0.15 * np.sin(x / 4.0) * np.cos(y / 3.0)
 
@@ -100,10 +106,10 @@ def test_unknown_cell():
 @pytest.mark.parametrize("abc", [(0.4, 0.0, 0.0), (0.2, 0.003, -0.002), (-0.1, 0.04, 0.03)])
 @pytest.mark.parametrize("options", [{}, {"max_angle": 25.0}])
 def test_raster_of_plane(abc, options):
-    a, b, c = abc
-    there = pcfix.WaterPlane(a - b * UTM[0] - c * UTM[1], b, c)
-    one = pcfix.correct_points(bed(), cameras(), raster(plane(*abc)), **options)
-    other = pcfix.correct_points(bed(), cameras(), there, **options)
+    one, other = (
+        pcfix.correct_points(bed(), cameras(), water, **options)
+        for water in (raster(plane(*abc)), in_utm(abc))
+    )
     assert np.array_equal(one.outcome, other.outcome)
     assert one.corrected.any()
     assert one.xyz == pytest.approx(other.xyz, abs=MICROMETRE)
@@ -129,41 +135,30 @@ def test_beyond_edge():
     abc = (0.1, 0.02, -0.01)
     small = raster(plane(*abc), (0.25, 0.25), half=2.0)
     points = np.array([[1.7, 1.7, -4.0], [-1.9, 0.3, -6.0]]) + UTM
-    there = pcfix.WaterPlane(abc[0] - abc[1] * UTM[0] - abc[2] * UTM[1], *abc[1:])
-    one = pcfix.correct_points(points, cameras(), small)
+    one, other = (pcfix.correct_points(points, cameras(), water) for water in (small, in_utm(abc)))
     assert one.corrected.all()
-    other = pcfix.correct_points(points, cameras(), there)
     assert one.xyz == pytest.approx(other.xyz, abs=MICROMETRE)
 
 
 # A level that moves
 
 
-def surfaces():
+def surface_of(kind, up=0.0):
     corners = np.array([[-60.0, -60], [60, -60], [60, 60], [-60, 60]])
-    vertices = np.column_stack([corners, 0.2 + 0.003 * corners[:, 0]]) + UTM
+    vertices = np.column_stack([corners, 0.2 + up + 0.003 * corners[:, 0]]) + UTM
     return {
-        "level": 0.2,
-        "plane": pcfix.WaterPlane(0.2 - 0.003 * UTM[0], 0.003, 0.0),
+        "level": 0.2 + up,
+        "plane": in_utm((0.2 + up, 0.003, 0.0)),
         "mesh": pcfix.WaterMesh(vertices, np.array([[0, 1, 2], [0, 2, 3]])),
-        "raster": raster(waves),
-    }
+        "raster": raster(lambda x, y: waves(x, y) + up),
+    }[kind]
 
 
-@pytest.mark.parametrize("kind", surfaces())
+@pytest.mark.parametrize("kind", ["level", "plane", "mesh", "raster"])
 def test_one_offset(kind):
-    water, up = surfaces()[kind], 0.31
-    match water:
-        case float():
-            higher = water + up
-        case pcfix.WaterPlane(a, b, c):
-            higher = pcfix.WaterPlane(a + up, b, c)
-        case pcfix.WaterMesh(vertices, triangles):
-            higher = pcfix.WaterMesh(vertices + np.array([0, 0, up]), triangles)
-        case WaterRaster():
-            higher = raster(lambda x, y: waves(x, y) + up)
-    one = pcfix.correct_points(bed(), cameras(), water, level_offset_m=np.full(5, up))
-    other = pcfix.correct_points(bed(), cameras(), higher)
+    points, up = (bed(), cameras()), 0.31
+    one = pcfix.correct_points(*points, surface_of(kind), level_offset_m=np.full(5, up))
+    other = pcfix.correct_points(*points, surface_of(kind, up))
     assert one.xyz == pytest.approx(other.xyz, abs=1e-8)
     assert one.depth_m + up == pytest.approx(other.depth_m, abs=1e-8)  # of the surface given
 
@@ -171,8 +166,8 @@ def test_one_offset(kind):
 @pytest.mark.parametrize("kind", ["plane", "raster"])
 def test_twin_of_offsets(kind):
     offset = np.array([-0.4, 0.3, 0.0, 0.7, -0.2])
-    result = pcfix.correct_points(bed(), cameras(), surfaces()[kind], level_offset_m=offset)
-    base = bilinear(surfaces()["raster"]) if kind == "raster" else plane(0.2, 0.003, 0.0)
+    result = pcfix.correct_points(bed(), cameras(), surface_of(kind), level_offset_m=offset)
+    base = bilinear(surface_of("raster")) if kind == "raster" else plane(0.2, 0.003, 0.0)
     own = [lambda x, y, up=up: base(x, y) + up for up in offset]
     for point, found in zip(bed() - UTM, result.xyz - UTM, strict=True):
         expected = correct_under(own, point, cameras().centres - UTM, 1.34)

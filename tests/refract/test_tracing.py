@@ -1,21 +1,21 @@
 """The four backward tracers against brentq on planes, Snell forwards and Fermat by scipy."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
-from scipy.interpolate import RegularGridInterpolator
 
 from pcfix.errors import SettingError
-from pcfix.model import WaterDimension, WaterMesh, WaterPlane, WaterRaster
+from pcfix.model import WaterDimension, WaterMesh, WaterPlane
 from pcfix.refract.tracing import METHODS, trace
+from tests.refract import test_surfaces as surfaces
 from tests.utils.codes import refused
 from tests.utils.tracing_twin import direction, through_plane, through_surface
 from tests.utils.twins import refract_ray
 
 INDEX = 1.34
-UTM = np.array([512_345.0, 4_987_654.0, 0.0])
-HALF = 60.0  # metres from the middle to the edge of rasters and meshes
+UTM, HALF = surfaces.UTM, surfaces.HALF  # metres from the middle to the edge of rasters and meshes
 
 each_method = pytest.mark.parametrize("method", METHODS)
 
@@ -39,20 +39,8 @@ def waves(slope_deg):
     return lambda x, y: high * (np.sin(wave * x) + np.sin(wave * y + 0.7))
 
 
-def raster(surface, cell=0.5, origin=(0.0, 0.0)):
-    x = np.arange(-HALF + cell / 2, HALF, cell)
-    return WaterRaster(
-        surface(x[None, :], x[::-1, None]), origin[0] - HALF, origin[1] + HALF, (cell, cell)
-    )
-
-
-def bilinear(water):
-    """Return scipy's z(x, y) of a raster."""
-    cell = water.cell_m[0]
-    x = water.left_m + cell / 2 + cell * np.arange(water.height_m.shape[1])
-    y = water.top_m - cell / 2 - cell * np.arange(water.height_m.shape[0])
-    found = RegularGridInterpolator((y[::-1], x), water.height_m[::-1])
-    return lambda x, y: float(found([[y, x]])[0])
+raster = partial(surfaces.raster, cell=(0.5, 0.5), origin=(0.0, 0.0))
+bilinear = partial(surfaces.bilinear, origin=(0.0, 0.0))
 
 
 def folded(slope):
@@ -125,7 +113,7 @@ def test_waves(method, slope_deg):
 
 @each_method
 def test_crease(method):
-    water = raster(waves(12.0), cell=1.0)
+    water = raster(waves(12.0), cell=(1.0, 1.0))
     surface = bilinear(water)
     points, centres = pairs(150, seed=4, steepest_deg=40.0)
     found = trace(centres, points, water, refractive_index=INDEX, method=method)
@@ -163,16 +151,11 @@ def test_shapes_far_from_origin(method):
     plane = (0.3, 0.02, -0.01)
     points, centres = pairs(40, steepest_deg=40.0)
     points[:, 2] += plane[0] + points[:, :2] @ plane[1:]
-
-    def surface(x, y):
-        return plane[0] + plane[1] * x + plane[2] * y
-
+    surface = surfaces.plane(*plane)
     corners = np.array([[x, y, surface(x, y)] for x in (-HALF, HALF) for y in (-HALF, HALF)])
     mesh = WaterMesh(corners + UTM, np.array([[0, 2, 1], [1, 2, 3]]))
-    moved = WaterPlane(
-        plane[0] - plane[1] * UTM[0] - plane[2] * UTM[1], plane[1], plane[2]
-    )  # a of 40 km: good to 1e-11 m
-    for water in (raster(surface, origin=UTM), mesh, moved):
+    # the plane's a of 40 km is good to 1e-11 m
+    for water in (raster(surface, origin=UTM), mesh, surfaces.in_utm(plane)):
         found = trace(centres + UTM, points + UTM, water, refractive_index=INDEX, method=method)
         for p, c, d in zip(points, centres, found.direction, strict=True):
             truth = direction(through_plane(p, c, plane, INDEX), c)

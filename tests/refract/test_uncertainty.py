@@ -15,6 +15,7 @@ import pytest
 from pcfix.model import WaterPlane
 from pcfix.options.correct import LEVEL_M, BudgetOptions, ScienceOptions
 from pcfix.refract import uncertainty
+from pcfix.refract.batch import Learned
 from pcfix.refract.intersect import intersect
 from pcfix.refract.methods import correct, with_rays
 from pcfix.refract.regression import DepthRegression
@@ -57,14 +58,8 @@ def flat(points):
 
 
 def solved(xyz, cameras, settings, **changed):
-    views = views_of(len(xyz), cameras)
-    return correct(
-        batch_of(xyz, flat(len(xyz)), LEVEL, cameras, replace(settings, **changed), views)
-    )
-
-
-def in_frame(*args):
-    return intersect(batch_of(*args))
+    n, settings = len(xyz), replace(settings, **changed)
+    return correct(batch_of(xyz, flat(n), LEVEL, cameras, settings, views_of(n, cameras)))
 
 
 def covariances(xyz, shift_m, above, cameras, settings, views=None, level_sigma_m=None):
@@ -120,7 +115,7 @@ def test_no_bias():
 
 def test_other_points():
     bed, cameras, _ = scene(35.0, points=700)
-    found = in_frame(bed, flat(700), LEVEL, cameras, ScienceOptions())
+    found = intersect(batch_of(bed, flat(700), LEVEL, cameras, ScienceOptions()))
     whole = covariances(bed, found.shift_m, flat(700), cameras, ScienceOptions())
     some = slice(100, 333)
     part = covariances(bed[some], found.shift_m[some], flat(233), cameras, ScienceOptions())
@@ -129,7 +124,7 @@ def test_other_points():
 
 def test_level_sigma():
     bed, cameras, _ = scene(0.0, points=20)
-    found = in_frame(bed, flat(20), LEVEL, cameras, ScienceOptions())
+    found = intersect(batch_of(bed, flat(20), LEVEL, cameras, ScienceOptions()))
 
     def sigma(given, stated=None):
         settings = ScienceOptions(**vars(replace(NONE, sigma_level=stated)))
@@ -158,14 +153,8 @@ def test_other_methods(method):
 
 
 def test_regression():
-    from pcfix.refract.batch import Learned
-
     bed, cameras, _ = scene(0.0, points=5)
     line = DepthRegression(0.0, 1.4, 0.01, 0.01, 0.99, 0.08, 0.11, 20, 1.0, 9.0)
-    found = correct(
-        batch_of(
-            bed, flat(5), LEVEL, cameras, ScienceOptions(method="regression"),
-            views_of(5, cameras), learned=Learned(regression=line),
-        )
-    )  # fmt: skip
+    given = flat(5), LEVEL, cameras, ScienceOptions(method="regression"), views_of(5, cameras)
+    found = correct(batch_of(bed, *given, learned=Learned(regression=line)))
     np.testing.assert_allclose(found.sigma_z_m, 0.11)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.simulate.terrain import STEPS
+from pcfix.simulate.settings import STEPS, SceneSettings
 from tests.utils.codes import refused
+from tests.utils.twins import image_slowly
 
 FEW = {"points": 200, "lidar_per_m2": 0.2}
 
@@ -70,9 +71,15 @@ def test_beds():
     assert 4.5 < depth.max() <= 5.0 + 1e-9
 
 
-def test_tilt_corrected():
-    scene = pcfix.simulate_scene(400, tilt_percent=0.5, lidar_per_m2=0)
-    ours = pcfix.correct_points(scene.xyz, scene.cameras, scene.water, views=scene.views)
-    deep = scene.depth_m(scene.true_xyz) > 2.0
-    error = (ours.xyz - scene.true_xyz)[deep]
-    assert np.abs(error.mean(axis=0)).max() < 0.05
+def test_brown():
+    """The simulated lens against Brown's formula, term by term."""
+    optics = SceneSettings(distortion=(-0.08, 0.03, -0.006, 0.0007, -0.0005)).optics
+    rng = np.random.default_rng(0)
+    ideal = rng.uniform(0, 1, (200, 2)) * [5472, 3648]
+    image = optics.to_image(ideal)
+    for i in range(200):
+        plane = (ideal[i] - [2736, 1824]) / optics.lens.focal
+        slow = image_slowly(optics.lens, np.array([*plane, 1.0]))
+        assert image[i] == pytest.approx(slow, abs=1e-8)  # pixels
+    assert np.abs(image - ideal).max() > 20.0
+    assert optics.to_ideal(image) == pytest.approx(ideal, abs=1e-8)

@@ -22,5 +22,14 @@ def read_raster(path: Any) -> Raster:
         return Raster(source.read(), source.transform, source.crs, source.nodata)
 
 
+def write_raster(path: Any, height: np.ndarray, left: float, top: float, cell: float, **more: Any):
+    """Write heights, shape (rows, columns); `more` goes to rasterio."""
+    rows, columns = height.shape
+    how = {"driver": "GTiff", "width": columns, "height": rows, "count": 1, "dtype": "float64"}
+    transform = rasterio.Affine(cell, 0.0, left, 0.0, -cell, top)
+    with rasterio.open(path, "w", **how, transform=transform, **more) as target:
+        target.write(height, 1)
+
+
 HAS_STATISTICS = tuple(map(int, rasterio.__gdal_version__.split(".")[:2])) >= (3, 8)
 """Whether GDAL writes statistics into cloud-optimised rasters."""

@@ -32,22 +32,25 @@ def test_height():
     assert heights[inside] == pytest.approx(expected[inside], abs=1e-9)
 
 
-def test_all_facets():
+def scene(labels, m=40):
+    """Return points below a rough mesh, cameras above it, the mesh, and its facets' corners."""
     vertices, triangles = random_mesh(relief=0.5)
+    rng, k = np.random.default_rng(8), len(labels)
+    points = np.column_stack([rng.uniform(10, 40, (m, 2)), rng.uniform(-9, -3, m)]) + UTM
+    centres = np.column_stack([rng.uniform(0, 50, (k, 2)), rng.uniform(55, 65, k)]) + UTM
     mesh = pcfix.WaterMesh(vertices, triangles)
-    rng = np.random.default_rng(8)
-    points = np.column_stack([rng.uniform(10, 40, (40, 2)), rng.uniform(-9, -3, 40)]) + UTM
-    centres = np.column_stack([rng.uniform(0, 50, (4, 2)), rng.uniform(55, 65, 4)]) + UTM
-    result = pcfix.correct_points(points, pcfix.Cameras(tuple("abcd"), centres), mesh)
+    return points, pcfix.Cameras(tuple(labels), centres), mesh, vertices[triangles]
+
+
+def test_all_facets():
+    points, cameras, mesh, facets = scene("abcd")
+    result = pcfix.correct_points(points, cameras, mesh)
     assert result.corrected.all()
     for point, found in zip(points, result.xyz, strict=True):
-        hits = [first_hit(vertices[triangles], centre, point) for centre in centres]
-        anchors = [at - point for at, _ in hits]
-        down = [(point - c) / np.linalg.norm(point - c) for c in centres]
-        refracted = [
-            refract_ray(d, normal, 1.34) for d, (_, normal) in zip(down, hits, strict=True)
-        ]
-        expected = point + stacked_intersection(anchors, refracted)
+        at, normals = zip(*(first_hit(facets, c, point) for c in cameras.centres), strict=True)
+        down = [(point - c) / np.linalg.norm(point - c) for c in cameras.centres]
+        refracted = [refract_ray(d, normal, 1.34) for d, normal in zip(down, normals, strict=True)]
+        expected = point + stacked_intersection(np.array(at) - point, refracted)
         assert found == pytest.approx(expected, abs=1e-8)
 
 
@@ -68,23 +71,13 @@ def first_hit(corners, centre, point):
 
 @pytest.mark.parametrize("limit_deg", mostly_nightly((12.0, 18.0, 25.0), 18.0))
 def test_max_angle(limit_deg):
-    vertices, triangles = random_mesh(relief=0.5)
-    mesh = pcfix.WaterMesh(vertices, triangles)
-    rng = np.random.default_rng(9)
-    points = np.column_stack([rng.uniform(10, 40, (30, 2)), rng.uniform(-9, -3, 30)]) + UTM
-    centres = np.column_stack([rng.uniform(0, 50, (12, 2)), rng.uniform(55, 65, 12)]) + UTM
-    cameras = pcfix.Cameras(tuple("abcdefghijkl"), centres)
+    points, cameras, mesh, facets = scene("abcdefghijkl", 30)
     result = pcfix.correct_points(points, cameras, mesh, max_angle=limit_deg)
     for i, point in enumerate(points):
-        angles = np.array([local_incidence_deg(vertices[triangles], c, point) for c in centres])
-        assert result.ray_count[i] in (0, np.sum(angles <= limit_deg))
+        up = (cameras.centres - point) / np.linalg.norm(cameras.centres - point, axis=1)[:, None]
+        normals = [first_hit(facets, c, point)[1] for c in cameras.centres]
+        angles = np.degrees(np.arccos(np.minimum((up * normals).sum(axis=1), 1.0)))
+        used = angles[angles <= limit_deg]
+        assert result.ray_count[i] in (0, len(used))
         if result.corrected[i]:
-            assert result.incidence_deg[i] == pytest.approx(
-                angles[angles <= limit_deg].max(), abs=1e-6
-            )
-
-
-def local_incidence_deg(facets, centre, point):
-    _, normal = first_hit(facets, centre, point)
-    up = (centre - point) / np.linalg.norm(centre - point)
-    return np.degrees(np.arccos(min(1.0, float(normal @ up))))
+            assert result.incidence_deg[i] == pytest.approx(used.max(), abs=1e-6)

@@ -17,8 +17,7 @@ from pcfix.simulate.scene import (
     simulate_scene,
     starts,
 )
-from pcfix.simulate.settings import SceneSettings
-from pcfix.simulate.terrain import Terrain
+from pcfix.simulate.settings import SceneSettings, Terrain
 from tests.utils.matchers.depth_maps import fuse_depth_maps, keep_single_maps, stereo_models
 from tests.utils.matchers.pairs import SAMPLE, TIES, match_pairs, neighbour_table, openmvs_partners
 

@@ -33,7 +33,7 @@ import numpy as np
 
 from pcfix.model import Cameras, FloatArray, IntArray, Lens
 from pcfix.simulate.scene import Visible
-from pcfix.simulate.tracing import piercing_points_of_planes, project, rotations_of
+from pcfix.simulate.tracing import anchors_and_normals, piercing_points_of_planes, project
 from tests.utils.bed_rays import bed_points
 from tests.utils.matchers.pairs import Partners, rows_of
 
@@ -121,7 +121,7 @@ def stereo_models(cameras: Cameras, ground_m: float, count: int) -> Partners:
     """
     base = np.linalg.norm(cameras.centres[:, None] - cameras.centres, axis=2)
     base /= (cameras.centres[:, 2] - ground_m)[:, None]
-    axes, (low, high) = rotations_of(cameras)[:, 2], BASE_TO_HEIGHT
+    axes, (low, high) = cameras.rotations[:, 2], BASE_TO_HEIGHT
     usable = (base >= low) & (base <= high) & (axes @ axes.T > np.cos(np.radians(AXES_WITHIN_DEG)))
     off = np.where(usable, np.abs(base - BEST_BASE), np.inf)
     best = np.argsort(off, axis=1, kind="stable")[:, :count]
@@ -177,7 +177,7 @@ class _Matching:
             return np.where(others >= 0, row_of[imaged.point[:, None], others], -1)
 
         self.imaged, self.normals, self.known = imaged, normals, partners.known
-        self.water = site.water.planes(len(imaged.point))
+        self.water = anchors_and_normals(site.terrain.water, len(imaged.point))
         self.partner = there(partners.matched)
         self.partner[(self.partner >= 0).sum(axis=1) < LEAST_PARTNERS] = -1
         self.averaged, self.fused = there(partners.averaged), there(partners.fused)
@@ -195,7 +195,7 @@ class _Matching:
             _rays(pixels, site.true, camera, lens),
             self.water,
             (imaged.truth[point], self.normals[point]),
-            site.water.refractive_index,
+            site.refractive_index,
         )
         origin, ray = site.given.centres[camera], _rays(pixels, site.given, camera, lens)
         depth = self._depths((origin, ray, depth), seen, best_pair=best_pair)
@@ -215,7 +215,7 @@ class _Matching:
         measured = self._measured(row, seen[reference], self.noise_px[reference, slot])
         origin, ray, first = rays
         camera, given, lens = self.imaged.camera[row], site.given, site.optics.lens
-        turn = rotations_of(given)[camera]
+        turn = given.rotations[camera]
         sightings = Sightings(
             reference,
             measured,
@@ -247,7 +247,7 @@ class _Matching:
         """Return where the images of some rows of `imaged` show places of the bed, ideal pixels."""
         site, camera = self.imaged.site, self.imaged.camera[row]
         anchors, normals = (part[row] for part in self.water)
-        centres, n = site.true.centres[camera], site.water.refractive_index
+        centres, n = site.true.centres[camera], site.refractive_index
         surface = piercing_points_of_planes(seen, centres, anchors, normals, n)
         ideal, _ = project(surface, site.true, camera, site.optics.lens)
         return site.optics.to_ideal(site.optics.to_image(ideal) + noise_px)
@@ -315,7 +315,7 @@ def _rays(pixels: FloatArray, cameras: Cameras, camera: IntArray, lens: Lens) ->
     """Return directions in the world whose component along the optical axis is 1, (m, 3)."""
     plane = (pixels - [lens.principal_x, lens.principal_y]) / lens.focal
     inside = np.column_stack([plane, np.ones(len(plane))])
-    return np.asarray(np.einsum("mij,mi->mj", rotations_of(cameras)[camera], inside))
+    return np.asarray(np.einsum("mij,mi->mj", cameras.rotations[camera], inside))
 
 
 def _least_squares(depth: FloatArray, sightings: Sightings, lens: Lens) -> FloatArray:

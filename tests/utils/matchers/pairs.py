@@ -13,7 +13,7 @@ import numpy as np
 
 from pcfix.model import FloatArray, IntArray
 from pcfix.simulate.scene import Visible, starts
-from pcfix.simulate.tracing import rotations_of, triangulate
+from pcfix.simulate.tracing import triangulate
 
 SAMPLE = 1000
 """Points that overlap and angles are judged by."""
@@ -87,7 +87,7 @@ def openmvs_partners(
     column, row = np.clip((CELLS * share).astype(int), 0, CELLS - 1).T
     cell[imaged.camera, imaged.point] = row * CELLS + column
     cell[_lost(ties, imaged, cameras.centres, rng)] = -1
-    axes = rotations_of(cameras)[:, 2]
+    axes = cameras.rotations[:, 2]
     depth = np.einsum("ki,kpi->kp", axes, ties - cameras.centres[:, None])
     table, known = np.full((k, max(MOST, count)), -1), np.zeros(k, int)
     matched = np.full((k, count), -1)
