@@ -49,6 +49,7 @@ def refuse(files, tmp_path):
 
 
 CLOUD = ("--cloud", "cloud.las")
+GCPS = ("--gcps", "gcps.csv")
 
 
 @pytest.mark.parametrize(
@@ -89,27 +90,34 @@ def higher(xyz):
     return xyz + np.array([0.0, 0.0, 30.0])
 
 
-CONTROL = {
+OTHER_LENS = "focal_px,width_px,height_px\n1000,4000,3000\n"
+CHANGED = {
     "under water": (
-        "gcps.under_water", lambda d, f: write_gcps(d / "gcps.csv", f.scene, wet=False),
+        "gcps.under_water", GCPS, lambda d, f: write_gcps(d / "gcps.csv", f.scene, wet=False),
     ),
-    "next zone": (
-        "gcps.far", lambda d, f: written_control(d, f, next_zone(f.scene.control.xyz)),
+    "control points in the next zone": (
+        "gcps.far", GCPS, lambda d, f: written_control(d, f, next_zone(f.scene.control.xyz)),
     ),
-    "another height datum": (
-        "gcps.offset", lambda d, f: written_control(d, f, higher(f.scene.control.xyz)),
+    "control points of another height datum": (
+        "gcps.offset", GCPS, lambda d, f: written_control(d, f, higher(f.scene.control.xyz)),
     ),
     "unknown image": (
-        "gcps.unknown_image",
+        "gcps.unknown_image", GCPS,
         lambda d, f: replaced(d, "gcps.csv", f.scene.cameras.labels[4], "DJI_9999.JPG"),
+    ),
+    "GNSS of another block": (
+        "gnss.no_image", (), lambda d, _: replaced(d, "gnss.csv", "IMG", "DJI"),
+    ),
+    "calibration of other images": (
+        "sensor.size", ("--lens", "lens.csv"), lambda d, _: (d / "lens.csv").write_text(OTHER_LENS),
     ),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", CONTROL)
-def test_control(refuse, name):
-    code, change = CONTROL[name]
-    refuse(code, "--gcps", "gcps.csv", change=change)
+@pytest.mark.parametrize("name", CHANGED)
+def test_changed_file(refuse, name):
+    code, words, change = CHANGED[name]
+    refuse(code, *words, change=change)
 
 
 @pytest.mark.parametrize("gnss", [True, False])
@@ -121,7 +129,7 @@ def test_swapped_names(refuse, files, gnss, model):
     order = np.arange(len(control.names))
     order[rows] = rows[::-1]
     error = refuse(
-        "gcps.gross_error", "--gcps", "gcps.csv", *CLOUD, model=model, gnss=gnss,
+        "gcps.gross_error", *GCPS, *CLOUD, model=model, gnss=gnss,
         change=lambda d, f: written_control(d, f, control.xyz[order]),
     )  # fmt: skip
     assert error.values["point"] in [control.names[i] for i in rows]
@@ -129,7 +137,7 @@ def test_swapped_names(refuse, files, gnss, model):
 
 def test_waterline_with_cloud(refuse):
     refuse(
-        "adjust.cloud_has_conditions", *CLOUD, "--gcps", "gcps.csv", model="bare",
+        "adjust.cloud_has_conditions", *CLOUD, *GCPS, model="bare",
         change=lambda d, _: replaced(d, "gcps.csv", ",control", ",waterline"),
     )  # fmt: skip
 
@@ -149,14 +157,8 @@ def test_gnss(refuse, code, moved):
         assert error.values["offset_m"][2] == pytest.approx(30.0, abs=0.5)
 
 
-def test_gnss_of_another_block(refuse):
-    refuse("gnss.no_image", change=lambda d, _: replaced(d, "gnss.csv", "IMG", "DJI"))
-
-
-@pytest.mark.parametrize(
-    ("model", "code"), [("wild", "adjust.behind"), ("upside down", "adjust.behind")]
-)
-def test_start_poses(refuse, model, code):
+@pytest.mark.parametrize("model", ["wild", "upside down"])
+def test_start_poses(refuse, model):
     def change(folder, files):
         data, rng = files.data, np.random.default_rng(5)
         turn = Rotation.random(len(data.cameras), rng=rng).as_matrix()
@@ -169,7 +171,7 @@ def test_start_poses(refuse, model, code):
         shutil.rmtree(folder / "model")
         write_colmap(folder / "model", wild, data.ties)
 
-    refuse(code, change=change)
+    refuse("adjust.behind", change=change)
 
 
 def test_all_under_water(refuse, drowned):
@@ -180,9 +182,3 @@ def test_all_under_water(refuse, drowned):
         shutil.copytree(drowned.folder / "model", folder / "model")
 
     refuse("water.no_land", "--free", "level", water=drowned.water, change=change)
-
-
-def test_calibration_of_other_images(refuse):
-    text = "focal_px,width_px,height_px\n1000,4000,3000\n"
-    change = lambda folder, _: (folder / "lens.csv").write_text(text)  # noqa: E731
-    refuse("sensor.size", "--lens", "lens.csv", change=change)

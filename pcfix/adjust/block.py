@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pcfix.adjust.parameters import Unknowns
-from pcfix.errors import GeometryError, PcfixWarning
+from pcfix.errors import GeometryError
 from pcfix.lens.imaging import straight_images, unproject
 from pcfix.model import (
     BoolArray,
@@ -43,10 +42,11 @@ LEAST_DETERMINANT = 1e-5
 TIE_POINTS = 150_000
 """At most; more reduce only the noise, which is no longer the largest error then."""
 
-LEAST_GNSS_SIGMA_M = 0.02
-MOST_OFFSET_M, MOST_OFFSET_SIGMAS = 1.0, 10.0
-"""Mean offset between GNSS and projection centres that indicates another datum, if it exceeds
-both."""
+
+NO_CONTROL = GroundControl(
+    (), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.bool_), np.zeros(0, np.bool_),
+    np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Block:
     water: WaterSurface | None = None
     refractive_index: float = 1.0
     port: Port | None = None  # a housing port as the refracting surface, instead of water
-    control: GroundControl | None = None  # its points are the last ones; check points do not count
+    control: GroundControl = NO_CONTROL  # its points are the last ones; check points do not count
     # parallel planes on which control points lie, perhaps with `WATER`
     parallel: tuple[str, ...] = ()
 
@@ -77,25 +77,20 @@ class Block:
     @property
     def tie_points(self) -> int:
         """Number of tie points."""
-        return len(self.xyz) - (0 if self.control is None else len(self.control.names))
+        return len(self.xyz) - len(self.control.names)
 
     @property
     def is_check(self) -> BoolArray:
         """Check points, shape (m,)."""
-        checks = np.zeros(len(self.xyz), np.bool_)
-        if self.control is not None:
-            checks[self.tie_points :] = self.control.is_check
-        return checks
+        return np.append(np.zeros(self.tie_points, np.bool_), self.control.is_check)
 
     @property
     def survey(self) -> tuple[FloatArray, FloatArray]:
         """Coordinates of control points and their inverse variances, both (m, 3), else zero."""
-        xyz, weight = np.zeros((2, *self.xyz.shape))
-        if (control := self.control) is not None:
-            sigma_m = np.where(control.is_check[:, None], np.inf, control.sigma_m)
-            weight[self.tie_points :] = inverse_variances(control.xyz, sigma_m)
-            xyz[self.tie_points :] = np.nan_to_num(control.xyz)
-        return xyz, weight
+        control, none = self.control, np.zeros((self.tie_points, 3))
+        sigma_m = np.where(control.is_check[:, None], np.inf, control.sigma_m)
+        weight = inverse_variances(control.xyz, sigma_m)
+        return np.vstack([none, np.nan_to_num(control.xyz)]), np.vstack([none, weight])
 
     @property
     def gnss_weights(self) -> FloatArray:
@@ -111,7 +106,7 @@ class Block:
         point lies on a surface.
         """
         control = self.control
-        if control is None or not any(control.on):
+        if not any(control.on):
             return (), np.zeros(0, np.int64), np.zeros(0)
         names = tuple(dict.fromkeys(name for name in control.on if name and name != WATER))
         number = {"": -1, WATER: 0} | {name: i for i, name in enumerate(names, start=1)}
@@ -121,8 +116,7 @@ class Block:
 
 def inverse_variances(values: FloatArray, sigma: FloatArray) -> FloatArray:
     """Return inverse variances; zero where the value or its standard deviation is unknown."""
-    known = np.isfinite(values) & np.isfinite(sigma)
-    return np.where(known, 1.0 / np.where(known, sigma, 1.0) ** 2, 0.0)
+    return np.where(np.isfinite(values), np.nan_to_num(1.0 / sigma**2), 0.0)
 
 
 def plain_block(
@@ -148,7 +142,7 @@ def block_of(
     refractive_index: float,
     *,
     inside: Callable[[FloatArray, FloatArray], BoolArray] | None = None,
-    control: GroundControl | None = None,
+    control: GroundControl = NO_CONTROL,
     level_sigma_m: float = 0.0,
 ) -> Block:
     """Return the block of tie points and control points.
@@ -160,7 +154,7 @@ def block_of(
     wet = np.ones(len(ties.xyz), np.bool_) if inside is None else inside(*ties.xyz[:, :2].T)
     begin = replace(ties, xyz=true_start(ties.xyz, water, refractive_index, wet))
     block = plain_block(cameras, begin, water, refractive_index, wet)
-    return block if control is None else _with_control(block, control, level_sigma_m)
+    return _with_control(block, control, level_sigma_m)
 
 
 def _with_control(block: Block, control: GroundControl, level_sigma_m: float) -> Block:
@@ -201,6 +195,19 @@ def _with_control(block: Block, control: GroundControl, level_sigma_m: float) ->
     )
 
 
+def used_as_dry(
+    control: GroundControl, water: WaterSurface, level_sigma_m: float = 0.0
+) -> list[str]:
+    """Return the names of points below the water that are not marked as under water.
+
+    Their images show them too high, so an adjustment without water that used them is wrong.
+    """
+    level = surface_above(water, control.xyz).height_m
+    least = level - 3.0 * np.hypot(control.sigma_m[:, 2], level_sigma_m)
+    deep = (control.xyz[:, 2] < least) & ~control.under_water
+    return [control.names[i] for i in np.flatnonzero(deep)]
+
+
 def marks_of(control: GroundControl) -> tuple[TiePoints, FloatArray]:
     """Return surveyed points and their marks as tie points, and the marks' standard deviations.
 
@@ -234,56 +241,63 @@ def true_start(
 
 def some_ties(ties: TiePoints, rows: IntArray) -> TiePoints:
     """Return some of the tie points, in the given order."""
-    first, counts = ties.views.start[rows], np.diff(ties.views.start)[rows]
-    begin = np.cumsum(counts) - counts
-    where = np.repeat(first - begin, counts) + np.arange(counts.sum())
-    return TiePoints(ties.xyz[rows], ties.views.take(rows), ties.image_xy[where])
+    of_observations = Views(ties.views.start, np.arange(len(ties.image_xy)))
+    observations = of_observations.take(rows).camera
+    return TiePoints(ties.xyz[rows], ties.views.take(rows), ties.image_xy[observations])
 
 
-def usable_ties(ties: TiePoints, cameras: Cameras, most: int = TIE_POINTS) -> TiePoints:
+def well_observed(ties: TiePoints, kept: BoolArray, least: int = LEAST_VIEWS) -> TiePoints:
+    """Return tie points with some of their observations, without points in too few images."""
+    start = np.append(0, np.cumsum(kept))[ties.views.start]
+    views = Views(start, np.asarray(ties.views.camera)[kept])
+    rows = np.flatnonzero(np.diff(start) >= least)
+    return some_ties(TiePoints(ties.xyz, views, ties.image_xy[kept]), rows)
+
+
+def usable_ties(ties: TiePoints, cameras: Cameras) -> TiePoints:
     """Return the tie points that can be adjusted; a random part of them if there are very many.
 
-    They have coordinates, two images or more, and a sufficient angle between their rays: twice the
-    largest angle between a ray and the mean ray of its point.
+    They have two images or more, and a sufficient angle between their rays: twice the largest angle
+    between a ray and the mean ray of its point. Those without coordinates are intersected.
     """
+    ties = with_places(ties, cameras)
     seen = np.diff(ties.views.start) >= LEAST_VIEWS
     rows = np.flatnonzero(np.isfinite(ties.xyz).all(axis=1) & seen)
     some = some_ties(ties, rows)
-    owner = np.repeat(np.arange(len(rows)), np.diff(some.views.start))
-    ray = cameras.centres[some.views.camera] - some.xyz[owner]
+    first, counts = some.views.start[:-1], np.diff(some.views.start)
+    ray = cameras.centres[some.views.camera] - np.repeat(some.xyz, counts, axis=0)
     ray /= np.linalg.norm(ray, axis=1)[:, None]
-    mean = np.zeros((len(rows), 3))
-    np.add.at(mean, owner, ray)
+    mean = np.add.reduceat(ray, first)
     mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
-    cosine = np.full(len(rows), 1.0)
-    np.minimum.at(cosine, owner, np.einsum("oi,oi->o", ray, mean[owner]))
+    cosine = np.minimum.reduceat((ray * np.repeat(mean, counts, axis=0)).sum(axis=1), first)
     angle_deg = 2.0 * np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     rows = rows[angle_deg >= LEAST_ANGLE_DEG]
-    if len(rows) > most:
-        rows = np.sort(np.random.default_rng(0).choice(rows, most, replace=False))
+    if len(rows) > TIE_POINTS:
+        rows = np.sort(np.random.default_rng(0).choice(rows, TIE_POINTS, replace=False))
     return some_ties(ties, rows)
 
 
 def with_places(ties: TiePoints, cameras: Cameras) -> TiePoints:
     """Return tie points in which those without coordinates are intersected by straight rays.
 
-    The sum of squared distances from the rays is minimised, which is good enough as a start.
+    The sum of squared distances from the rays is minimised, which is good enough as a start:
+    sum (I - r r') (Q - C) = 0 for unit rays r from the centres C.
     """
-    lost = np.flatnonzero(~np.isfinite(ties.xyz).all(axis=1) & (np.diff(ties.views.start) >= 2))
+    seen = np.diff(ties.views.start) >= LEAST_VIEWS
+    lost = np.flatnonzero(~np.isfinite(ties.xyz).all(axis=1) & seen)
     rotations, lenses = np.asarray(cameras.rotations), cameras.lenses or ()
     some = some_ties(ties, lost)
-    owner, camera = np.repeat(np.arange(len(lost)), np.diff(some.views.start)), some.views.camera
-    ray = np.full((len(owner), 3), np.nan)
+    first, camera = some.views.start[:-1], some.views.camera
+    ray = np.full((len(camera), 3), np.nan)
     for c in np.unique(camera):
         ray[camera == c] = unproject(lenses[c], some.image_xy[camera == c]) @ rotations[c]
     across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
     middle = cameras.centres.mean(axis=0)
-    normal, right = np.zeros((len(lost), 3, 3)), np.zeros((len(lost), 3))
-    np.add.at(normal, owner, across)
-    np.add.at(right, owner, np.einsum("oij,oj->oi", across, cameras.centres[camera] - middle))
-    known = np.linalg.det(normal) > LEAST_DETERMINANT  # NaN is not
+    right = np.einsum("oij,oj->oi", across, cameras.centres[camera] - middle)
+    across, right = np.add.reduceat(across, first), np.add.reduceat(right, first)
+    known = np.linalg.det(np.nan_to_num(across)) > LEAST_DETERMINANT
     xyz = ties.xyz.copy()
-    xyz[lost[known]] = np.linalg.solve(normal[known], right[known][:, :, None])[:, :, 0] + middle
+    xyz[lost[known]] = np.linalg.solve(across[known], right[known][:, :, None])[:, :, 0] + middle
     return replace(ties, xyz=xyz)
 
 
@@ -295,12 +309,9 @@ def ties_of_cloud(
     The views say which cameras contributed to them, or have them in their frame.
     """
     owner = np.repeat(np.arange(len(xyz)), np.diff(views.start))
-    image = straight_images(xyz[owner], np.asarray(views.camera), cameras)
-    seen = np.isfinite(image).all(axis=1)
-    counts = np.bincount(owner[seen], minlength=len(xyz))
-    start = np.concatenate([[0], np.cumsum(counts)])
-    tracks = Views(start, np.asarray(views.camera)[seen])
-    return some_ties(TiePoints(xyz, tracks, image[seen]), np.flatnonzero(counts >= least))
+    image_xy = straight_images(xyz[owner], np.asarray(views.camera), cameras)
+    is_imaged = np.asarray(np.isfinite(image_xy).all(axis=1))
+    return well_observed(TiePoints(xyz, views, image_xy), is_imaged, least)
 
 
 # Some of the images
@@ -317,11 +328,10 @@ def restricted(block: Block, rows: IntArray) -> Block:
     place = np.full(len(block.cameras), -1)
     place[rows] = np.arange(len(rows))
     is_left, gnss = place[block.camera] >= 0, block.gnss
-    counts = np.bincount(block.owner[is_left], minlength=len(block.xyz))
     return replace(
         block,
         cameras=some_cameras(block.cameras, rows),
-        start=np.concatenate([[0], np.cumsum(counts)]),
+        start=np.append(0, np.cumsum(is_left))[block.start],
         camera=place[block.camera[is_left]],
         image_xy=block.image_xy[is_left],
         sigma_px=block.sigma_px[is_left],
@@ -339,78 +349,3 @@ def some_cameras(cameras: Cameras, rows: IntArray) -> Cameras:
         lenses=None if cameras.lenses is None else tuple(cameras.lenses[i] for i in rows),
         gnss=None,
     )
-
-
-# Checks of surveys
-
-
-def check_datum(block: Block, unknowns: Unknowns, reason: str = "") -> None:
-    """Check that GNSS, control points, fixed poses or a free network give a datum.
-
-    `reason` is why GNSS positions are not used.
-    """
-    if unknowns.free_network or unknowns.poses == "fixed":
-        return
-    gnss = int((block.gnss_weights > 0.0).all(axis=1).sum())
-    is_control = (block.survey[1] > 0.0).any(axis=1) & (np.diff(block.start) >= LEAST_VIEWS)
-    control = int(is_control.sum())
-    if gnss + control >= 3:
-        return
-    words = (
-        f"Position, orientation and scale of the block are undetermined: {gnss} GNSS positions,"
-        f" {control} control points in two or more images. Give --gnss or --gcps with three points"
-        " or more, or --datum free to keep the mean of the original projection centres."
-        + (f" {reason}" if reason else "")
-    )
-    raise GeometryError("adjust.no_datum", words, gnss=gnss, control=control)
-
-
-def used_as_dry(
-    control: GroundControl, water: WaterSurface, level_sigma_m: float = 0.0
-) -> list[str]:
-    """Return the names of points below the water that are not marked as under water.
-
-    Their images show them too high, so an adjustment without water that used them is wrong.
-    """
-    level = surface_above(water, control.xyz).height_m
-    least = level - 3.0 * np.hypot(control.sigma_m[:, 2], level_sigma_m)
-    deep = (control.xyz[:, 2] < least) & ~control.under_water
-    return [control.names[i] for i in np.flatnonzero(deep)]
-
-
-def gnss_with_sigma(
-    centres: FloatArray, found: GnssPositions, name: str, sigma_m: float | None
-) -> tuple[GnssPositions | None, list[PcfixWarning]]:
-    """Return GNSS positions with standard deviations (infinite for unknown ones), and warnings.
-
-    They are in the frame of the centres, shape (k, 3), metres; `name` is their file. Positions that
-    state no standard deviation get `sigma_m`, or None estimates it from their scatter about the
-    centres.
-    """
-    known = np.isfinite(found.xyz)
-    if not known.any():
-        return None, []
-    sigma = np.where(known, found.sigma_m, np.inf)
-    silent = known & ~np.isfinite(found.sigma_m)
-    off, notes = np.where(known, centres - found.xyz, np.nan), []
-    if silent.any() and sigma_m is None:
-        rest = off - np.nanmedian(off, axis=0)
-        sigma_m = max(1.4826 * float(np.nanmedian(np.abs(rest))), LEAST_GNSS_SIGMA_M)
-        words = (
-            f"The GNSS positions have no standard deviations; {sigma_m:.2f} m is assumed, from"
-            " their scatter about the projection centres. Give --gnss-sigma if you know it."
-        )
-        notes.append(PcfixWarning("gnss.no_sigma", words, sigma_m=sigma_m))
-    if silent.any():
-        sigma[silent] = sigma_m
-    mean = np.nan_to_num(np.nanmean(off, axis=0))
-    typical = float(np.median(sigma[np.isfinite(sigma)]))
-    if np.abs(mean).max() > max(MOST_OFFSET_M, MOST_OFFSET_SIGMAS * typical):
-        x, y, z = (-mean).tolist()
-        words = (
-            f"{name}: the GNSS positions are on average {x:.2f}, {y:.2f}, {z:.2f} m (x, y, z) from"
-            " the projection centres, so they have another datum or CRS (ellipsoidal heights?)."
-            " Name it with --gnss-crs, or transform the positions or the model."
-        )
-        raise GeometryError("gnss.offset", words, path=name, offset_m=[x, y, z])
-    return GnssPositions(found.xyz, sigma, None), notes

@@ -142,6 +142,7 @@ def surface_at(water: FloatArray, given: Given, x: float, y: float) -> Vector:
 def _set_plane(work: Workspace, water: FloatArray, given: Given, q: Vector, centre: Vector) -> bool:
     """Set the refracting plane (N, h) for light from Q to C; return if Q is below the water."""
     plane = work.plane
+    # the first plane is tangent above Q; a plane of water is that already
     z, b, c = surface_at(water, given, q[0], q[1])
     if not z > q[2]:
         return False
@@ -154,6 +155,7 @@ def _set_plane(work: Workspace, water: FloatArray, given: Given, q: Vector, cent
         path = light_path(q, centre, normal, plane[3], water[INDEX])
         x, y, z_plane = beyond(centre, path[2], direction(path, normal))
         z, b_there, c_there = surface_at(water, given, x, y)
+        # by how much the light moves: height of the plane, and its slope over the path in water
         change = abs(z - z_plane) + abs(path[3]) * (abs(b_there - b) + abs(c_there - c))
         lay(plane, x, y, z, b_there, c_there)
         if not change > CLOSE_M:
@@ -176,6 +178,7 @@ def _curved_gradients(
     for column in range(13):
         out[:, column + 1] = 0.0
         for sign in (1.0, -1.0):
+            # Q in columns 0 to 2, C in 3 to 5, then the water; one of them moves along one axis
             step, by = sign * DIFFERENCES[column], column % 3
             axis = (1.0 if by == 0 else 0.0, 1.0 if by == 1 else 0.0, 1.0 if by == 2 else 0.0)
             q_there = beyond(q, step if column < 3 else 0.0, axis)
@@ -205,6 +208,7 @@ def image_and_all_gradients(
     q, centre = vector(state.xyz[p]), vector(state.centres[c])
     r, water = state.rotations[c], state.water
     light, plane, ahead = work.light, work.plane, work.ahead
+    # the light at the projection centre: refracted under water, straight from land to camera
     if given.wet[p] and _set_plane(work, water, given, q, centre):
         light_and_gradients(q, centre, vector(plane), plane[3], water[INDEX], light)
         if given.curved:
@@ -214,6 +218,7 @@ def image_and_all_gradients(
         for i in range(3):
             light[i, 0] = q[i] - centre[i]
             light[i, 1 + i], light[i, 4 + i] = 1.0, -1.0
+    # turned into the camera frame, through a port, and imaged by the lens
     x = times(r, column_of(light, 0))
     ahead[0], ahead[1], ahead[2] = x
     behind = work.behind_port
@@ -235,6 +240,7 @@ def image_and_all_gradients(
                 dot(g, column_of(behind, 2)),
                 dot(g, column_of(behind, 3)),
             )
+        # g, the gradient by x: x cross g by omega; R'g by the light, then chain rule to Q, C, water
         out[row, 0], out[row, 1], out[row, 2] = cross(x, g)
         w = transposed_times(r, g)
         for i in range(3):
@@ -254,6 +260,7 @@ def lens_gradients(c: FloatArray, ahead: FloatArray, codes: IntArray, out: Float
     For a lens whose formula goes from the image to the plane (`inverse`), x' solves B(x') = x, so
     that d x' = -J^-1 d B.
     """
+    # p in the plane of the projection; Brown's formula takes a, and d is the distorted p
     px, py, _ = plane_and_gradients(c, ahead[0], ahead[1], ahead[2])
     px, py = px - c[formulas.CENTRE_X], py - c[formulas.CENTRE_Y]
     inverse = c[formulas.INVERSE] != 0.0
@@ -265,6 +272,7 @@ def lens_gradients(c: FloatArray, ahead: FloatArray, codes: IntArray, out: Float
     else:
         ax, ay = px, py
         dx, dy, _ = distorted(c, px, py)
+    # u = cx + (f + b1) d_x + b2 d_y, v = cy + f d_y + b3 d_x, with d from the principal axis
     fx, fy, b2, b3 = c[formulas.FOCAL_X], c[formulas.FOCAL_Y], c[formulas.B2], c[formulas.B3]
     for i in range(codes.size):
         code = codes[i]
@@ -319,6 +327,7 @@ def condition(state: State, given: Given, p: int, work: Workspace, at: int) -> b
         return False
     row, r = work.right[at], work.r[at]
     q, numbers, number, weight = state.xyz[p], state.water, given.on[p], given.on_weight[p]
+    # z = a + b x + c y, where z is along the main axis of the normal, and x and y are the next two
     up = given.axis[number]
     x, y = q[(up + 1) % 3], q[(up + 2) % 3]
     first = 0 if number == 0 else PLANES + 3 * (number - 1)
@@ -329,6 +338,8 @@ def condition(state: State, given: Given, p: int, work: Workspace, at: int) -> b
         z, b, c = surface_at(numbers, given, x, y)
     if np.isnan(z):
         return False
+    # like an image: q_z - z is measured as zero; its derivatives are (-b, -c, 1) by the point, and
+    # -(1, x, y, x^2, x y, y^2) by the unknowns of the surface
     row[:], r[1] = 0.0, 0.0
     r[0] = weight * (z - q[up])
     row[0, POINT + up] = weight

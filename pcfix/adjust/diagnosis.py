@@ -20,7 +20,7 @@ The first sign that is significant decides.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,7 +42,6 @@ from pcfix.water.surface import is_submerged, surface_above
 
 if TYPE_CHECKING:  # not quick to load
     from pcfix.adjust.from_cloud import Undone
-    from pcfix.adjust.problem import Intersected
 
 ORDER = (
     *("tie points", "GNSS positions", "measured depths"),
@@ -87,9 +86,10 @@ class Sign:
     """One statistic."""
 
     name: str  # one of `ORDER`
-    speaks: bool | None  # whether it says that refraction was absorbed; None if not significant
+    absorbed: bool | None  # whether it says that refraction was absorbed; None if not significant
     words: str  # what was found
-    figures: dict[str, float] = field(default_factory=dict)
+    share: float | None = None  # what is compared with a limit, and its standard error
+    sigma_share: float | None = None
     error_m: float | None = None  # likely error of the heights, if it was absorbed
 
 
@@ -102,19 +102,19 @@ class Diagnosis:
     @property
     def decided_by(self) -> Sign | None:
         """The first sign with evidence."""
-        return next((sign for sign in self.signs if sign.speaks is not None), None)
+        return next((sign for sign in self.signs if sign.absorbed is not None), None)
 
     @property
     def absorbed(self) -> bool | None:
         """Whether the poses have absorbed the refraction; None if unknown."""
-        return None if self.decided_by is None else self.decided_by.speaks
+        return None if self.decided_by is None else self.decided_by.absorbed
 
     @property
     def likely_error_m(self) -> float | None:
         """The error that land shows, else that of the sign that decides; None if none is likely."""
         if self.decided_by is None or not self.absorbed:
             return None
-        land = [sign for sign in self.signs if sign.name == "heights of land" and sign.speaks]
+        land = [sign for sign in self.signs if sign.name == "heights of land" and sign.absorbed]
         return (land or [self.decided_by])[-1].error_m
 
     def sentence(self, command: str) -> str:
@@ -134,10 +134,7 @@ class Diagnosis:
         return {
             "absorbed": self.absorbed,
             "likely_error_m": self.likely_error_m,
-            "signs": [
-                {"name": s.name, "absorbed": s.speaks, "words": s.words, **s.figures}
-                for s in self.signs
-            ],
+            "signs": [{**vars(sign)} for sign in self.signs],
         }
 
 
@@ -157,30 +154,53 @@ def _absorbed_words(share: float, sigma: float) -> str:
 
 
 def tie_point_sign(
-    straight: Intersected, refracted: Intersected, depth_m: FloatArray
-) -> Sign | None:
+    cameras: Cameras, water: WaterSurface, n: float, ties: TiePoints
+) -> tuple[Sign | None, FloatArray | None]:
     """Compare residuals of the same tie points with straight and refracted rays.
-
-    Their depths, shape (m,), are those of the straight intersection; negative on land.
 
     With the residuals s without and r with refraction, d = s - r is what straight rays cannot fit.
     With true poses r is noise, which is independent of d; with poses that absorbed the refraction s
     is noise. So b = -(r . d) / (d . d) is 0 or 1, whatever the noise. Its standard error is that of
     a jackknife over parts of the area, as errors of a pose are common to neighbours.
+
+    Also returns the intersections of the straight rays, shape (m, 3); None if there are too few.
     """
-    redundancy = straight.redundancy
-    worst = np.maximum(straight.squares, refracted.squares) / np.maximum(redundancy, 1)
-    good = np.isfinite(worst) & (redundancy > 0) & np.isfinite(depth_m)
+    is_known = np.isfinite(ties.xyz).all(axis=1)
+    rows = np.flatnonzero((np.diff(ties.views.start) >= LEAST_TIE_VIEWS) & is_known)
+    if len(rows) < LEAST_POINTS:
+        return None, None
+    from pcfix.adjust.problem import intersect_fixed  # not quick to load
+
+    some = some_ties(ties, rows[:: max(1, len(rows) // TIE_POINTS)])
+    block = plain_block(cameras, some, None, n)
+    xyz, straight_px = intersect_fixed(block)
+    above = surface_above(water, xyz)
+    wet = is_submerged(xyz[:, 2], above)
+    begin = true_start(xyz, water, n, wet)
+    _, refracted_px = intersect_fixed(replace(block, xyz=begin, wet=wet, water=water))
+
+    def sums(values: FloatArray) -> FloatArray:
+        """Return the sums over the observations of each point."""
+        return np.asarray(np.bincount(block.owner, values.sum(axis=1), len(xyz)), np.float64)
+
+    # points under water without outliers; three coordinates of each are estimated
+    straight, refracted, redundancy = (
+        sums(straight_px**2),
+        sums(refracted_px**2),
+        2 * np.diff(block.start) - 3,
+    )
+    worst = np.maximum(straight, refracted) / redundancy
+    good = np.isfinite(worst) & np.isfinite(above.height_m)
     if good.any():
         good &= worst <= np.quantile(worst[good], 1.0 - OUTLIERS)
-    wet = good & (depth_m > 0.0)
+    apparent = xyz[np.isfinite(straight)]
+    wet &= good
     if wet.sum() < LEAST_POINTS:
-        return None
-    d = straight.residual_px - refracted.residual_px
-    over = straight.sums(-(refracted.residual_px * d).sum(axis=1))[wet]
-    under = straight.sums((d * d).sum(axis=1))[wet]
+        return None, apparent
+    d = straight_px - refracted_px
+    over, under = sums(-refracted_px * d)[wet], sums(d * d)[wet]
     # as many points in each part of the area along x and along y; each is left out in turn
-    ranks = np.argsort(np.argsort(straight.xyz[wet, :2], axis=0, kind="stable"), axis=0)
+    ranks = np.argsort(np.argsort(xyz[wet, :2], axis=0, kind="stable"), axis=0)
     x, y = (ranks * PARTS // len(ranks)).T
     part = np.unique(x * PARTS + y, return_inverse=True)[1].ravel()
     a, b, g = np.bincount(part, over), np.bincount(part, under), int(part.max()) + 1
@@ -189,57 +209,50 @@ def tie_point_sign(
     sigma = float(np.sqrt((g - 1) / g * ((without - without.mean()) ** 2).sum()))
     # standard deviations of an image coordinate
     free = redundancy[wet].sum()
-    s_px, r_px = (float(np.sqrt(one.squares[wet].sum() / free)) for one in (straight, refracted))
-    figures = {"share": share, "sigma_share": sigma}
-    figures |= {"wet_straight_px": s_px, "wet_refracted_px": r_px}
+    s_px, r_px = (float(np.sqrt(one[wet].sum() / free)) for one in (straight, refracted))
     words = (
         f"tie points under water have residuals of {s_px:.2f} px with straight rays and"
         f" {r_px:.2f} px with refraction, so {_absorbed_words(share, sigma)}"
     )
-    speaks = None if sigma > MOST_SIGMA else _exceeds(share, sigma, SHARE)
-    return Sign("tie points", speaks, words, figures)
+    absorbed = None if sigma > MOST_SIGMA else _exceeds(share, sigma, SHARE)
+    return Sign("tie points", absorbed, words, share, sigma), apparent
 
 
 # GNSS
 
 
-def gnss_sign(centres: FloatArray, off_m: FloatArray, sigma_m: FloatArray, undone: Undone) -> Sign:
+def gnss_sign(cameras: Cameras, gnss: GnssPositions, undone: Undone) -> Sign:
     """Look for the pattern of absorbed refraction in adjusted minus GNSS positions.
 
     The pattern is the centres minus those that an adjustment with water finds without the GNSS
     (`pcfix.adjust.from_cloud.undo_absorption`).
 
-    All arrays have the shape (k, 3): adjusted centres, adjusted minus GNSS (NaN where there is
-    none), and the stated standard deviations of the GNSS (NaN if not).
-
     off = b pattern + shift, turn and scale of the block + noise, by least squares. The noise is
     that of the residuals, or that stated of the GNSS if it is larger.
     """
-    centres, off_m = centres[undone.row], off_m[undone.row]
-    rows = np.isfinite(off_m)
-    y, base = off_m[rows], similarity_gradients(centres - centres.mean(axis=0))[rows]
+    centres, xyz = cameras.centres[undone.row], gnss.xyz[undone.row]
+    rows = np.isfinite(xyz)
+    y, base = (centres - xyz)[rows], similarity_gradients(centres - centres.mean(axis=0))[rows]
 
     def rest(values: FloatArray, columns: FloatArray) -> FloatArray:
         """Return the residuals of a least squares fit."""
         return np.asarray(values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0])
 
-    clear = rest((centres - undone.cameras.centres)[rows], base)
+    clear = rest(undone.pattern_m[rows], base)
     share = float(clear @ y) / max(float(clear @ clear), 1e-300)
     left = rest(y, np.column_stack([base, clear]))
     noise = float(np.linalg.norm(left) / np.sqrt(max(len(y) - 8, 1)))
-    stated = sigma_m[undone.row][rows]
+    stated = gnss.sigma_m[undone.row][rows]
     if np.isfinite(stated).any() and np.nanmedian(stated) < MOST_STATED_M:
         noise = max(noise, float(np.nanmedian(stated)))
     sigma = noise / max(float(np.linalg.norm(clear)), 1e-150)
-    rms = float(np.sqrt(np.mean(y * y)))
     words = (
-        f"projection centres differ from the GNSS by {rms:.3f} m RMS, and by their pattern"
-        f" {_absorbed_words(share, sigma)}"
+        f"projection centres differ from the GNSS by {np.sqrt(np.mean(y * y)):.3f} m RMS, and by"
+        f" their pattern {_absorbed_words(share, sigma)}"
     )
     is_useful = share <= MOST_SHARE and sigma <= MOST_SIGMA
-    speaks = _exceeds(share, sigma, SHARE) if is_useful else None
-    figures = {"share": share, "sigma_share": sigma, "rms_m": rms}
-    return Sign("GNSS positions", speaks, words, figures, undone.error_m)
+    absorbed = _exceeds(share, sigma, SHARE) if is_useful else None
+    return Sign("GNSS positions", absorbed, words, share, sigma, undone.error_m)
 
 
 # Surveys, and the cloud itself
@@ -257,8 +270,8 @@ def land_sign(higher_m: FloatArray, gsd_m: float) -> Sign | None:
         f"land of the cloud is {abs(bias):.3f} m too {side} ({len(found):,} places, spread"
         f" {spread:.3f} m, limit {limit:.3f} m)"
     )
-    figures = {"bias_m": bias, "spread_m": spread, "limit_m": limit, "places": float(len(found))}
-    return Sign("heights of land", True if abs(bias) > limit else None, words, figures, abs(bias))
+    absorbed = True if abs(bias) > limit else None
+    return Sign("heights of land", absorbed, words, error_m=abs(bias))
 
 
 def _median_of(values: FloatArray) -> tuple[float, float, float]:
@@ -281,9 +294,8 @@ def bed_sign(apparent_m: FloatArray, true_m: FloatArray, refractive_index: float
         f"the bed of the cloud has {share:.2f} of its measured depth before any correction,"
         f" standard error {sigma:.2f} (limit {limit:.2f})"
     )
-    figures = {"share": share, "sigma_share": sigma, "limit": limit}
     error_m = float(np.sqrt(np.mean(after**2)))
-    return Sign("measured depths", _exceeds(share, sigma, limit), words, figures, error_m)
+    return Sign("measured depths", _exceeds(share, sigma, limit), words, share, sigma, error_m)
 
 
 def neighbours_sign(share: float, sigma: float, *, is_fused: bool) -> Sign:
@@ -298,8 +310,8 @@ def neighbours_sign(share: float, sigma: float, *, is_fused: bool) -> Sign:
         f" corrected bed (standard error {100.0 * sigma:.0f} %, limit 50 %; filtering and meshing"
         " also leave some)"
     )
-    speaks = _exceeds(share, sigma, 0.5) if is_fused or share < 0.5 else None
-    return Sign("neighbouring points", speaks, words, {"share": share, "sigma_share": sigma})
+    absorbed = _exceeds(share, sigma, 0.5) if is_fused or share < 0.5 else None
+    return Sign("neighbouring points", absorbed, words, share, sigma)
 
 
 # All signs
@@ -309,10 +321,10 @@ def diagnosed(
     cameras: Cameras,
     water: WaterSurface,
     n: float,
+    view: Any,
     *,
     ties: TiePoints | None = None,
     gnss: GnssPositions | None = None,
-    view: Any = None,
     control: GroundControl | None = None,
     reference: Any = None,
     neighbours: Sign | None = None,
@@ -330,8 +342,7 @@ def diagnosed(
         lenses = cameras.lenses
         if cameras.rotations is not None and lenses and all(one.unit == "px" for one in lenses):
             signs += _signs_of_rays(cameras, water, n, ties, gnss, view, in_passing=in_passing)
-        if view is not None:
-            signs += _signs_of_surveys(cameras, water, n, view, control, reference)
+        signs += _signs_of_surveys(cameras, water, n, view, control, reference)
     known = [sign for sign in signs if sign is not None]
     return Diagnosis(tuple(sorted(known, key=lambda sign: ORDER.index(sign.name))))
 
@@ -341,53 +352,27 @@ def _signs_of_rays(
     gnss: GnssPositions | None, view: Any, *, in_passing: bool,
 ) -> list[Sign]:  # fmt: skip
     """Look at tie points and at the GNSS, and predict the error if they say that it is there."""
-    by_ties, apparent = _sign_of_ties(cameras, water, n, ties)
-    signs, speaks = [by_ties] if by_ties else [], None if by_ties is None else by_ties.speaks
-    off = np.full((len(cameras), 3), np.nan) if gnss is None else cameras.centres - gnss.xyz
-    is_known = int(np.isfinite(off).sum()) >= LEAST_COORDINATES
-    if not speaks and (not is_known or (in_passing and speaks is False)):
+    sign, apparent = (None, None) if ties is None else tie_point_sign(cameras, water, n, ties)
+    signs, absorbed = ([], None) if sign is None else ([sign], sign.absorbed)
+    is_known = gnss is not None and np.isfinite(gnss.xyz).sum() >= LEAST_COORDINATES
+    if not absorbed and (not is_known or (in_passing and absorbed is False)):
+        return signs
+    if len(cameras) > (QUICK_IMAGES if in_passing else MOST_IMAGES):
         return signs
     # the pattern of absorbed refraction, by tie points or points spread over the cloud
     from pcfix.adjust.from_cloud import undo_absorption  # not quick to load
 
     wanted = max(CLOUD_POINTS, POINTS_PER_IMAGE * len(cameras))
-    if len(cameras) > (QUICK_IMAGES if in_passing else MOST_IMAGES):
-        return signs
-    if apparent is None and view is not None:
+    if apparent is None:
         every = max(1, view.points // wanted)
-        apparent = np.vstack([np.zeros((0, 3)), *(one.xyz[::every] for one in view.chunks())])
+        apparent = np.vstack([one.xyz[::every] for one in view.chunks()])
     try:
-        some = np.zeros((0, 3)) if apparent is None else apparent
-        true = undo_absorption(some[:: max(1, len(some) // wanted)], cameras, water, n)
+        some = apparent[:: max(1, len(apparent) // wanted)]
+        undone = undo_absorption(some, cameras, water, n)
     except GeometryError:
         return signs
-    signs = [replace(sign, error_m=true.error_m) for sign in signs]
-    if gnss is not None and is_known:
-        signs.append(gnss_sign(cameras.centres, off, gnss.sigma_m, true))
-    return signs
-
-
-def _sign_of_ties(
-    cameras: Cameras, water: WaterSurface, n: float, ties: TiePoints | None
-) -> tuple[Sign | None, FloatArray | None]:
-    """Intersect some tie points with straight and refracted rays; return the straight ones too."""
-    if ties is None:
-        return None, None
-    counts = np.diff(ties.views.start)
-    rows = np.flatnonzero((counts >= LEAST_TIE_VIEWS) & np.isfinite(ties.xyz).all(axis=1))
-    if not len(rows):
-        return None, None
-    from pcfix.adjust.problem import intersect_fixed  # not quick to load
-
-    some = some_ties(ties, rows[:: max(1, len(rows) // TIE_POINTS)])
-    block = plain_block(cameras, some, None, n)
-    straight = intersect_fixed(block)
-    above = surface_above(water, straight.xyz)
-    wet = is_submerged(straight.xyz[:, 2], above)
-    begin = true_start(straight.xyz, water, n, wet)
-    refracted = intersect_fixed(replace(block, xyz=begin, wet=wet, water=water))
-    sign = tie_point_sign(straight, refracted, above.height_m - straight.xyz[:, 2])
-    return sign, straight.xyz[np.isfinite(straight.squares)]
+    signs = [replace(one, error_m=undone.error_m) for one in signs]
+    return [*signs, gnss_sign(cameras, gnss, undone)] if gnss is not None and is_known else signs
 
 
 def _signs_of_surveys(

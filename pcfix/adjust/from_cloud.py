@@ -36,14 +36,7 @@ from pcfix.adjust.collinearity import SHARED
 from pcfix.adjust.normal import UNDAMPED, linearised, point_steps, residuals
 from pcfix.adjust.parameters import Unknowns
 from pcfix.adjust.precision import precision_of
-from pcfix.adjust.problem import (
-    Problem,
-    Solution,
-    intersect_fixed,
-    prepare,
-    solved_cameras,
-    survey_cost,
-)
+from pcfix.adjust.problem import Problem, Solution, intersect_fixed, prepare, survey_cost
 from pcfix.adjust.result import Adjusted, adjusted_of
 from pcfix.adjust.solve import moved_by, reduced_at, show
 from pcfix.errors import GeometryError, PcfixWarning
@@ -179,6 +172,7 @@ def _trial(
     marks, weight = problem.used & (owner >= m), problem.given.weight
     r = residuals(found.state, problem.given)[marks]
     in_images = float((r * r * weight[marks][:, None] ** 2).sum())
+    # observations with noise, minus the coordinates of the surveyed points
     surveyed = problem.given.surveyed_weight > 0.0
     count = int((block.gnss_weights > 0.0).sum()) + 2 * int(marks.sum()) + int(surveyed.sum())
     count -= 3 * int(surveyed.any(axis=1).sum())
@@ -236,17 +230,17 @@ LEAST_IMAGES_OF_POINT, LEAST_POINTS, LEAST_IMAGES = 3, 10, 5
 
 
 class Undone(NamedTuple):
-    """The poses if they had absorbed the refraction, and the error that this implies."""
+    """What the poses would have absorbed, and the error of heights that this implies."""
 
-    cameras: Cameras  # those with enough points
-    row: IntArray  # (k,), their rows among all cameras
+    row: IntArray  # (k,), rows of the cameras with enough points
+    pattern_m: FloatArray  # (k, 3), their centres minus those of an adjustment with water
     error_m: float  # RMS, heights of the land now, or if there is none of the corrected bed
 
 
 def undo_absorption(
     xyz: FloatArray, cameras: Cameras, water: WaterSurface, refractive_index: float
 ) -> Undone:
-    """Return the poses that an adjustment with water would have found; the block stays in place.
+    """Return the centres minus those of an adjustment with water; the block stays in place.
 
     The points, shape (m, 3), are a thousand or two of the apparent cloud or of its tie points.
     """
@@ -254,7 +248,7 @@ def undo_absorption(
     shown = ties_of_cloud(xyz, in_frame, cameras, least).views.camera
     row = np.flatnonzero(np.bincount(shown, minlength=len(cameras)) >= LEAST_POINTS)
     if len(row) < LEAST_IMAGES:
-        raise _unsolved(f"only {len(row)} images have {LEAST_POINTS} points of the cloud")
+        raise _unsolved(f"{len(row)} images have {LEAST_POINTS} points, {LEAST_IMAGES} are needed")
     cameras = some_cameras(cameras, row)
     ties = ties_of_cloud(xyz, views_in_frame(xyz, cameras), cameras, least)
     wet = is_submerged(ties.xyz[:, 2], surface_above(water, ties.xyz))
@@ -265,8 +259,8 @@ def undo_absorption(
     sigma_m = np.full((len(cameras), 3), OWN_SIGMA_M)
     block = replace(block, gnss=GnssPositions(cameras.centres, sigma_m, None))
     trial = _trial(block, cameras, ties.xyz, Unknowns(lens=("f",)), SIGMA_PX)
-    problem, found = trial.problem, trial.found
-    higher = found.state.xyz[:, 2] + problem.origin[2] - intersect_fixed(block).xyz[:, 2]
+    origin, state = trial.problem.origin, trial.found.state
+    higher = state.xyz[:, 2] + origin[2] - intersect_fixed(block)[0][:, 2]
     is_land = ~wet if (~wet & np.isfinite(higher)).any() else wet
     error_m = float(np.sqrt(np.nanmean(higher[is_land] ** 2)))
-    return Undone(solved_cameras(problem, found), row, error_m)
+    return Undone(row, cameras.centres - origin - state.centres, error_m)

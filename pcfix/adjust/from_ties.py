@@ -174,7 +174,7 @@ def weak_lens_parameters(problem: Problem, found: Solution, precision: Precision
     None are returned if all of them moved further together than chance allows.
     """
     names = [NAMES[code] for code in problem.given.code.tolist()]
-    sigma = np.array([row.sigma for row in precision.shared[: len(names)]])
+    sigma = precision.shared_sigma[: len(names)]
     by_px = zip(names, sigma * problem.lens_effects, strict=True)
     weak = list(dict.fromkeys(name for name, by in by_px if name != "f" and by > WEAK_PX))
     rows = np.flatnonzero(np.isin(names, weak))
@@ -207,17 +207,17 @@ def missing_lens_parameters(problem: Problem, now: Solution, sigma0: float) -> l
     border, own = matrix[~mine][:, mine], matrix[mine][:, mine]
     if not isinstance(matrix, np.ndarray):
         border, own = border.toarray(), own.toarray()
-    taken = solve_for(np.column_stack([border, right[~mine]]))
-    left = own - border.T @ taken[:, :-1]
-    pull = right[mine] - border.T @ taken[:, -1]
+    # R and its right side c
+    rest = np.column_stack([own, right[mine]])
+    rest -= border.T @ solve_for(np.column_stack([border, right[~mine]]))
     tried = np.flatnonzero(is_tried)
     code, effect = given.code[tried], wide.lens_effects[tried]
 
     def squares(codes: list[int]) -> tuple[float, FloatArray]:
         """Return by how much these lower the squares, and their effects' standard errors."""
         rows = np.isin(code, codes)
-        covariance = np.linalg.inv(left[np.ix_(rows, rows)])
-        gain = float(pull[rows] @ covariance @ pull[rows]) / max(sigma0, 1.0) ** 2
+        covariance, pull = np.linalg.inv(rest[rows][:, :-1][:, rows]), rest[rows, -1]
+        gain = float(pull @ covariance @ pull) / max(sigma0, 1.0) ** 2
         return gain, sigma0 * np.sqrt(covariance.diagonal()) * effect[rows]
 
     chosen: list[int] = []

@@ -7,7 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.adjust.block import Block, marks_of, plain_block, restricted, some_cameras, well_seen
+from pcfix.adjust.block import (
+    LEAST_VIEWS,
+    Block,
+    marks_of,
+    plain_block,
+    restricted,
+    some_cameras,
+    well_seen,
+)
 from pcfix.adjust.from_cloud import adjust_cloud
 from pcfix.adjust.from_ties import adjust_ties
 from pcfix.adjust.parameters import Unknowns, words_of
@@ -15,17 +23,27 @@ from pcfix.adjust.precision import Precision
 from pcfix.adjust.problem import intersect_fixed
 from pcfix.adjust.result import Adjusted
 from pcfix.errors import GeometryError, PcfixWarning
-from pcfix.model import Cameras, FloatArray, GroundControl
+from pcfix.model import Cameras, FloatArray, GnssPositions, GroundControl
 from pcfix.water.surface import surface_above
 
-SMALL_WATER = 10
-"""Tie points on one side of the surface that are needed for it to count as observed."""
+LEAST_GNSS_SIGMA_M = 0.02
+MOST_OFFSET_M, MOST_OFFSET_SIGMAS = 1.0, 10.0
+"""Mean offset between GNSS and projection centres that indicates another datum, if it exceeds
+both."""
 
 GROSS_SIGMAS, GROSS_PX = 20.0, 10.0
 """A control point with larger errors than both is a mistake, not noise."""
 
 MOST_OFFSET = 0.1
 """Share of the flying height; no absorbed refraction puts control points that far off."""
+
+_REMEDY = (
+    "Check its name, coordinates and marks (swapped names?). A point with the role check has no"
+    " weight."
+)
+
+SMALL_WATER = 10
+"""Tie points on one side of the surface that are needed for it to count as observed."""
 
 BED_GSD = 1.5
 """Standard error of the heights of the bed, in ground pixels, that is worth a warning."""
@@ -39,11 +57,6 @@ LIMITS = {
 
 STRONG = 0.95
 """Correlation of two unknowns that are hardly separated."""
-
-_REMEDY = (
-    "Check its name, coordinates and marks (swapped names?). A point with the role check has no"
-    " weight."
-)
 
 
 def adjust_block(
@@ -81,9 +94,7 @@ def adjust_block(
     if cloud is None:
         found = adjust_ties(block, unknowns, choose_lens=choose_lens)
     else:
-        original, apparent = some_cameras(cloud[0], rows), cloud[1]
-        if block.control is not None:
-            apparent = np.vstack([apparent, block.control.xyz])
+        original, apparent = some_cameras(cloud[0], rows), np.vstack([cloud[1], block.control.xyz])
         found = adjust_cloud(block, original, apparent, unknowns, choose_lens=choose_lens)
 
     # 3. What its user should know
@@ -92,6 +103,65 @@ def adjust_block(
 
 
 # Checks of what goes in
+
+
+def gnss_with_sigma(
+    centres: FloatArray, found: GnssPositions, name: str, sigma_m: float | None
+) -> tuple[GnssPositions | None, list[PcfixWarning]]:
+    """Return GNSS positions with standard deviations (infinite for unknown ones), and warnings.
+
+    They are in the frame of the centres, shape (k, 3), metres; `name` is their file. Positions that
+    state no standard deviation get `sigma_m`, or None estimates it from their scatter about the
+    centres.
+    """
+    known = np.isfinite(found.xyz)
+    if not known.any():
+        return None, []
+    sigma = np.where(known, found.sigma_m, np.inf)
+    silent = known & ~np.isfinite(found.sigma_m)
+    off, notes = np.where(known, centres - found.xyz, np.nan), []
+    if silent.any() and sigma_m is None:
+        rest = off - np.nanmedian(off, axis=0)
+        sigma_m = max(1.4826 * float(np.nanmedian(np.abs(rest))), LEAST_GNSS_SIGMA_M)
+        words = (
+            f"The GNSS positions have no standard deviations; {sigma_m:.2f} m is assumed, from"
+            " their scatter about the projection centres. Give --gnss-sigma if you know it."
+        )
+        notes.append(PcfixWarning("gnss.no_sigma", words, sigma_m=sigma_m))
+    if silent.any():
+        sigma[silent] = sigma_m
+    mean = np.nan_to_num(np.nanmean(off, axis=0))
+    typical = float(np.median(sigma[np.isfinite(sigma)]))
+    if np.abs(mean).max() > max(MOST_OFFSET_M, MOST_OFFSET_SIGMAS * typical):
+        x, y, z = (-mean).tolist()
+        words = (
+            f"{name}: the GNSS positions are on average {x:.2f}, {y:.2f}, {z:.2f} m (x, y, z) from"
+            " the projection centres, so they have another datum or CRS (ellipsoidal heights?)."
+            " Name it with --gnss-crs, or transform the positions or the model."
+        )
+        raise GeometryError("gnss.offset", words, path=name, offset_m=[x, y, z])
+    return GnssPositions(found.xyz, sigma, None), notes
+
+
+def check_datum(block: Block, unknowns: Unknowns, reason: str = "") -> None:
+    """Check that GNSS, control points, fixed poses or a free network give a datum.
+
+    `reason` is why GNSS positions are not used.
+    """
+    if unknowns.free_network or unknowns.poses == "fixed":
+        return
+    gnss = int((block.gnss_weights > 0.0).all(axis=1).sum())
+    is_control = (block.survey[1] > 0.0).any(axis=1) & (np.diff(block.start) >= LEAST_VIEWS)
+    control = int(is_control.sum())
+    if gnss + control >= 3:
+        return
+    words = (
+        f"Position, orientation and scale of the block are undetermined: {gnss} GNSS positions,"
+        f" {control} control points in two or more images. Give --gnss or --gcps with three points"
+        " or more, or --datum free to keep the mean of the original projection centres."
+        + (f" {reason}" if reason else "")
+    )
+    raise GeometryError("adjust.no_datum", words, gnss=gnss, control=control)
 
 
 def check_marks(
@@ -104,11 +174,10 @@ def check_marks(
     differently is a mistake. `name` is that of the file.
     """
     marks, _ = marks_of(control)
-    found = intersect_fixed(plain_block(cameras, marks))
-    intersect = np.isfinite(found.squares) & (np.diff(found.start) >= 2) & ~control.is_check
+    off = intersect_fixed(plain_block(cameras, marks))[0] - control.xyz
+    intersect = np.isfinite(off).all(axis=1) & (np.diff(marks.views.start) >= 2) & ~control.is_check
     if intersect.sum() < 3:
         return
-    off = found.xyz - control.xyz
     middle = np.median(off[intersect], axis=0)
     distance = np.where(intersect, np.linalg.norm(off - middle, axis=1), 0.0)
     height = float(np.median(cameras.centres[:, 2]) - np.nanmedian(control.xyz[:, 2]))
@@ -156,11 +225,8 @@ def check_control(found: Adjusted, name: str) -> None:
     The adjustment distributes a gross error over the coordinates of the point and its marks, so
     both count: the coordinates as they appear in the images.
     """
-    control = found.block.control
-    if control is None:
-        return
+    control, errors = found.block.control, []
     focal = float(np.median([lens.focal for lens in found.cameras.lenses or ()]))
-    errors = []
     for row in found.control:
         i = control.names.index(row.name)
         off_m = np.array([row.dx_m, row.dy_m, row.dz_m])
@@ -203,20 +269,21 @@ def undetermined(precision: Precision) -> list[PcfixWarning]:
 
     It names the unknown from which this one is hardly separated, if there is one.
     """
-    notes, shared = [], precision.shared
-    for i, row in enumerate(shared):
-        (what, unit), limit = words_of(row.name), LIMITS.get(row.name, np.inf)
+    notes, names = [], [*precision.shared]
+    for i, (name, row) in enumerate(precision.shared.items()):
+        (what, unit), limit = words_of(name), LIMITS.get(name, np.inf)
         if row.sigma <= limit:
             continue
         words = (
             f"the {what} is undetermined: standard error {row.sigma:.2g}{unit} (limit"
             f" {limit:.2g}{unit})."
         )
-        values: dict[str, Any] = {"unknown": row.name, "sigma": row.sigma}
-        r = np.where(np.arange(len(shared)) == i, 0.0, precision.correlation[i])
+        values: dict[str, Any] = {"unknown": name, "sigma": row.sigma}
+        r = np.where(np.arange(len(names)) == i, 0.0, precision.correlation[i])
         other = int(np.abs(r).argmax())
         if abs(r[other]) > STRONG:
-            pair, values["correlated_with"] = words_of(shared[other].name)[0], shared[other].name
+            values["correlated_with"] = names[other]
+            pair = words_of(names[other])[0]
             words += f" It is strongly correlated with the {pair} (r = {r[other]:.3f})."
         words += " Fix it to a measured value, or give control points at several heights."
         notes.append(PcfixWarning("adjust.undetermined", words, **values))

@@ -153,6 +153,7 @@ def _add_point(given: Given, work: Workspace, at: int) -> None:
     """Set what tests a row, and add its B'B and B'r."""
     v, rhs, right, left, r = work.v, work.rhs, work.right[at], work.left[at], work.r[at]
     o = work.row[at]
+    # in least squares `left` and `right` are one array; tests exist for the images of the cloud
     if len(given.tests):
         for axis in range(2):
             for i in range(left.shape[1]):
@@ -295,6 +296,7 @@ def _point_steps(
     span: Span, state: State, given: Given, rule: Rule, moved: FloatArray, steps: FloatArray,
     work: Workspace,
 ) -> None:  # fmt: skip
+    # V^-1 B'(r - A x) for the steps x of poses and shared unknowns
     first, v, rhs = len(moved) - given.shared, work.v, work.rhs
     for p in range(*span):
         count, _ = linearise_point(state, given, rule, p, work)
@@ -349,6 +351,7 @@ def _linearised(
     for p in range(*span):
         count, images = linearise_point(state, given, rule, p, work)
         point = p - span[0]
+        # each point before has had a row more than observations, for its condition
         first = given.start[p] - given.start[span[0]] + point
         for a in range(count):
             at = first + a

@@ -65,11 +65,8 @@ class Unknowns:
 def similarity_gradients(d: FloatArray) -> FloatArray:
     """Return how places d from the pivot move with shift, turn and scale, shape (k, 3, 7)."""
     by = np.zeros((len(d), 3, 7))
-    by[:, [0, 1, 2], [0, 1, 2]] = 1.0
-    x, y, z = d.T
-    by[:, 0, 4], by[:, 0, 5] = z, -y
-    by[:, 1, 3], by[:, 1, 5] = -z, x
-    by[:, 2, 3], by[:, 2, 4] = y, -x
+    by[:, :, :3] = np.eye(3)
+    by[:, :, 3:6] = np.cross(np.eye(3), d[:, None]).transpose(0, 2, 1)  # about axis i: e_i x d
     by[:, :, 6] = d
     return by
 
@@ -110,14 +107,14 @@ def usable_codes(lens: Lens, names: tuple[str, ...]) -> tuple[int, ...]:
 
 def default_lens(lenses: tuple[Lens, ...]) -> tuple[str, ...]:
     """Return the lens parameters that are free by default: those that the lenses have."""
-    names = ["f", "cx", "cy"]
-    for lens in lenses:
-        names += [name for name in ("b1", "b2") if getattr(lens, name)]
-        names += [f"k{i}" for i, value in enumerate(lens.radial[:4], start=1) if value]
-        names += [f"p{i}" for i, value in enumerate(lens.tangential[:2], start=1) if value]
-    return tuple(
-        name for name in dict.fromkeys(names) if any(usable_codes(lens, (name,)) for lens in lenses)
-    )
+
+    def is_used(name: str) -> bool:
+        """Return whether a lens has this term."""
+        code = CODES[name]
+        return any(usable_codes(lens, (name,)) and lens_parameter(lens, code) for lens in lenses)
+
+    more = ("b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
+    return ("f", "cx", "cy", *filter(is_used, more))
 
 
 def lens_parameter(lens: Lens, code: int) -> float:

@@ -37,17 +37,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import fdtri
 
 from pcfix.adjust.normal import UNDAMPED, sparse_matrix, sparse_rows_of
-from pcfix.adjust.parameters import (
-    CODES,
-    CX,
-    CY,
-    FOCAL,
-    INDEX,
-    PORT,
-    SHAPE,
-    lens_parameter,
-    moved_lens,
-)
+from pcfix.adjust.parameters import CODES, CX, CY, FOCAL, INDEX, NAMES, PORT, SHAPE, moved_lens
 from pcfix.adjust.problem import Problem, Solution, polynomial
 from pcfix.adjust.solve import moved_by, reduced_at, singular, solver
 from pcfix.model import Cameras, FloatArray, IntArray, WaterPlane, WaterRaster, WaterSurface
@@ -63,14 +53,14 @@ SINGULAR = 1e-12
 
 
 class SharedUnknown(NamedTuple):
-    """A shared unknown; units are pixels, metres, slopes, radians.
+    """A shared unknown before and after the adjustment: pixels, metres, slopes, radians.
 
     The level is that at the origin of the block, below the mean of the projection centres.
     """
 
-    name: str
-    added: float  # correction to its start value
-    sigma: float  # its standard error
+    before: float
+    after: float
+    sigma: float  # standard error
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +70,7 @@ class Precision:
     sigma0: float  # a-posteriori standard deviation of unit weight, which scales the covariances
     # (k, 6, 6), rotation in the camera frame (rad), centre in the world (m); zero if fixed
     pose_covariance: FloatArray
-    shared: tuple[SharedUnknown, ...]
+    shared: dict[str, SharedUnknown]  # by name, in the order of `Problem.names`
     correlation: FloatArray  # (g, g), of the shared unknowns
     # (m, 3), standard errors of the points along x, y, z in metres; NaN if not determined, or not
     # among the `MOST_POINTS` of a large block, None for very large ones
@@ -97,9 +87,10 @@ class Precision:
         """Standard errors of rotations about the axes of the cameras, shape (k, 3)."""
         return np.asarray(np.degrees(np.sqrt(np.einsum("kii->ki", self.pose_covariance)[:, :3])))
 
-    def sigma_of(self, name: str) -> float | None:
-        """Return the standard error of a shared unknown; None if it is fixed."""
-        return next((row.sigma for row in self.shared if row.name == name), None)
+    @property
+    def shared_sigma(self) -> FloatArray:
+        """Standard errors of the shared unknowns, shape (g,)."""
+        return np.array([row.sigma for row in self.shared.values()])
 
 
 def precision_of(
@@ -118,28 +109,24 @@ def precision_of(
     solve_for = solver(matrix)
     if solve_for is None:
         raise singular(problem, solution)
-    # columns of the inverse, some at a time: those of 32 poses, then those of the shared unknowns
-    is_wanted = u <= DENSE_UP_TO and not only_poses
-    poses, inverse = np.zeros((k, 6, 6)), np.empty((u, u)) if is_wanted else None
-    first, last = np.arange(0, u - g, 6), np.arange(u - g, u)
-    for part in (*np.array_split(first, -(-len(first) // 32) or 1), None):
-        rows = last if part is None else (part[:, None] + np.arange(6)).ravel()
+    # columns of S^-1, some at a time: those of 32 poses, then those of the shared unknowns
+    inverse = None if u > DENSE_UP_TO or only_poses else np.empty((u, u))
+    poses, of_shared = np.zeros((k, 6, 6)), np.zeros((g, g))
+    for rows in [*np.split(np.arange(u - g), range(192, u - g, 192)), np.arange(u - g, u)]:
         unit = np.zeros((u, len(rows)))
         unit[rows, np.arange(len(rows))] = 1.0
         columns = solve_for(unit)
         if inverse is not None:
             inverse[:, rows] = columns
-        if part is not None:
-            of_part = columns[rows].reshape(len(part), 6, len(part), 6)
-            poses[part // 6] = np.einsum("kikj->kij", of_part)
-    of_shared = columns[last]
+        if not len(rows) or rows[0] >= u - g:
+            of_shared = columns[rows]
+        else:
+            six_by_six = columns[rows].reshape(-1, 6, len(rows) // 6, 6)
+            poses[rows[::6] // 6] = np.einsum("kikj->kij", six_by_six)
     diagonal = np.append(np.einsum("kii->ki", poses), of_shared.diagonal())[problem.fixed :]
     if not ((diagonal > 0.0) & (diagonal * matrix.diagonal() * SINGULAR < 1.0)).all():
         raise singular(problem, solution)
-    of_shared = of_shared * times[6:] * times[6:, None]
-    poses = poses * times[:6] * times[:6, None]
-    points: FloatArray | None = None
-    members: Members | None = None
+    points = members = None
     if inverse is not None:
         each = np.append(np.tile(times[:6], k), times[6:])[problem.fixed :]
         inverse *= each
@@ -147,12 +134,18 @@ def precision_of(
         points = sigma0 * _point_sigma(problem, solution, inverse)
         members = members_of(problem, solution, sigma0 * drawn(inverse))
     sigma = np.sqrt(np.diag(of_shared))
-    correlation = of_shared / sigma / sigma[:, None]
-    rows_of = zip(problem.names, solution.shared.tolist(), (sigma * sigma0).tolist(), strict=True)
-    return Precision(
-        sigma0, sigma0**2 * poses, tuple(SharedUnknown(*row) for row in rows_of), correlation,
-        points, members,
+    rows_of = zip(
+        problem.start_values, problem.start_values + solution.shared, sigma0 * times[6:] * sigma,
+        strict=True,
     )  # fmt: skip
+    return Precision(
+        sigma0,
+        sigma0**2 * poses * times[:6] * times[:6, None],
+        {name: SharedUnknown(*row) for name, row in zip(problem.names, rows_of, strict=True)},
+        of_shared / sigma / sigma[:, None],
+        points,
+        members,
+    )
 
 
 def _point_sigma(problem: Problem, found: Solution, inverse: FloatArray) -> FloatArray:
@@ -202,19 +195,17 @@ def disagreement_of(problem: Problem, found: Solution, formal: Precision) -> Flo
     the precision by the normal matrix.
     """
     given, block, added = problem.given, problem.block, np.zeros(6 + len(problem.names))
+    (matrix, right), free = reduced_at(problem, found), slice(problem.fixed, None)
+    solve_for, tiles = solver(matrix), min(MOST_TILES, len(block.xyz) // POINTS_PER_TILE)
+    if tiles < LEAST_GROUPS or solve_for is None:
+        return 1.0 + added
     # random groups of points, neighbouring points, points of an image, and places in the frame
-    tiles = min(MOST_TILES, len(block.xyz) // POINTS_PER_TILE)
-    randomly = np.random.default_rng(0).integers(0, max(tiles, 1), len(block.xyz))[block.owner]
+    randomly = np.random.default_rng(0).integers(0, tiles, len(block.xyz))[block.owner]
     near = _tiles(found.state.xyz[:, :2], tiles)[block.owner]
     size = np.array([(lens.width, lens.height) for lens in block.cameras.lenses or ()])
     place = _tiles(given.image_xy / size[given.camera], FRAME_TILES)
-    place += given.group[given.camera] * (place.max(initial=0) + 1)
+    place += given.group[given.camera] * (place.max() + 1)  # each sensor has its own
     frame = np.unique(place, return_inverse=True)[1]
-    matrix, right = reduced_at(problem, found)
-    solve_for, free = solver(matrix), slice(problem.fixed, None)
-    least = len(np.unique(randomly))
-    if least < LEAST_GROUPS or solve_for is None:
-        return 1.0 + added
     # the first group has drawn residuals: the variances that random groups have by chance
     random = np.random.default_rng(1).normal(0.0, formal.sigma0, given.image_xy.shape)
     groups = [randomly, randomly, near, given.camera]
@@ -222,7 +213,7 @@ def disagreement_of(problem: Problem, found: Solution, formal: Precision) -> Flo
     by_chance, *shares = (_share_of(formal, solve_for(p[:, free].T)) for p in pulls)
     for group, share in zip(groups[1:], shares, strict=True):
         count = len(np.unique(group))
-        is_more = share > fdtri(count - 1, least - 1, SURE) * by_chance
+        is_more = share > fdtri(count - 1, tiles - 1, SURE) * by_chance
         more = np.where(is_more & (count >= LEAST_GROUPS), share - by_chance, 0.0)
         added = added + more
         if group is randomly:
@@ -240,15 +231,15 @@ def common_errors(problem: Problem, formal: Precision) -> FloatArray:
     factor = np.ones(6 + len(formal.shared))
     noise_px = formal.sigma0 / float(np.median(problem.given.weight[problem.used]))
     rows = np.flatnonzero(np.isin(problem.given.code, (FOCAL, CX, CY)))
-    sigma = np.array([formal.shared[i].sigma for i in rows])
-    factor[6 + rows] = np.hypot(1.0, COMMON_SHARE * noise_px / problem.lens_effects[rows] / sigma)
+    common = COMMON_SHARE * noise_px / problem.lens_effects[rows]
+    factor[6 + rows] = np.hypot(1.0, common / formal.shared_sigma[rows])
     return factor
 
 
 def _tiles(xy: FloatArray, count: int) -> IntArray:
     """Return the tile of each place, of about `count` square ones that cover nearly all places."""
     low, high = np.nanpercentile(xy, [1.0, 99.0], axis=0)
-    side = max(float(np.sqrt(np.prod(high - low) / max(count, 1))), 1e-9)
+    side = max(float(np.sqrt(np.prod(high - low) / count)), 1e-9)
     last = np.maximum(np.ceil((high - low) / side) - 1.0, 0.0)
     place = np.clip(np.floor((np.nan_to_num(xy) - low) / side), 0.0, last).astype(np.int64)
     return np.asarray(place[:, 0] * int(last[1] + 1.0) + place[:, 1])
@@ -260,11 +251,11 @@ def _share_of(formal: Precision, moved: FloatArray) -> FloatArray:
     `moved`, shape (u, n), are the movements of the free unknowns by each of n groups.
     """
     of_poses, of_shared = np.split((moved**2).sum(axis=1), [len(moved) - len(formal.shared)])
-    share = of_shared / [row.sigma**2 for row in formal.shared]
-    if not len(of_poses):
-        return np.append(np.zeros(6), share)
-    poses = np.einsum("kii->ki", formal.pose_covariance)
-    return np.append((of_poses.reshape(-1, 6) / poses).mean(axis=0), share)
+    share = np.append(np.zeros(6), of_shared / formal.shared_sigma**2)
+    if len(of_poses):
+        poses = np.einsum("kii->ki", formal.pose_covariance)
+        share[:6] = (of_poses.reshape(-1, 6) / poses).mean(axis=0)
+    return share
 
 
 def _pulls_of(
@@ -276,8 +267,8 @@ def _pulls_of(
     Then, for shifts along u and v of the t tiles of the frame: B', shape (2 t, 6 k + g), and C
     with their right sides, shape (2 t, 2 t + 1).
     """
-    size, count = 6 * len(found.lenses) + problem.given.shared, 2 * (int(frame.max(initial=0)) + 1)
-    pulls = [np.zeros((int(group.max(initial=0)) + 1, size)) for group in groups]
+    size, count = 6 * len(found.lenses) + problem.given.shared, 2 * (int(frame.max()) + 1)
+    pulls = [np.zeros((int(group.max()) + 1, size)) for group in groups]
     field, rest = np.zeros((count, size)), np.zeros((count, count + 1))
     for part in sparse_rows_of(found.state, problem.given, UNDAMPED):
         at, is_image = part.rows.observation, part.rows.is_image
@@ -375,11 +366,9 @@ class Members:
     def aligned(self, cameras: Cameras) -> Members | None:
         """Return the members in the order of their cameras, in any CRS; None for other cameras."""
         row = {label: i for i, label in enumerate(self.labels)}
-        if len(row) < len(self.labels) or sorted(cameras.labels) != sorted(self.labels):
+        if sorted(cameras.labels) != sorted(row) or cameras.lenses is None:
             return None
         rows = np.array([row[label] for label in cameras.labels])
-        if cameras.rotations is None or cameras.lenses is None:
-            return None
         focal = np.array([lens.focal for lens in cameras.lenses])
         if np.abs(focal / self.focal[rows] - 1.0).max() >= SAME_FOCAL:
             return None
@@ -430,14 +419,13 @@ def drawn(covariance: FloatArray, count: int = MEMBERS) -> FloatArray:
     correlation /= sigma[:, None]
     correlation[np.diag_indices(len(sigma))] += TINY
     few = min(AXES, count, len(sigma) - 1)
-    found = eigsh(correlation, few, v0=np.ones(len(sigma))) if few > 0 else None
+    values, axes = np.zeros(0), np.zeros((len(sigma), 0))
+    if few > 0:
+        values, axes = eigsh(correlation, few, v0=np.ones(len(sigma)))
     factor = cholesky(correlation, lower=True, overwrite_a=True)
     draws = rng.standard_normal((count, len(sigma))) @ factor.T
-    if found is not None:
-        values, axes = found
-        even = np.linalg.qr(draws @ axes)[0] * np.sqrt(count * values)
-        draws += (even - draws @ axes) @ axes.T
-    return np.asarray(draws * sigma)
+    even = np.linalg.qr(draws @ axes)[0] * np.sqrt(count * values)
+    return np.asarray((draws + (even - draws @ axes) @ axes.T) * sigma)
 
 
 def members_of(problem: Problem, found: Solution, steps: FloatArray) -> Members:
@@ -445,31 +433,27 @@ def members_of(problem: Problem, found: Solution, steps: FloatArray) -> Members:
 
     Steps that take a lens or an index out of its range are skipped.
     """
-    state, names = found.state, problem.unknowns.lens
-    codes = [CODES[name] for name in names]
-    before = [[lens_parameter(lens, code) for code in codes] for lens in found.lenses]
-    turn, shift, lens, water = [], [], [], []
-    for step in np.hstack([np.zeros((len(steps), problem.fixed)), steps]):
-        moved = moved_by(problem, found, step, np.zeros_like(state.xyz))
-        if moved is None:
-            continue
-        r, by = state.rotations, moved.state.water - state.water
-        turn.append(Rotation.from_matrix(moved.state.rotations @ r.transpose(0, 2, 1)).as_rotvec())
-        shift.append(np.einsum("kij,kj->ki", r, moved.state.centres - state.centres))
-        after = [[lens_parameter(lens, code) for code in codes] for lens in moved.lenses]
-        lens.append(np.array(after) - np.array(before))
-        # level and slopes below the mean of the cameras, not at the origin of the block
-        x, y, _ = state.centres.mean(axis=0)
-        d, e, f = by[SHAPE:PORT]
-        slopes = by[1] + 2.0 * d * x + e * y, by[2] + e * x + 2.0 * f * y
-        water.append([float(polynomial(by, x, y)), *slopes, by[INDEX], d, e, f])
-    k, m = len(state.centres), len(turn)
+    state, given, names, k = found.state, problem.given, problem.unknowns.lens, len(found.lenses)
+    steps = np.hstack([np.zeros((len(steps), problem.fixed)), steps])
+    still = np.zeros_like(state.xyz)
+    steps = steps[[moved_by(problem, found, one, still) is not None for one in steps]]
+    poses, shared = steps[:, : 6 * k].reshape(-1, k, 6), steps[:, 6 * k :]
+    lens = np.zeros((len(steps), k, len(names)))
+    for column, (image, code) in enumerate(problem.lens_unknowns):
+        of_sensor = given.group == given.group[image]
+        lens[:, of_sensor, names.index(NAMES[code])] = shared[:, column, None]
+    by, free = np.zeros((len(state.water), len(steps))), given.column >= 0
+    by[free] = shared.T[given.column[free]]
+    # level and slopes below the mean of the cameras, not at the origin of the block
+    x, y, _ = state.centres.mean(axis=0)
+    d, e, f = by[SHAPE:PORT]
+    slopes = by[1] + 2.0 * d * x + e * y, by[2] + e * x + 2.0 * f * y
     return Members(
         problem.block.cameras.labels,
-        np.array([lens.focal for lens in found.lenses]),
-        np.reshape(turn, (m, k, 3)),
-        np.reshape(shift, (m, k, 3)),
+        np.array([one.focal for one in found.lenses]),
+        poses[:, :, :3],
+        np.einsum("kij,mkj->mki", state.rotations, poses[:, :, 3:]),
         names,
-        np.reshape(lens, (m, k, len(names))),
-        np.reshape(water, (m, 7)),
+        lens,
+        np.column_stack([polynomial(by, x, y), *slopes, by[INDEX], d, e, f]),
     )

@@ -7,12 +7,12 @@ surveyed points, standard deviations of lens, water and index.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pcfix.adjust.block import WATER, Block
-from pcfix.adjust.collinearity import POINT, SHARED, Given, State
+from pcfix.adjust.collinearity import SHARED, Given, State
 from pcfix.adjust.normal import UNDAMPED, cost_of, linearised, point_steps, residuals
 from pcfix.adjust.parameters import (
     INDEX,
@@ -23,6 +23,7 @@ from pcfix.adjust.parameters import (
     WATER_NAMES,
     Unknowns,
     effect_at_corner,
+    lens_parameter,
     sensor_groups,
     similarity_gradients,
     usable_codes,
@@ -66,6 +67,7 @@ class Problem:
     given: Given  # what the kernels need
     lens_unknowns: list[tuple[int, int]]  # of each the first image of its sensor, and the code
     names: list[str]  # of the g shared unknowns
+    start_values: FloatArray  # (g,), heights in the world frame
 
     @property
     def fixed(self) -> int:
@@ -103,17 +105,14 @@ class Solution:
     cost: float = np.inf  # sum of weighted squares, including prior knowledge
 
 
-def prepare(
-    block: Block, unknowns: Unknowns, origin: FloatArray | None = None
-) -> tuple[Problem, Solution]:
-    """Return a problem and its start; the origin is the rounded mean of the cameras by default."""
+def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
+    """Return a problem and its start."""
     cameras, water, lenses = block.cameras, block.water, block.cameras.lenses or ()
-    origin = np.round(cameras.centres.mean(axis=0)) if origin is None else origin
+    origin = np.round(cameras.centres.mean(axis=0))
     group = sensor_groups(lenses)
     first_images = np.unique(group, return_index=True)[1].tolist()
     codes = [usable_codes(lenses[i], unknowns.lens) for i in first_images]
-    pairs = zip(first_images, codes, strict=True)
-    lens_unknowns = [(i, code) for i, of_sensor in pairs for code in of_sensor]
+    lens_unknowns = [(i, code) for i, of in zip(first_images, codes, strict=True) for code in of]
     numbers = surface_numbers(block, origin)
     planes, plane_names, axis, alike = _planes(block, origin, numbers)
     # columns of the shared unknowns: lenses, then surface and planes
@@ -129,6 +128,10 @@ def prepare(
         for i, code in lens_unknowns
     ]
     names += [name for name, one in zip((*WATER_NAMES, *plane_names), is_free, strict=True) if one]
+    numbers = np.concatenate([numbers, planes])
+    world = numbers.copy()  # the level, and the position of each plane along its axis
+    world[[0, *range(PLANES, len(numbers), 3)]] += origin[axis]
+    start_values = [lens_parameter(lenses[i], code) for i, code in lens_unknowns]
     row, table = lens_table(lenses)
     centres = cameras.centres - origin
     surveyed_xyz, surveyed_weight = block.survey
@@ -149,17 +152,18 @@ def prepare(
         code=np.array([code for _, code in lens_unknowns], np.int64),
         column=column,
         shared=len(names),
-        surveyed_xyz=np.where(surveyed_weight > 0.0, surveyed_xyz - origin, 0.0),
+        surveyed_xyz=surveyed_xyz - origin,
         surveyed_weight=surveyed_weight,
         on=on,
         on_weight=np.where(on >= 0, 1.0 / on_sigma_m, 0.0),
         axis=axis,
         tests=np.zeros((0, 2, SHARED + len(names))),
     )
-    problem = Problem(block, unknowns, origin, given, lens_unknowns, names)
+    values = np.append(start_values, world[is_free])
+    problem = Problem(block, unknowns, origin, given, lens_unknowns, names, values)
     state = State(
         centres, np.ascontiguousarray(cameras.rotations, np.float64), table, block.xyz - origin,
-        np.concatenate([numbers, planes]), window_of(block.port),
+        numbers, window_of(block.port),
     )  # fmt: skip
     return problem, Solution(state, lenses, np.zeros(len(names)))
 
@@ -334,21 +338,12 @@ def cost_at(problem: Problem, found: Solution, loss: int) -> float:
 
 def survey_cost(problem: Problem, found: Solution) -> float:
     """Return the weighted squares of all observations that are no images."""
-    given, left = problem.given, prior_rows(problem, found)[1]
-    off = given.surveyed_weight * (given.surveyed_xyz - found.state.xyz) ** 2
-    off_surfaces = _off_surfaces(problem, found.state)
-    return float(off.sum() + left @ left + off_surfaces @ off_surfaces)
-
-
-def _off_surfaces(problem: Problem, state: State) -> FloatArray:
-    """Return surface minus point, in standard deviations, of points that lie on surfaces.
-
-    Points that their rays and surface do not fix are missing.
-    """
-    if not len(problem.given.on):
-        return np.zeros(0)
-    rows = linearised(state, problem.given, UNDAMPED, problem.block.tie_points, len(state.xyz))
-    return rows.r[~rows.is_image & rows.columns[:, 0, POINT:SHARED].any(axis=1), 0]
+    given, state, left = problem.given, found.state, prior_rows(problem, found)[1]
+    cost = (given.surveyed_weight * (given.surveyed_xyz - state.xyz) ** 2).sum() + left @ left
+    if len(given.on):  # distances from surfaces; zero for points that their rays do not fix
+        rows = linearised(state, given, UNDAMPED, problem.block.tie_points, len(state.xyz))
+        cost += (rows.r[~rows.is_image] ** 2).sum()
+    return float(cost)
 
 
 # Intersection with fixed poses
@@ -358,40 +353,18 @@ STEPS = 10
 CLOSE_M = 1e-4
 
 
-class Intersected(NamedTuple):
-    """Points and how well they fit their images."""
-
-    xyz: FloatArray  # (m, 3), metres, world frame
-    residual_px: FloatArray  # (o, 2), measured minus computed; NaN if the intersection failed
-    start: IntArray  # (m + 1,), the residuals of point i are start[i]:start[i + 1]
-
-    @property
-    def redundancy(self) -> IntArray:
-        """Measured coordinates minus the three of the point, shape (m,)."""
-        return np.asarray(2 * np.diff(self.start) - 3)
-
-    def sums(self, values: FloatArray) -> FloatArray:
-        """Return sums over the observations of each point, shape (m,)."""
-        owner = np.repeat(np.arange(len(self.xyz)), np.diff(self.start))
-        return np.asarray(np.bincount(owner, values, len(self.xyz)), np.float64)
-
-    @property
-    def squares(self) -> FloatArray:
-        """Sum of squared residuals of each point, px2, shape (m,)."""
-        return self.sums((self.residual_px**2).sum(axis=1))
-
-
-def intersect_fixed(block: Block) -> Intersected:
+def intersect_fixed(block: Block) -> tuple[FloatArray, FloatArray]:
     """Intersect the points of a block by least squares, with fixed poses, lens and water.
 
-    It fails for a point that needs more than `STEPS` Gauss-Newton steps.
+    Returns the points, shape (m, 3), metres, world frame, and their residuals, measured minus
+    computed, shape (o, 2). Both are NaN for points that need more than `STEPS` Gauss-Newton steps.
     """
     problem, start = prepare(block, Unknowns(poses="fixed", lens=()))
     state, step = intersected(problem, start.state)
-    r = residuals(state, problem.given)
-    converged = np.asarray((np.abs(step) < CLOSE_M).all(axis=1))
-    r[~converged[block.owner]] = np.nan
-    return Intersected(state.xyz + problem.origin, r, np.asarray(block.start))
+    xyz, residual_px = state.xyz + problem.origin, residuals(state, problem.given)
+    failed = np.asarray(~(np.abs(step) < CLOSE_M).all(axis=1))
+    xyz[failed], residual_px[failed[block.owner]] = np.nan, np.nan
+    return xyz, residual_px
 
 
 def intersected(problem: Problem, state: State) -> tuple[State, FloatArray]:

@@ -8,23 +8,21 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pcfix.adjust.block import LEAST_VIEWS, Block
+from pcfix.adjust.block import LEAST_VIEWS, NO_CONTROL, Block
 from pcfix.adjust.normal import residuals
-from pcfix.adjust.parameters import INDEX, NAMES, PORT, SHAPE, WATER_NAMES, Unknowns, lens_parameter
+from pcfix.adjust.parameters import INDEX, Unknowns
 from pcfix.adjust.precision import Precision
 from pcfix.adjust.problem import (
-    Intersected,
     Problem,
     Solution,
     intersect_fixed,
     intersected,
     port_of,
     solved_cameras,
-    surface_numbers,
     water_of,
 )
 from pcfix.errors import PcfixWarning, plain
-from pcfix.model import BoolArray, Cameras, FloatArray, WaterPlane, WaterSurface
+from pcfix.model import BoolArray, Cameras, FloatArray, WaterSurface
 from pcfix.port.shapes import Port
 from pcfix.water.surface import surface_above
 
@@ -62,11 +60,8 @@ class Adjusted:
     redundancy: int  # observations, with those of the unknowns, minus unknowns
     source: Source  # what was observed: tie points, or images of the apparent cloud
     precision: Precision
-    gnss_residual_m: FloatArray  # (k, 3), adjusted centres minus GNSS positions; NaN if unknown
     control: list[ControlRow]
     notes: list[PcfixWarning]
-    problem: Problem  # with the weights of the last round
-    solution: Solution
     port: Port | None = None  # adjusted
 
     @property
@@ -106,7 +101,6 @@ def adjusted_of(
     none = -np.inf if block.port is None else np.inf  # behind a port everything is under water
     level = np.full(len(xyz), none) if water is None else surface_above(water, xyz).height_m
     cameras = solved_cameras(problem, now)
-    off = cameras.centres - block.gnss.xyz
     return Adjusted(
         block=block,
         unknowns=problem.unknowns,
@@ -121,19 +115,14 @@ def adjusted_of(
         redundancy=redundancy_of(problem),
         source=source,
         precision=precision,
-        gnss_residual_m=np.where(block.gnss_weights > 0.0, off, np.nan),
         control=_control_rows(block, xyz, r),
         notes=notes,
         port=port_of(block, state.water),
-        problem=problem,
-        solution=now,
     )
 
 
 def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlRow]:
     rows, control = list[ControlRow](), block.control
-    if control is None:
-        return rows
     names = zip(control.names, control.is_check, control.xyz, strict=True)
     for p, (name, check, surveyed) in enumerate(names, block.tie_points):
         marks = r[block.start[p] : block.start[p + 1]]
@@ -149,18 +138,14 @@ def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlR
 # Plain values
 
 
-def before_of(adjusted: Adjusted) -> Intersected:
-    """Intersect the points with the original poses, lenses and water, with refraction.
+def residuals_before(adjusted: Adjusted) -> FloatArray:
+    """Return residuals with the original poses, lenses and water, with refraction, shape (o, 2).
 
     Control points are intersected like all others, so that the residuals do not contain their
-    survey; observations that the adjustment excluded stay excluded.
+    survey; observations that the adjustment excluded have no weight.
     """
-    block = adjusted.block
-    sigma_px = np.where(adjusted.used, block.sigma_px, np.inf)
-    found = intersect_fixed(replace(block, sigma_px=sigma_px, control=None))
-    met = (np.isfinite(found.squares) & adjusted.is_observed)[:, None]
-    residual_px = np.where(met[block.owner], found.residual_px, np.nan)
-    return Intersected(np.where(met, found.xyz, np.nan), residual_px, found.start)
+    sigma_px = np.where(adjusted.used, adjusted.block.sigma_px, np.inf)
+    return intersect_fixed(replace(adjusted.block, sigma_px=sigma_px, control=NO_CONTROL))[1]
 
 
 def mean(values: FloatArray) -> FloatArray:
@@ -176,13 +161,10 @@ def rms(values: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(mean(values * values)))
 
 
-def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
-    """Return the content of adjustment.json; pcfix/cli/README.md lists its keys.
-
-    `before` are the residuals before the adjustment, of `before_of`.
-    """
+def adjustment_dict(adjusted: Adjusted) -> Plain:
+    """Return the content of adjustment.json; pcfix/cli/README.md lists its keys."""
     a, block, u = adjusted, adjusted.block, adjusted.unknowns
-    observed, lenses = a.is_observed, block.cameras.lenses or ()
+    observed, lenses, before_px = a.is_observed, block.cameras.lenses or (), residuals_before(a)
     found = {
         "source": a.source,
         "image_unit": lenses[0].unit,
@@ -206,14 +188,19 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
         "sigma0": a.sigma0,
         "redundancy": a.redundancy,
         "residuals": {
-            "land": _residuals(a, before, ~a.is_wet),
-            "water": _residuals(a, before, a.is_wet),
+            "land": _residuals(a, before_px, ~a.is_wet),
+            "water": _residuals(a, before_px, a.is_wet),
         },
-        "lens": _lens(a),
-        "water": _surface(a, "water"),
-        "port": _surface(a, "port"),
+        "shared": {name: row._asdict() for name, row in a.precision.shared.items()},
+        "water": None if a.water is None else str(a.water),
+        "port": None if a.port is None else str(a.port),
+        "index": a.refractive_index,
         "poses": _poses(a),
-        "precision": _precision(a.precision),
+        "precision": {
+            "centre_mean_m": mean(a.precision.centre_sigma_m),
+            "angle_mean_deg": mean(a.precision.angle_sigma_deg),
+            "correlation": a.precision.correlation,
+        },
         "gnss": _gnss(a),
         "control": _surveyed(a, "control"),
         "check": _surveyed(a, "check"),
@@ -222,7 +209,7 @@ def adjustment_dict(adjusted: Adjusted, before: Intersected) -> Plain:
     return dict(plain(found))
 
 
-def _residuals(a: Adjusted, before: Intersected, points: BoolArray) -> Plain:
+def _residuals(a: Adjusted, before_px: FloatArray, points: BoolArray) -> Plain:
     """Return residuals and standard errors on land or under water, as in Mulsow 2024."""
     points = points & a.is_observed
     rows = a.used & points[a.block.owner]
@@ -234,7 +221,7 @@ def _residuals(a: Adjusted, before: Intersected, points: BoolArray) -> Plain:
     return {
         "points": points.sum(),
         "observations": rows.sum(),
-        "rms_before_px": rms(before.residual_px[rows].ravel()),
+        "rms_before_px": rms(before_px[rows].ravel()),
         "rms_px": rms(r.ravel()),
         "rms_xy_px": rms(r),
         "rms_m": rms((r * (away / focal)[:, None]).ravel()),
@@ -242,68 +229,21 @@ def _residuals(a: Adjusted, before: Intersected, points: BoolArray) -> Plain:
     }
 
 
-def _lens(a: Adjusted) -> list[Plain]:
-    """Return the free parameters of each lens: the first of the shared unknowns."""
-    original, adjusted = a.block.cameras.lenses or (), a.cameras.lenses or ()
-    rows = zip(a.problem.lens_unknowns, a.precision.shared, strict=False)
-    return [
-        {
-            "sensor": original[i].sensor or f"sensor {a.problem.given.group[i] + 1}",
-            "name": NAMES[code],
-            "before": lens_parameter(original[i], code),
-            "after": lens_parameter(adjusted[i], code),
-            "sigma": unknown.sigma,
-        }
-        for (i, code), unknown in rows
-    ]
-
-
-def _surface(a: Adjusted, kind: str) -> Plain | None:
-    """Return parameters of the water or of the port, block frame; None if there is none."""
-    sigma = dict(zip(WATER_NAMES, a.unknowns.water_sigma, strict=True))
-    free = [name for name, value in sigma.items() if value]
-    if kind == "water":
-        surface: object = a.water
-        names = [*WATER_NAMES[: INDEX + 1]] if isinstance(a.block.water, WaterPlane) else ["index"]
-        names += [name for name in free if name in WATER_NAMES[SHAPE:PORT]]
-    else:
-        surface, names = a.port, [name for name in free if name in ("index", *WATER_NAMES[PORT:])]
-    if surface is None:
-        return None
-    start, found = surface_numbers(a.block, a.problem.origin), dict[str, Any](surface=str(surface))
-    for name in names:
-        i = WATER_NAMES.index(name)
-        base = float(a.problem.origin[2]) if name == "level" else 0.0
-        found[name] = {
-            "before": base + start[i],
-            "after": base + a.solution.state.water[i],
-            "sigma": a.precision.sigma_of(name),
-            "free": name in free,
-        }
-    return found
-
-
 def _poses(a: Adjusted) -> Plain:
+    """Return by how much the poses changed."""
     far = np.linalg.norm(a.cameras.centres - a.block.cameras.centres, axis=1)
     before, after = np.asarray(a.block.cameras.rotations), np.asarray(a.cameras.rotations)
     turned = Rotation.from_matrix(after @ before.transpose(0, 2, 1)).magnitude()
     return {"moved_rms_m": rms(far), "turned_rms_deg": rms(np.degrees(np.asarray(turned)))}
 
 
-def _precision(p: Precision) -> Plain:
-    return {
-        "centre_mean_m": mean(p.centre_sigma_m),
-        "angle_mean_deg": mean(p.angle_sigma_deg),
-        "shared": [row._asdict() for row in p.shared],
-        "correlation": p.correlation,
-    }
-
-
 def _gnss(a: Adjusted) -> Plain | None:
-    known = np.isfinite(a.gnss_residual_m).any(axis=1)
+    """Return centres minus GNSS positions; None if there is none."""
+    is_used = a.block.gnss_weights > 0.0
+    known = is_used.any(axis=1)
     if not known.any():
         return None
-    off = a.gnss_residual_m[known]
+    off = np.where(is_used, a.cameras.centres - a.block.gnss.xyz, np.nan)[known]
     return {
         "images": known.sum(),
         "mean_m": mean(off),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -149,29 +150,27 @@ def solver(matrix: Any) -> Callable[[FloatArray], FloatArray] | None:
     """Return a function that solves for a right side; None if the matrix is not definite."""
     if matrix.shape[0] == 0:
         return lambda right: right
+    from scipy.linalg import cho_factor, cho_solve
+    from scipy.sparse import diags_array
+    from scipy.sparse.linalg import splu
+
     diagonal = matrix.diagonal()
     if not (diagonal > 0.0).all():
         return None
-    scale = 1.0 / np.sqrt(diagonal)
+    scale = diags_array(1.0 / np.sqrt(diagonal))  # units differ, so that rounding would too
+    scaled = scale @ matrix @ scale
     solve_scaled: Callable[[FloatArray], FloatArray]
     try:
-        if isinstance(matrix, np.ndarray):
-            from scipy.linalg import cho_factor, cho_solve
-
-            factor = cho_factor(matrix * scale * scale[:, None], lower=True)
-            solve_scaled = lambda right: np.asarray(cho_solve(factor, right))  # noqa: E731
+        if isinstance(scaled, np.ndarray):
+            solve_scaled = partial(cho_solve, cho_factor(scaled, lower=True))
         else:
-            from scipy.sparse import diags_array
-            from scipy.sparse.linalg import splu
-
-            scaled = diags_array(scale) @ matrix @ diags_array(scale)
             solve_scaled = splu(
                 scaled.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
                 options={"SymmetricMode": True},
             ).solve  # fmt: skip
     except (np.linalg.LinAlgError, RuntimeError):
         return None
-    return lambda right: (solve_scaled((right.T * scale).T).T * scale).T
+    return lambda right: np.asarray(scale @ solve_scaled(scale @ right))
 
 
 # What is undetermined

@@ -75,6 +75,7 @@ def _transfer(
     most = most_between(span, start)
     image, who = np.empty((most, 2)), np.empty(most, np.int64)
     for i in range(*span):
+        # where the original cameras image the point, by straight rays
         count = 0
         for j in range(start[i], start[i + 1]):
             c = camera[j]
@@ -104,6 +105,7 @@ def _intersect(
             u, v, by_u, by_v = image_and_slopes(lens, None, cameras.rotations[c], ahead)
             m, b = plus_square(m, by_u), plus(b, scaled(image[j, 0] - u, by_u))
             m, b = plus_square(m, by_v), plus(b, scaled(image[j, 1] - v, by_v))
+        # nearly parallel rays do not fix the point
         det, step = solved(m, b)
         if not det > LEAST_CONDITION * m[0] * m[3] * m[5]:
             return False
@@ -138,9 +140,8 @@ def transfer_of(original: Cameras, adjusted: Cameras, place: IntArray) -> CloudT
 def renumbered(views: Views, row: IntArray) -> tuple[Views, IntArray]:
     """Return views with other camera numbers, without negative ones, and the entries that stay."""
     camera = row[np.asarray(views.camera)]
-    stays = camera >= 0
-    entry = np.flatnonzero(stays)
-    start = np.concatenate([[0], np.cumsum(stays)])[views.start]
+    entry = np.flatnonzero(camera >= 0)
+    start = np.append(0, np.cumsum(camera >= 0))[views.start]
     weight = None if views.weight is None else views.weight[entry]
     return Views(start, camera[entry], weight, views.kind), entry
 
@@ -187,6 +188,29 @@ class TransferCounts(Sums):
         not_moved, squares = int((~step.moved).sum()), float((shift**2).sum())
         return cls(len(shift), not_moved, land, float(shift[:, 2].sum()), squares)
 
+    def check(self, name: str) -> None:
+        """Refuse a cloud that the original cameras do not see."""
+        if self.points == 0 and self.not_moved:
+            words = (
+                f"{name}: no point could be transferred to the adjusted cameras, because fewer than"
+                " two original cameras image them. Check that --adjusted-from is the model of the"
+                " cloud, in its CRS."
+            )
+            raise GeometryError("adjusted_from.no_overlap", words, path=name)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, metres."""
+        count = max(self.points, 1)
+        return {
+            "points": self.points,
+            "land": self.land,
+            "not_transferred": self.not_moved,
+            "shift_m": {
+                "mean_z": round(self.sum_z_m / count, 4),
+                "rms": round(float(np.sqrt(self.sum_squares_m2 / count)), 4),
+            },
+        }
+
 
 @dataclass(frozen=True, eq=False)
 class CloudTransfer:
@@ -225,29 +249,6 @@ class CloudTransfer:
                 " --cameras-offset, which count for the file that has no CRS."
             )
             raise GeometryError("adjusted_from.too_far", words, distance_m=off_m, height_m=height)
-
-    def check(self, name: str, counts: TransferCounts) -> None:
-        """Refuse a cloud that the original cameras do not see."""
-        if counts.points == 0 and counts.not_moved:
-            words = (
-                f"{name}: no point could be transferred to the adjusted cameras, because fewer than"
-                " two original cameras image them. Check that --adjusted-from is the model of the"
-                " cloud, in its CRS."
-            )
-            raise GeometryError("adjusted_from.no_overlap", words, path=name)
-
-    def as_dict(self, counts: TransferCounts) -> dict[str, Any]:
-        """Return the statistics as plain values, metres."""
-        count = max(counts.points, 1)
-        return {
-            "points": counts.points,
-            "land": counts.land,
-            "not_transferred": counts.not_moved,
-            "shift_m": {
-                "mean_z": round(counts.sum_z_m / count, 4),
-                "rms": round(float(np.sqrt(counts.sum_squares_m2 / count)), 4),
-            },
-        }
 
     def provenance(self) -> dict[str, Any]:
         """Return the record of the transfer for the output file."""

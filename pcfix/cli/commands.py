@@ -82,13 +82,13 @@ def correct(
 )
 def adjust(model: Path, out: Path, /, *, options: AdjustOptions, quiet: bool) -> None:
     """Refine camera poses and lens by a refractive bundle adjustment."""
-    from pcfix.adjust.result import adjustment_dict, before_of
+    from pcfix.adjust.result import adjustment_dict
     from pcfix.flow.adjust import correct_words
     from pcfix.report.adjustment import adjustment_text
 
     with status_line("Adjusting", quiet) as progress:
         found = pcfix.adjust_cameras(model, out, options=options, progress=progress)
-    say(adjustment_text(adjustment_dict(found, before_of(found))), quiet)
+    say(adjustment_text(adjustment_dict(found)), quiet)
     cloud = "" if options.cloud else ", with the cloud of the original cameras as CLOUD.laz"
     say(f"Next step{cloud}:\n  {correct_words(found, model, out, options)}", quiet)
 

@@ -12,19 +12,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pcfix.adjust.block import (
-    LEAST_VIEWS,
+    NO_CONTROL,
     WATER,
     block_of,
-    check_datum,
-    gnss_with_sigma,
-    some_ties,
     ties_of_cloud,
     usable_ties,
-    with_places,
+    well_observed,
 )
-from pcfix.adjust.methods import adjust_block, check_control, check_marks
+from pcfix.adjust.methods import (
+    adjust_block,
+    check_control,
+    check_datum,
+    check_marks,
+    gnss_with_sigma,
+)
 from pcfix.adjust.parameters import Unknowns, default_lens
-from pcfix.adjust.result import Adjusted, adjustment_dict, before_of
+from pcfix.adjust.result import Adjusted, adjustment_dict
 from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError, bad_file
 from pcfix.flow.diagnosis import flags_of, water_word
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
@@ -150,21 +153,18 @@ def adjust_into(
     unknowns = _unknowns(given, original)
     _check_free(unknowns, water, inputs.port)
     gnss, reason, notes = _gnss(original, name, given)
-    control = given.gcps
-    gcps = "gcps" if isinstance(control, GroundControl) else str(control)
-    if control is not None and not isinstance(control, GroundControl):
-        control = read_ground_control(control, original, crs=given.gcps_crs)
-    if control is not None and water is not None:
+    control, gcps = given.gcps or NO_CONTROL, "gcps"
+    if not isinstance(control, GroundControl):
+        control, gcps = read_ground_control(control, original, crs=given.gcps_crs), str(control)
+    if water is not None:
         check_marks(control, original, gcps, is_placed=gnss is not None)
     _check_surfaces(given.parallel, control, water, gcps)
     mask = mask_of(inputs.water_mask, crs or original.crs)
 
     # 2. The block, by tie points as they were measured or by points of the cloud
     ties, cloud_points = None, None
-    if given.ties != "cloud":
-        ties = inputs.tie_points(crs, placed=False)
-    if ties is not None:
-        ties = usable_ties(with_places(ties, original), original)
+    if given.ties != "cloud" and (read_ties := inputs.tie_points(crs, placed=False)) is not None:
+        ties = usable_ties(read_ties, original)
     if ties is None or len(ties.xyz) < LEAST_TIES:
         ties = _ties_of_cloud(view, original, name, 0 if ties is None else len(ties.xyz))
         cloud_points = original, ties.xyz
@@ -180,8 +180,7 @@ def adjust_into(
     found = adjust_block(block, unknowns, cloud=cloud_points, choose_lens=chooses_lens)
 
     # 3. The result
-    if control is not None:
-        check_control(found, gcps)
+    check_control(found, gcps)
     found = replace(found, notes=[*notes, *found.notes])
     if folder is not None:
         _write(folder, found, str(inputs.cameras))
@@ -206,14 +205,13 @@ def _check_free(unknowns: Unknowns, water: WaterSurface | None, port: Port | Non
 
 
 def _check_surfaces(
-    parallel: tuple[str, ...], control: GroundControl | None, water: WaterSurface | None, name: str
+    parallel: tuple[str, ...], control: GroundControl, water: WaterSurface | None, name: str
 ) -> None:
     """Refuse points on water that does not exist, and unknown planes."""
-    on = () if control is None else control.on
-    if WATER in on and water is None:
+    if WATER in control.on and water is None:
         sentence = "points have the role waterline, but there is no --water."
         raise bad_file(name, "gcps.no_water", sentence)
-    known = list(dict.fromkeys(one for one in on if one and one != WATER))
+    known = list(dict.fromkeys(one for one in control.on if one and one != WATER))
     known += [WATER] if isinstance(water, WaterPlane) else []
     if parallel and (len(parallel) < 2 or not set(parallel) <= set(known)):
         words = (
@@ -300,7 +298,7 @@ def _write(folder: Path, found: Adjusted, model: str) -> None:
             write_water_raster(draft / WATER_FILE, found.water, found.cameras.crs)
         if found.precision.members is not None:
             write_members(draft, found.precision.members)
-        summary = {"model": model, **adjustment_dict(found, before_of(found))}
+        summary = {"model": model, **adjustment_dict(found)}
         text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
         write_text(draft / SUMMARY, text, overwrite=False)
         write_text(draft / "report.html", adjustment_page(summary), overwrite=False)
@@ -311,11 +309,10 @@ def _write_models(folder: Path, found: Adjusted) -> None:
     ties, cameras = None, found.cameras
     if found.source != "cloud":  # the adjusted tie points without outliers
         block, m = found.block, found.block.tie_points
-        used = found.used & (block.owner < m)
-        counts = np.bincount(block.owner[used], minlength=m)[:m]
-        start = np.concatenate([[0], np.cumsum(counts)])
-        ties = TiePoints(found.xyz[:m], Views(start, block.camera[used]), block.image_xy[used])
-        ties = some_ties(ties, np.flatnonzero(counts >= LEAST_VIEWS))
+        o = block.start[m]
+        views = Views(block.start[: m + 1], block.camera[:o])
+        ties = TiePoints(found.xyz[:m], views, block.image_xy[:o])
+        ties = well_observed(ties, found.used[:o])
     failed = ""
     try:
         write_colmap(folder / MODELS[0], cameras, ties)

@@ -243,7 +243,7 @@ def cameras_text(report: CamerasReport) -> str:
             verdict += f"; the likely error of heights is {found.likely_error_m:.2g} m"
         rows.append(("Refraction", verdict))
         rows += [
-            (s.name[:1].upper() + s.name[1:], verdicts[s.speaks] + s.words) for s in found.signs
+            (s.name[:1].upper() + s.name[1:], verdicts[s.absorbed] + s.words) for s in found.signs
         ]
         if found.absorbed:
             rows += [("Next step", "adjust the poses:"), ("", report.remedy)]

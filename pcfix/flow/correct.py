@@ -153,7 +153,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         *coded("water.extent", water_notes),
         *([] if absorbed is None else [absorbed]),
     ]
-    figures, reconstruction, transfer = tally.figures, plan.reconstruction, plan.transfer
+    figures, reconstruction = tally.figures, plan.reconstruction
     because = "" if reconstruction is None else reconstruction["because"]
     unused = list(compress(plan.cameras.labels, ~figures.camera_used))
     return Summary(
@@ -170,7 +170,7 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         labelling=plan.labelling.report(tally.labels),
         settings={**plan.options.part(ScienceOptions).as_dict(), **plan.settings},
         water_fit=plan.found.as_dict(),
-        transfer=transfer.as_dict(tally.transfer) if transfer and tally.transfer else None,
+        transfer=None if tally.transfer is None else tally.transfer.as_dict(),
         reconstruction=reconstruction,  # its type, and why
         # other notes on the cloud, also in `warnings`
         notes=[one for one in map(str, plan.notes) if one not in because],
@@ -200,8 +200,8 @@ def _check_inputs(plan: Plan, tally: CloudTally) -> list[str]:
     From the general to the particular: a mask elsewhere would also leave points without cameras.
     """
     name, water = plan.view.name, plan.found.surface
-    if plan.transfer is not None and tally.transfer is not None:
-        plan.transfer.check(name, tally.transfer)
+    if tally.transfer is not None:
+        tally.transfer.check(name)
     plan.labelling.check(name, tally.labels)
     if tally.water is None:  # a port
         if tally.figures.submerged == 0:

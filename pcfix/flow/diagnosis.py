@@ -42,7 +42,7 @@ def diagnose_inputs(
     """Look for signs in a cloud, its cameras with their tie points, and surveys, if given."""
     control = None if gcps is None else read_ground_control(gcps, cameras).surveyed
     return diagnosed(
-        cameras, water, index, ties=inputs.tie_points(view.crs), view=view, control=control,
+        cameras, water, index, view, ties=inputs.tie_points(view.crs), control=control,
         gnss=_gnss_of(cameras, str(inputs.cameras)), reference=reference, in_passing=in_passing,
     )  # fmt: skip
 
@@ -79,8 +79,8 @@ def diagnose_in_passing(
             neighbours = neighbours_sign(*verdict.straight, is_fused=verdict.is_fused)
     try:
         found = diagnosed(
-            cameras, plan.found.surface, n, ties=ties, gnss=_gnss_of(cameras, name),
-            view=plan.view, neighbours=neighbours, in_passing=True,
+            cameras, plan.found.surface, n, plan.view, ties=ties, gnss=_gnss_of(cameras, name),
+            neighbours=neighbours, in_passing=True,
         )  # fmt: skip
     except (PcfixError, OSError) as error:  # this check stops no correction
         return poses(f"not checked for absorbed refraction: {error}"), None

@@ -247,8 +247,8 @@ def _decide(run: RunFolder) -> tuple[str, bool | None]:
     if sign is None:
         why = "nothing shows whether the poses have absorbed the refraction (--adjust yes adjusts)"
         return why, None
-    have = "have" if sign.speaks else "have not"
-    return f"the poses {have} absorbed the refraction: {sign.words}", sign.speaks
+    have = "have" if sign.absorbed else "have not"
+    return f"the poses {have} absorbed the refraction: {sign.words}", sign.absorbed
 
 
 def _adjust(run: RunFolder, files: list[Path]) -> str:

@@ -14,8 +14,8 @@ from pcfix.report.text import Rows, RowTable, filled, share, wrapped
 
 WHERE = (("land", "on land"), ("water", "under water"))
 _FACTS: RowTable = (
-    ("Water", "{water[surface]}", "water"),
-    ("Port", "--port {port[surface]}", "port"),
+    ("Water", "{water}", "water"),
+    ("Port", "--port {port}", "port"),
     ("Poses", "{poses_words}", "images"),
     ("", "centres moved by {poses[moved_rms_m]:.3f} m, rotated by {poses[turned_rms_deg]:.4f} deg"
      " (RMS)", "moved"),
@@ -43,8 +43,8 @@ def all_notes(d: Plain) -> list[str]:
 
 def adjustment_sentence(d: Plain) -> str:
     """Return an adjustment in a line."""
-    rows = [row for row in d["lens"] if row["name"] == "f"]
-    facts = [f"focal length {row['before']:.6g} -> {row['after']:.6g}" for row in rows]
+    lengths = [row for name, row in d["shared"].items() if name.partition(" ")[0] == "f"]
+    facts = [f"focal length {row['before']:.6g} -> {row['after']:.6g}" for row in lengths]
     moved = f"centres moved by {d['poses']['moved_rms_m']:.3f} m (RMS)"
     return "; ".join([*facts, moved, f"residuals: {_residuals(d)}"])
 
@@ -111,16 +111,11 @@ def _facts(d: Plain) -> Rows:
 def _change_table(d: Plain) -> Table:
     """Return lens, water, residuals and centres before and after."""
     unit, rows = d["image_unit"], list[list[str]]()
-    several = len({row["sensor"] for row in d["lens"]}) > 1
-    unknowns = [(row["name"], row, f", {row['sensor']}" * several) for row in d["lens"]]
-    surface = d["water"] or d["port"] or {}
-    unknowns += [
-        (name, row, "") for name, row in surface.items() if isinstance(row, dict) and row["free"]
-    ]
-    for name, row, of_lens in unknowns:
+    for name, row in d["shared"].items():
         label, of_unit = words_of(name)
-        of_unit = unit if name in ("f", "cx", "cy", "b1", "b2") else of_unit.strip()
-        label = label.capitalize() + of_lens + (f" ({of_unit})" if of_unit else "")
+        in_image = name.partition(" ")[0] in ("f", "cx", "cy", "b1", "b2")
+        of_unit = unit if in_image else of_unit.strip()
+        label = label[:1].upper() + label[1:] + (f" ({of_unit})" if of_unit else "")
         before, after = f"{row['before']:.6g}", f"{row['after']:.6g}"
         rows.append([label, before, after, f"{row['sigma']:.2g}"])
     for key, where in WHERE:

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from pcfix.adjust.block import block_of, restricted, usable_ties, well_seen
+from pcfix.adjust.block import NO_CONTROL, block_of, restricted, usable_ties, well_seen
 from pcfix.model import TiePoints, Views
 from tests.utils.codes import refused
 from tests.utils.tie_points import simulate_tie_points
@@ -31,7 +31,7 @@ def test_usable_ties():
     camera = data.ties.views.camera[:first]
     single = replace(single, camera=np.concatenate([camera[:1], camera, camera]))
     xyz = np.array([data.truth[0], data.truth[0], [np.nan] * 3])
-    ties = TiePoints(xyz, single, np.zeros((1 + 2 * first, 2)))
+    ties = TiePoints(xyz, single, np.full((1 + 2 * first, 2), np.nan))
     found = usable_ties(ties, data.cameras)
     np.testing.assert_array_equal(found.xyz, xyz[1:2])
     # 40 m over 5 km is half a degree
@@ -41,7 +41,7 @@ def test_usable_ties():
 
 def test_poor_image():
     data = scene()
-    block = gathered(control=None)
+    block = gathered(control=NO_CONTROL)
     seen = np.flatnonzero(block.camera == 3)
     sigma = block.sigma_px.copy()
     sigma[seen[3:]] = np.inf

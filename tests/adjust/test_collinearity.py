@@ -55,7 +55,7 @@ def given_of(**changes):
     cameras = Cameras(("a",), np.zeros((1, 3)), DOWN[None], (PLAIN,))
     ties = TiePoints(np.zeros((1, 3)), Views(np.array([0, 1]), np.array([0])), np.zeros((1, 2)))
     block = plain_block(cameras, ties, WaterPlane(-60.0), 1.34, np.array([True]))
-    return prepare(block, Unknowns(lens=()), np.zeros(3))[0].given._replace(**changes)
+    return prepare(block, Unknowns(lens=()))[0].given._replace(**changes)
 
 
 def pose(seed: int):
@@ -71,9 +71,7 @@ def state_of(q, centre, rotation, lens, water, port=None):
 
 
 def at(q, centre, rotation, lens, water, given, port=None):
-    state = state_of(q, centre, rotation, lens, water, port)
-    work = workspace(given)
-    return np.array(image_and_all_gradients(state, given, 0, 0, work, work.own))
+    return gradients(q, centre, rotation, lens, water, given, port)[0]
 
 
 def gradients(q, centre, rotation, lens, water, given, port=None):

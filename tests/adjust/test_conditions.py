@@ -11,7 +11,6 @@ from pcfix.adjust.problem import prepare
 from pcfix.adjust.result import redundancy_of
 from pcfix.model import WaterPlane
 from tests.utils import tie_blocks
-from tests.utils.adjust_twin import Twin
 from tests.utils.curved_water import under_curved_water
 from tests.utils.tie_blocks import block_of
 from tests.utils.tie_points import simulate_tie_points
@@ -51,8 +50,6 @@ def block_with(data, on, **how):
     """Return a block in which all points are control points, most of them without coordinates."""
     block = block_of(data, **how)
     m, control = len(on), block.control
-    if control is None:
-        control = replace(data.control, names=(), xyz=np.zeros((0, 3)), sigma_m=np.zeros((0, 3)))
     on = (*on, *[""] * len(control.names))
     control = replace(
         control, names=tuple(f"P{i}" for i in range(len(on))), is_check=np.zeros(len(on), bool),
@@ -106,9 +103,9 @@ def test_waterline():
     data, on = put(data, {"water": (rows, at_level(data))})
     block = block_with(data, on, water=WaterPlane(data.water.a + 0.2), control=True)
     _, found, precision = adjusted(block, LEVEL)
-    sigma = precision.sigma_of("level")
+    sigma = precision.shared["level"].sigma
     assert abs(found.shared[0] + 0.2) < 3.5 * sigma
-    assert sigma < 0.9 * adjusted(without_surfaces(block), LEVEL)[2].sigma_of("level")
+    assert sigma < 0.9 * adjusted(without_surfaces(block), LEVEL)[2].shared["level"].sigma
     redundancies = [
         redundancy_of(prepare(one, LEVEL)[0]) for one in (block, without_surfaces(block))
     ]
@@ -132,39 +129,9 @@ def test_parallel(parallel):
     if "water" in parallel:
         assert (floor[1:] == found.state.water[1:3]).all()
         assert problem.names == ["tilt_x", "tilt_y", "level of floor", "level of deck"]
-        sigma = precision.sigma_of("tilt_x")
-        assert sigma < separate.sigma_of("tilt_x")
+        sigma = precision.shared["tilt_x"].sigma
+        assert sigma < separate.shared["tilt_x"].sigma
     else:
-        sigma = precision.sigma_of("tilt_x of floor")
-        assert sigma < min(separate.sigma_of(f"tilt_x of {name}") for name in ("floor", "deck"))
+        sigma = precision.shared["tilt_x of floor"].sigma
+        assert sigma < min(separate.shared[f"tilt_x of {name}"].sigma for name in ("floor", "deck"))
     assert abs(floor[1] - b) < 3.5 * sigma
-
-
-def test_same_as_scipy():
-    data = simulate_tie_points(
-        20, seed=2, area_m=(25, 20), greatest_depth_m=6, position_noise_m=0.05,
-        attitude_noise_deg=0.05, forward_overlap=0.6, side_overlap=0.5, obliques_deg=25,
-        oblique_directions=2, oblique_share=0.3, tilt_percent=1.0,
-    )  # fmt: skip
-    data, on = put(data, {
-        "water": (np.arange(4), at_level(data, data.water.b, data.water.c)),
-        "floor": (np.arange(4, 10), at_level(data, 0.01, 0.0, 1.0)),
-    })  # fmt: skip
-    block = block_with(data, on, cameras=data.true_cameras, gnss=False)
-    for parallel in ((), ("water", "floor")):
-        # the twin has no word for points that are never wet: a waterline that it meets from above
-        block = replace(block, wet=np.ones(len(block.wet), bool), parallel=parallel)
-        unknowns = Unknowns(poses="fixed", lens=(), surface={"level": FREE, "tilt": FREE})
-        problem, found, precision = adjusted(block, unknowns)
-        twin = Twin(block, tuple(problem.names), free_poses=False)
-        x = twin.solve()
-        _, _, added, xyz = twin.parts(x)
-        # the twin's planes are told as a whole, ours as what was added to a fitted start
-        added = {name: value for name, value in added.items() if " of " not in name}
-        assert abs((twin.residuals(x) ** 2).sum() - found.cost) < 1e-6
-        np.testing.assert_allclose(found.state.xyz, xyz, atol=1e-5)  # m
-        sigma = np.sqrt(np.diag(twin.covariance(x)))[: len(problem.names)]
-        np.testing.assert_allclose([row.sigma for row in precision.shared], sigma, rtol=2e-3)
-        for name, value in added.items():
-            row = next(row for row in precision.shared if row.name == name)
-            assert abs(row.added - value) < 1e-3 * row.sigma

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pcfix.adjust.block import block_of, ties_of_cloud
+from pcfix.adjust.block import NO_CONTROL, block_of, ties_of_cloud
 from pcfix.adjust.from_cloud import adjust_cloud
 from pcfix.adjust.from_ties import adjust_ties
 from pcfix.adjust.parameters import Unknowns
@@ -20,15 +20,13 @@ SMALL = {"area_m": (50, 40), "greatest_depth_m": 5, "position_noise_m": 0.5,
 HOME_M = 1e-6
 """Exact data: Newton's steps end below 1e-7 m."""
 
-"""Of |J||r|: differences of the simulator's projection are good to about 1e-9 of it."""
-
 
 @cache
 def block(points=150, exact=True, **settings):
     return unaware(simulate_tie_points(points, **(SMALL | settings)), exact=exact)
 
 
-def cloud_block(data, *, gnss=True, control=None, exact=True):
+def cloud_block(data, *, gnss=True, control=NO_CONTROL, exact=True):
     """Return the apparent points as the only thing that is known of the images."""
     scene, old = data.scene, data.cameras
     ties = ties_of_cloud(data.ties.xyz, data.ties.views, old)
@@ -36,8 +34,7 @@ def cloud_block(data, *, gnss=True, control=None, exact=True):
     if gnss:
         place = scene.true_cameras.centres if exact else scene.cameras.gnss.xyz
         whole = replace(whole, gnss=GnssPositions(place, scene.cameras.gnss.sigma_m, None))
-    apparent = ties.xyz if control is None else np.vstack([ties.xyz, control.xyz])
-    return whole, old, apparent
+    return whole, old, np.vstack([ties.xyz, control.xyz])
 
 
 def centre_error_m(data, cameras):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.adjust.block import block_of
+from pcfix.adjust.block import NO_CONTROL, block_of
 from pcfix.adjust.from_ties import adjust_ties
 from pcfix.adjust.parameters import Unknowns, default_lens
 from pcfix.flow.adjust import adjust_cameras
@@ -27,7 +27,7 @@ def scene(image_px=0.5, **settings):
     )  # fmt: skip
 
 
-def block(data, ties=None, gnss=True, control=None):
+def block(data, ties=None, gnss=True, control=NO_CONTROL):
     ties = data.ties if ties is None else ties
     found = block_of(data.cameras, ties, data.water, data.refractive_index, control=control)
     return replace(found, gnss=data.cameras.gnss) if gnss else found
@@ -176,8 +176,8 @@ def test_missing_term(term):
     found = adjusted(with_lens(**term))
     assert found.unknowns.lens == ("f", "cx", "cy", name)
     assert found.notes[0].values == {"found": [name]}
-    row = next(row for row in found.precision.shared if row.name == name)
-    assert abs(row.added - value) < 4.0 * row.sigma
+    row = found.precision.shared[name]
+    assert abs(row.after - row.before - value) < 4.0 * row.sigma
     assert found.sigma0 == pytest.approx(1.0, abs=0.1)
 
 
@@ -185,7 +185,7 @@ def test_absorbed_term():
     """Square pixels came with an aspect of 0.2 px, too little to be missed among the residuals."""
     found = adjusted(with_lens(start_b1=0.2))
     assert found.unknowns.lens == ("f", "cx", "cy", "b1")
-    sigma = found.precision.sigma_of("b1")
+    sigma = found.precision.shared["b1"].sigma
     assert abs(found.cameras.lenses[0].b1) < 4.0 * sigma
 
 
@@ -199,7 +199,7 @@ def test_strip(tmp_path):
     assert abs(before.principal_y - truth.principal_y) > 20.0
     # standard errors: four of a normal distribution, which chance exceeds once in 16,000
     for name in ("principal_x", "principal_y", "focal"):
-        sigma = found.precision.sigma_of({"focal": "f"}.get(name, f"c{name[-1]}"))
+        sigma = found.precision.shared[{"focal": "f"}.get(name, f"c{name[-1]}")].sigma
         assert abs(getattr(after, name) - getattr(truth, name)) < 4.0 * sigma
     off = (found.cameras.centres - true.centres) / found.precision.centre_sigma_m
     # rms of 42 normalised errors: 1 with a standard deviation of a tenth, more as neighbours agree

@@ -1,105 +1,46 @@
-"""The shape of the water as an unknown: exact light through bent water comes home."""
-
-from dataclasses import replace
-from functools import cache
+"""The shape of the water as an unknown: exact light through curved water comes home."""
 
 import numpy as np
 
 from pcfix.adjust.methods import undetermined
 from pcfix.adjust.parameters import Unknowns
-from pcfix.adjust.precision import members_of, precision_of
+from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import water_of
 from pcfix.model import WaterPlane, WaterRaster
 from pcfix.water.surface import surface_above
-from tests.utils import tie_blocks
-from tests.utils.adjust_twin import Twin
+from tests.adjust.test_conditions import scene
 from tests.utils.curved_water import under_curved_water
-from tests.utils.tie_blocks import block_of, clear_of_the_waterline
-from tests.utils.tie_points import simulate_tie_points
+from tests.utils.tie_blocks import adjusted, block_of, clear_of_the_waterline
 
 FREE = np.inf
 SHAPED = Unknowns(lens=(), surface={"level": FREE, "tilt": FREE, "shape": FREE})
 CURVATURE = np.array([1.2e-4, -6e-5, -9e-5])
 """1/m: 6 cm at 25 m from the middle, as before a weir."""
-SCENE = {
-    "area_m": (50, 40), "greatest_depth_m": 5, "position_noise_m": 0.2, "attitude_noise_deg": 0.2,
-    "block": "oblique", "obliques_deg": 30, "oblique_directions": 2, "oblique_share": 0.4,
-}  # fmt: skip
 
 
-@cache
-def scene(points, curvature=tuple(CURVATURE), **settings):
-    data = simulate_tie_points(points, **(SCENE | settings))
-    # the straight images of points that the bend puts under water or lifts out of it have a kink
-    return under_curved_water(clear_of_the_waterline(data, 0.4), np.array(curvature))
-
-
-def adjusted(block, unknowns=SHAPED):
-    problem, found = tie_blocks.adjusted(block, unknowns)
-    return problem, found, precision_of(problem, found)
+def curved(points):
+    # the straight images of points that the curve puts under water or lifts out of it have a kink
+    return under_curved_water(clear_of_the_waterline(scene(points), 0.4), CURVATURE)
 
 
 def test_comes_home():
-    data = scene(150)
+    data = curved(150)
     start = WaterPlane(data.water.a + 0.1)
-    block = block_of(data, exact=True, control=True, water=start)
-    problem, found, _ = adjusted(block)
-    np.testing.assert_allclose(
-        found.state.water[4:7], CURVATURE, atol=1e-10
-    )  # 1/m: 0.06 um at 25 m
+    problem, found = adjusted(block_of(data, exact=True, control=True, water=start), SHAPED)
+    # 1/m: 0.06 um at 25 m
+    np.testing.assert_allclose(found.state.water[4:7], CURVATURE, atol=1e-10)
     ties = found.state.xyz[: len(data.truth)] + problem.origin
     np.testing.assert_allclose(ties, data.truth, atol=1e-6)  # m: Newton's last step
     water = water_of(problem, found.state)
     assert isinstance(water, WaterRaster)
     x, y = (data.truth - problem.origin)[:, :2].T
     wanted = data.water.a + CURVATURE @ [x * x, x * y, y * y]
-    # m: between the centres of cells of half a metre the raster is bilinear, and this much bent
+    # m: between the centres of cells of half a metre the raster is bilinear, and this much curved
     np.testing.assert_allclose(surface_above(water, data.truth).height_m, wanted, atol=2e-5)
 
 
 def test_undetermined_shape():
-    data = scene(60)
-    precision = adjusted(block_of(data, control=True, sigma_px=8.0))[2]
+    block = block_of(curved(60), control=True, sigma_px=8.0)
     shape = {"shape_xx", "shape_xy", "shape_yy"}
-    assert shape <= {one.values["unknown"] for one in undetermined(precision)}
-
-
-def test_same_as_scipy():
-    data = simulate_tie_points(
-        14, seed=2, area_m=(25, 20), greatest_depth_m=6, position_noise_m=0.05,
-        attitude_noise_deg=0.05, forward_overlap=0.6, side_overlap=0.5, obliques_deg=25,
-        oblique_directions=2, oblique_share=0.3,
-    )  # fmt: skip
-    block = block_of(
-        under_curved_water(data, 4.0 * CURVATURE),
-        control=True,
-        cameras=data.true_cameras,
-        gnss=False,
-    )
-    problem, found, precision = adjusted(block, replace(SHAPED, poses="fixed"))
-    twin = Twin(block, tuple(problem.names), free_poses=False)
-    x = twin.solve()
-    _, _, added, xyz = twin.parts(x)
-    assert abs((twin.residuals(x) ** 2).sum() - found.cost) < 1e-6
-    np.testing.assert_allclose(found.state.xyz, xyz, atol=1e-5)  # m
-    sigma = np.sqrt(np.diag(twin.covariance(x)))[: len(added)]
-    # 0.2 percent: what differences of an ill-conditioned Jacobian are good to
-    np.testing.assert_allclose([row.sigma for row in precision.shared], sigma, rtol=2e-3)
-    off = np.array([row.added - added[row.name] for row in precision.shared])
-    assert np.abs(off / sigma).max() < 1e-3
-
-
-def test_members():
-    data = scene(60)
-    problem, found, precision = adjusted(block_of(data, control=True))
-    step = np.zeros((1, 6 * len(found.lenses) + len(problem.names)))
-    step[0, -6:] = [0.02, 1e-3, -2e-3, 1e-5, 2e-5, -3e-5]
-    member = members_of(problem, found, step)
-    raster, cameras = water_of(problem, found.state), data.true_cameras
-    cameras = replace(cameras, centres=found.state.centres + problem.origin)
-    moved = member.surface(0, raster, cameras)
-    x, y = (data.truth - problem.origin)[:, :2].T
-    by = step[0, -6:] @ [np.ones(len(x)), x, y, x * x, x * y, y * y]
-    risen = surface_above(moved, data.truth).height_m - surface_above(raster, data.truth).height_m
-    np.testing.assert_allclose(risen, by, atol=5e-6)  # m: as above
-    assert precision.members.water.shape == (32, 7)
+    found = undetermined(precision_of(*adjusted(block, SHAPED)))
+    assert shape <= {one.values["unknown"] for one in found}

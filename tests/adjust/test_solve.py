@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from pcfix.adjust.parameters import Unknowns
 from pcfix.adjust.problem import solved_cameras, water_of
 from pcfix.model import WaterPlane
-from tests.utils.adjust_twin import Twin
 from tests.utils.tie_blocks import adjusted, block_of
 from tests.utils.tie_points import simulate_tie_points
 
@@ -99,23 +98,3 @@ def test_free_network():
     over, across = (a[:, :2] * b[:, :2]).sum(), a[:, 0] @ b[:, 1] - a[:, 1] @ b[:, 0]
     turn = Rotation.from_euler("z", np.arctan2(across, over)).as_matrix()
     np.testing.assert_allclose(b, s * a @ turn.T, atol=HOME_M)
-
-
-def test_same_as_scipy():
-    data = simulate_tie_points(
-        11, seed=2, area_m=(25, 20), greatest_depth_m=6, position_noise_m=0.1,
-        attitude_noise_deg=0.1, forward_overlap=0.6, side_overlap=0.5, obliques_deg=25,
-        oblique_directions=2, oblique_share=0.3, tilt_percent=2.0,
-    )  # fmt: skip
-    block = block_of(data, control=True)
-    problem, found = adjusted(block, Unknowns(lens=("f",), surface={"level": FREE, "index": 0.005}))
-    twin = Twin(block, ("f", "level", "index"), index_sigma=0.005)
-    x = twin.solve()
-    centres, rotations, added, xyz = twin.parts(x)
-    assert abs((twin.residuals(x) ** 2).sum() - found.cost) < 1e-6  # of about 250
-    # m: a thousandth of the standard errors and less; both stop where the cost no longer changes
-    np.testing.assert_allclose(found.state.centres, centres, atol=1e-5)
-    np.testing.assert_allclose(found.state.xyz, xyz, atol=1e-5)
-    np.testing.assert_allclose(found.state.rotations, rotations, atol=1e-6)
-    names = dict(zip(problem.names, found.shared, strict=True))
-    assert names == pytest.approx(added, abs=1e-4)

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from pcfix.adjust.transfer import transfer
 from pcfix.model import Cameras, Lens, Views
+from tests.utils.consistent_twin import image_in, triangulated_straight
 
 DOWN = np.diag([1.0, -1.0, -1.0])
 STEP_M = 1e-6
@@ -39,31 +39,6 @@ def everybody(n, k):
     return Views(np.arange(0, n * k + 1, k), np.tile(np.arange(k), n))
 
 
-def images_of(xyz, cameras):
-    """Project one point into all cameras by the formulas of `Lens`, shape (k, 2)."""
-    found = []
-    for centre, rotation, lens in zip(
-        cameras.centres, cameras.rotations, cameras.lenses, strict=True
-    ):
-        x, y, z = rotation @ (xyz - centre)
-        x, y = x / z, y / z
-        r2 = x * x + y * y
-        factor = 1.0 + lens.radial[0] * r2 + lens.radial[1] * r2 * r2
-        found.append(
-            [lens.principal_x + lens.focal * x * factor, lens.principal_y + lens.focal * y * factor]
-        )
-    return np.array(found)
-
-
-def met(images, cameras, start):
-    """Return where rays through image places meet: the least squares of the residuals in pixels."""
-    found = least_squares(
-        lambda xyz: (images_of(xyz, cameras) - images).ravel(), start, xtol=1e-15, ftol=1e-15,
-        gtol=1e-15, x_scale=1.0, method="lm",
-    )  # fmt: skip
-    return found.x
-
-
 def disturbed(cameras, rng):
     """Return what an adjustment may have made of them: other centres, angles and lens."""
     turn = Rotation.from_rotvec(rng.normal(0.0, 5e-4, (len(cameras), 3))).as_matrix()
@@ -91,7 +66,10 @@ def test_come_home(cameras, points):
     """The disturbed cameras' points are where their own straight rays nearly meet."""
     old = disturbed(cameras, np.random.default_rng(2))
     some = points[:40]
-    data = np.array([met(images_of(xyz, cameras), old, xyz) for xyz in some])
+    data = np.array([
+        triangulated_straight([image_in(cameras, c, xyz) for c in range(12)], old, range(12), xyz)
+        for xyz in some
+    ])  # fmt: skip
     shift, moved = transfer(data, everybody(40, 12), old, cameras)
     assert moved.all()
     away = np.sqrt(((data - some) ** 2).sum(axis=1).mean())

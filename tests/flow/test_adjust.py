@@ -107,7 +107,7 @@ def test_level_and_index(files):
         files, water=files.water + 0.25, index=1.33, free=("level", "index"),
         gcps=files.folder / "gcps.csv", lens=files.folder / "lens.csv",
     )  # fmt: skip
-    sigma = {row.name: row.sigma for row in found.precision.shared}
+    sigma = {name: row.sigma for name, row in found.precision.shared.items()}
     level, n = found.water.a, found.refractive_index
     assert abs(level - files.water) < 3.0 * sigma["level"]
     assert abs(n - files.scene.refractive_index) < 3.0 * sigma["index"]
@@ -150,7 +150,7 @@ def test_shape_and_waterline(files, tmp_path):
     assert f"--water {tmp_path / 'out' / 'water.tif'}" in words
     bed, _ = home(files, tmp_path / "out" / "colmap", water=tmp_path / "out" / "water.tif")
     assert bed < 0.02
-    level = as_written["water"]["level"]
+    level = as_written["shared"]["level"]
     assert abs(level["after"] - files.water) < 3.5 * level["sigma"] < 0.04
 
 
@@ -170,13 +170,8 @@ def test_wrong_marks_on_surfaces(files, tmp_path, role, more, code):
 def test_written(files, written):
     out, found = written
     names = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
-    assert {
-        "colmap/images.bin",
-        "cameras.csv",
-        "sensor.csv",
-        "adjustment.json",
-        "report.html",
-    } <= names
+    wanted = {"colmap/images.bin", "cameras.csv", "sensor.csv", "adjustment.json", "report.html"}
+    assert wanted <= names
     for name in ("colmap", "cameras.csv"):
         read = pcfix.read_cameras(out / name)
         order = [read.labels.index(label) for label in found.cameras.labels]

@@ -1,7 +1,5 @@
 """A rendered block that ordinary software bent, mended with tie points and without."""
 
-from functools import partial
-
 import laspy
 import numpy as np
 import pytest
@@ -9,7 +7,6 @@ import rasterio
 from scipy.interpolate import RegularGridInterpolator
 
 import pcfix
-from pcfix.adjust.block import usable_ties
 from pcfix.flow.adjust import adjust_cameras
 from tests.utils.nightly import mostly_nightly
 from tests.utils.shared import needs
@@ -30,7 +27,7 @@ TIES = 3000
 )
 def test_rendered_block(tmp_path, monkeypatch, ties, bed_gsd, land_gsd):
     """Before, land lies 19 GSD (of 5 cm) too low; the matcher's own noise is 0.9 and 0.7."""
-    monkeypatch.setattr("pcfix.flow.adjust.usable_ties", partial(usable_ties, most=TIES))
+    monkeypatch.setattr("pcfix.adjust.block.TIE_POINTS", TIES)
     offset = tuple(np.loadtxt(FREE / "offset.txt"))
     found = adjust_cameras(
         FREE / "sparse", water=WATER_M, cameras_offset=offset, cloud=FREE / "cloud.las",

@@ -96,7 +96,7 @@ def test_no_sign():
         gnss=ABSORBED / "gnss.csv", gcps=ABSORBED / "gcps.csv", reference=TRUE / "lidar.laz",
     )  # fmt: skip
     assert report.diagnosis.absorbed is False
-    assert not any(sign.speaks for sign in report.diagnosis.signs)
+    assert not any(sign.absorbed for sign in report.diagnosis.signs)
     assert report.figures["refraction"]["likely_error_m"] is None
 
 
@@ -112,7 +112,7 @@ def test_no_sign():
     ],
 )
 def test_neighbours_sign(share, sigma, is_fused, absorbed):
-    assert neighbours_sign(share, sigma, is_fused=is_fused).speaks is absorbed
+    assert neighbours_sign(share, sigma, is_fused=is_fused).absorbed is absorbed
 
 
 def test_neighbours_last():

@@ -97,20 +97,19 @@ def test_port_from_noisy_images(tmp_path, port):
             gnss=tmp_path / "gnss.csv", index=data.refractive_index, lens_unknowns=(),
         )  # fmt: skip
     summary = json.loads((tmp_path / "out" / "adjustment.json").read_text())
-    written = summary["port"]
-    again = port_of_text(written["surface"])  # to 0.1 um
+    again = port_of_text(summary["port"])  # to 0.1 um
     for numbers, adjusted in zip(window_of(again), window_of(found.port), strict=True):
         np.testing.assert_allclose(numbers, adjusted, atol=1e-7)
     names = ("distance",) if port is FLAT else ("centre_x", "centre_y", "centre_z")
     values = (port.distance_m,) if port is FLAT else port.centre_m
     for name, value in zip(names, values, strict=True):
-        row = written[name]
+        row = summary["shared"][name]
         assert abs(row["after"] - value) < 3.5 * row["sigma"]
         assert abs(row["before"] - value) > 0.0 or value == 0.0
-    assert f"--port {written['surface']}" in " ".join(adjustment_text(summary).split())
+    assert f"--port {summary['port']}" in " ".join(adjustment_text(summary).split())
     options = AdjustOptions(port=port, free=(free,))
     words = correct_words(found, "model", tmp_path / "out", options)
-    assert words.endswith(f"--port {written['surface']}")
+    assert words.endswith(f"--port {summary['port']}")
 
 
 @pytest.mark.parametrize(

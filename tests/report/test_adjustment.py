@@ -10,8 +10,7 @@ import pytest
 from pcfix.adjust.block import Block
 from pcfix.adjust.parameters import Unknowns
 from pcfix.adjust.precision import Precision, SharedUnknown
-from pcfix.adjust.problem import Intersected, prepare
-from pcfix.adjust.result import Adjusted, ControlRow, adjustment_dict, before_of
+from pcfix.adjust.result import Adjusted, ControlRow, adjustment_dict, residuals_before
 from pcfix.errors import PcfixWarning
 from pcfix.model import Cameras, GnssPositions, GroundControl, Lens, WaterPlane
 from pcfix.report.adjustment import adjustment_page, adjustment_text
@@ -40,6 +39,11 @@ def cameras(focal=FOCAL, shift=(0.0, 0.0, 0.0)):
     )  # fmt: skip
 
 
+AFTER = cameras(1002.0, (0.0, 0.0, 0.3))
+OFF_M = np.array([[0.01, 0.02, 0.03], [0.05, -0.02, 0.09], [np.nan] * 3])
+"""Adjusted centres minus GNSS positions."""
+
+
 def points(m=24):
     """Return m points under the cameras: a third on land, the others down to 3.5 m of depth."""
     rng = np.random.default_rng(3)
@@ -59,7 +63,7 @@ def make_block(xyz, images, before, refractive_index=1.34):
     m, k = len(xyz), 3
     return Block(
         before, xyz, np.arange(m + 1) * k, np.tile(np.arange(k), m), images, np.full(m * k, 0.3),
-        np.ones(m, bool), GnssPositions(before.centres + 0.01, np.full((k, 3), 0.03), None),
+        np.ones(m, bool), GnssPositions(AFTER.centres - OFF_M, np.full((k, 3), 0.03), None),
         WaterPlane(LEVEL), refractive_index,
     )  # fmt: skip
 
@@ -74,9 +78,12 @@ def surveyed(points, checks=0):
 
 
 @pytest.fixture
-def adjusted():
-    """Return 24 points in three images with residuals of 0.3 on land and 0.4 px under water."""
-    xyz, after, before = points(), cameras(1002.0, (0.0, 0.0, 0.3)), cameras()
+def adjusted(monkeypatch):
+    """Return 24 points in three images with residuals of 0.3 on land and 0.4 px under water.
+
+    Before the adjustment these were 1.2 and 2.4 px.
+    """
+    xyz, before = points(), cameras()
     is_wet = xyz[:, 2] < LEVEL
     residual = np.where(is_wet, 0.4, 0.3).repeat(3)[:, None] * np.array([1.0, -1.0])
     used = np.ones(72, bool)
@@ -87,19 +94,15 @@ def adjusted():
         ControlRow("G2", "control", 0.010, 0.020, -0.050, 0.7, 2),
         ControlRow("C1", "check", -0.040, 0.000, 0.060, 0.8, 3),
     ]
-    origin = np.round(before.centres.mean(axis=0))
-    gnss = np.array([[0.01, 0.02, 0.03], [0.05, -0.02, 0.09], [np.nan] * 3])
-    block, unknowns = (
-        make_block(xyz, pinhole(xyz, before), before),
-        Unknowns(surface={"level": 0.1}),
+    monkeypatch.setattr(
+        "pcfix.adjust.result.residuals_before",
+        lambda _: np.where(is_wet, 2.4, 1.2).repeat(3)[:, None] * np.ones(2),
     )
-    problem, start = prepare(block, unknowns, origin)
-    numbers = np.array([LEVEL + 0.02 - origin[2], 0.0, 0.0, 1.34, *[0.0] * 7])
     return Adjusted(
-        block, unknowns, after, WaterPlane(LEVEL + 0.02), 1.34, xyz, residual, used, is_wet, 1.234,
-        60, "tie points", make_precision(len(xyz)), gnss, control,
-        [PcfixWarning("adjust.lens", "something <decided>")], problem,
-        replace(start, state=start.state._replace(water=numbers)),
+        make_block(xyz, pinhole(xyz, before), before), Unknowns(surface={"level": 0.1}), AFTER,
+        WaterPlane(LEVEL + 0.02), 1.34, xyz, residual, used, is_wet, 1.234, 60, "tie points",
+        make_precision(len(xyz)), control,
+        [PcfixWarning("adjust.lens", "something <decided>")],
     )  # fmt: skip
 
 
@@ -108,21 +111,17 @@ def make_precision(m):
     pose[:, range(6), range(6)] = [1e-6, 4e-6, 9e-6, 1e-4, 4e-4, 9e-4]
     pose[1] *= 4.0
     pose[2] *= 9.0
-    shared = SharedUnknown("f", 2.0, 0.25), SharedUnknown("level", 0.02, 0.004)
+    shared = {
+        "f": SharedUnknown(FOCAL, 1002.0, 0.25), "level": SharedUnknown(LEVEL, LEVEL + 0.02, 0.004),
+    }  # fmt: skip
     # of every point: 1, 2 and 3 cm
     sigma = np.tile([0.01, 0.02, 0.03], (m, 1))
     correlation = np.array([[1.0, -0.6], [-0.6, 1.0]])
     return Precision(1.234, pose, shared, correlation, sigma)
 
 
-def before_px(adjusted):
-    """Return residuals before that are 1.2 px on land and 2.4 px under water."""
-    size = np.where(adjusted.is_wet, 2.4, 1.2).repeat(3)[:, None]
-    return Intersected(adjusted.xyz - [0.0, 0.0, 1.0], size * np.ones(2), adjusted.block.start)
-
-
 def test_residuals_on_the_ground(adjusted):
-    found = adjustment_dict(adjusted, before_px(adjusted))["residuals"]["land"]["rms_m"]
+    found = adjustment_dict(adjusted)["residuals"]["land"]["rms_m"]
     land = ~adjusted.is_wet
     away = np.linalg.norm(adjusted.xyz[land, None] - adjusted.cameras.centres, axis=2)
     used = adjusted.used.reshape(-1, 3)[land]
@@ -131,7 +130,7 @@ def test_residuals_on_the_ground(adjusted):
 
 
 def test_values(adjusted):
-    values = adjustment_dict(adjusted, before_px(adjusted))
+    values = adjustment_dict(adjusted)
     json.dumps(values, allow_nan=False)
     reference = (ROOT / "pcfix" / "cli" / "README.md").read_text("utf-8")
     table = reference[reference.index("| key of `adjustment.json`") :].partition("\n\n")[0]
@@ -146,18 +145,17 @@ def test_values(adjusted):
 
 def bare(adjusted):
     """Return what is least: no water, nothing beside the images, one step."""
-    block = replace(adjusted.block, water=None)
+    unknown = np.full((3, 3), np.nan)
+    block = replace(adjusted.block, water=None, gnss=GnssPositions(unknown, unknown, None))
     return replace(
         adjusted, block=block, water=None, is_wet=np.zeros(len(adjusted.xyz), bool), control=[],
-        gnss_residual_m=np.full((3, 3), np.nan), notes=[],
-        unknowns=Unknowns(poses="fixed", lens=()),
+        notes=[], unknowns=Unknowns(poses="fixed", lens=()),
     )  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", ["whole", "bare"])
 def test_page(adjusted, kind):
-    before, it = before_px(adjusted), adjusted if kind == "whole" else bare(adjusted)
-    values = adjustment_dict(it, before)
+    values = adjustment_dict(adjusted if kind == "whole" else bare(adjusted))
     texts = " ".join(Elements(adjustment_page(values)).texts)
     assert not re.search(r"\bnan\b|\bNone\b|\binf\b", texts + adjustment_text(values))
     assert "Adjusted 3 images and 24 points" in texts
@@ -166,7 +164,7 @@ def test_page(adjusted, kind):
 
 def test_text(adjusted):
     """Before and after: lens and level with standard errors, residuals, GNSS; what is known."""
-    lines = adjustment_text(adjustment_dict(adjusted, before_px(adjusted))).splitlines()
+    lines = adjustment_text(adjustment_dict(adjusted)).splitlines()
     rows = [re.split(r"  +", line.strip()) for line in lines[1:7]]
     table = {label: numbers for label, *numbers in rows}
     assert table["Focal length (px)"] == ["1000", "1002", "0.25"]
@@ -185,13 +183,13 @@ def test_check_points(adjusted):
     used[-3:] = False
     used[3:6] = False  # a tie point that is left out wholly
     found = replace(adjusted, block=replace(adjusted.block, control=surveyed(2, 1)), used=used)
-    values = adjustment_dict(found, before_px(found))
+    values = adjustment_dict(found)
     assert values["points"] == {"all": 22, "land": 8, "water": 14}
     assert values["observations"] == {"used": 64, "excluded": 5}
     assert sum(values["residuals"][key]["points"] for key in ("land", "water")) == 22
 
 
-def test_before(adjusted):
+def test_residuals_before(adjusted):
     """n = 1: straight rays meet at the truth, whatever the survey says of a control point."""
     truth = points()
     start = truth + np.array([0.3, -0.2, 0.4])
@@ -199,8 +197,7 @@ def test_before(adjusted):
     block.image_xy[40] += 25.0  # the outlier, left out
     control = surveyed(len(truth))
     control.xyz[4] = truth[4] + 1.0
-    found = before_of(replace(adjusted, block=replace(block, control=control)))
+    found = residuals_before(replace(adjusted, block=replace(block, control=control)))
     # observations are exact: what is left is Newton's last step, and coordinates of 4e6 m
-    np.testing.assert_allclose(found.xyz, truth, atol=1e-6)
-    assert np.abs(found.residual_px[adjusted.used]).max() < 1e-4
-    assert found.residual_px[40] == pytest.approx([25.0, 25.0], abs=1e-4)
+    assert np.abs(found[adjusted.used]).max() < 1e-4
+    assert found[40] == pytest.approx([25.0, 25.0], abs=1e-4)

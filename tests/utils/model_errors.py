@@ -83,8 +83,8 @@ def normalised(found: Adjusted, true: Cameras) -> dict[str, FloatArray]:
         "f": lens.focal - data.focal, "cx": lens.principal_x - data.principal_x,
         "cy": lens.principal_y - data.principal_y,
     }  # fmt: skip
-    sigma = {name: found.precision.sigma_of(name) or np.nan for name in off}  # NaN where held
-    errors = {name: np.array([by / sigma[name]]) for name, by in off.items()}
+    errors, shared = {name: np.array([np.nan]) for name in off}, found.precision.shared  # if fixed
+    errors |= {name: off[name] / np.array([shared[name].sigma]) for name in off if name in shared}
     errors |= dict(zip(("omega", "phi", "kappa"), angles.T, strict=True))
     return errors | dict(zip("XYZ", centres.T, strict=True))
 
@@ -92,7 +92,7 @@ def normalised(found: Adjusted, true: Cameras) -> dict[str, FloatArray]:
 def bed_rms_m(scene: TieScene, cameras: Cameras, water: WaterPlane) -> float:
     """Return the rms error of the height of points under water, seen without noise."""
     block = block_of(scene, exact=True, cameras=cameras, water=water)
-    off = (intersect_fixed(block).xyz - scene.truth)[scene.is_wet, 2]
+    off = (intersect_fixed(block)[0] - scene.truth)[scene.is_wet, 2]
     return float(np.sqrt(np.nanmean(off * off)))
 
 

@@ -1,6 +1,7 @@
 """Blocks for an adjustment, made of the simulator's scenes."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -8,7 +9,17 @@ from pcfix.adjust.block import Block
 from pcfix.adjust.problem import prepare
 from pcfix.adjust.solve import solve
 from pcfix.model import GnssPositions, TiePoints
-from tests.utils.tie_points import TieScene
+from tests.utils.tie_points import TieScene, simulate_tie_points
+
+
+@cache
+def tiny_scene(points: int = 14, **settings) -> TieScene:
+    """Return a scene that is small enough for slow twins."""
+    return simulate_tie_points(
+        points, seed=2, area_m=(25, 20), greatest_depth_m=6, forward_overlap=0.6, side_overlap=0.5,
+        obliques_deg=25, oblique_directions=2, oblique_share=0.3, position_noise_m=0.05,
+        attitude_noise_deg=0.05, **settings,
+    )  # fmt: skip
 
 
 def block_of(
@@ -55,7 +66,7 @@ def block_of(
         gnss=GnssPositions(place if gnss else nowhere, positions.sigma_m, None),
         water=scene.water if water is None else water,
         refractive_index=scene.refractive_index if index is None else index,
-        control=surveyed if len(rows) else None,
+        control=surveyed,
     )
 
 
