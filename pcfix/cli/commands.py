@@ -156,8 +156,8 @@ def photos(images: Path, out_dir: Path, /, *, options: PhotosOptions, quiet: boo
 
 @command(
     "pcfix calm frames calm.jpg --surface --depth 2.5 --gsd 0.01 --interval 0.2",
-    frames="Folder of photographs.",
-    out="Image to write, in the format of the frames.",
+    frames="Folder of photographs, or a video.",
+    out="Image to write, in the format of the frames; PNG for a video.",
 )
 def calm(frames: Path, out: Path, /, *, options: CalmOptions, quiet: bool) -> None:
     """Combine a burst of frames into one image as seen through calm water."""

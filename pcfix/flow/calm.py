@@ -46,10 +46,10 @@ def calm_frames(
     Parameters
     ----------
     frames : path
-        Folder of photographs of one size, in the order of their names.
+        Folder of photographs of one size, in the order of their names, or a video.
     out : path
-        Image in the format of the frames, with the metadata of the first. The spread is written
-        next to it, and with `surface` a folder of rasters of the water.
+        Image in the format of the frames, with the metadata of the first; PNG for a video. The
+        spread is written next to it, and with `surface` a folder of rasters of the water.
     options, progress
         See `pcfix.correct_file`; progress is in frames, each of which is read twice, with `surface`
         three times.
@@ -58,7 +58,7 @@ def calm_frames(
     check_summary(given)
     started = time.perf_counter()
     found = read_frames(frames, given.every)
-    interval = given.interval * given.every if given.interval else None
+    interval = given.interval * given.every if given.interval else found.interval_s
     if given.surface and interval is None:
         sentence = "--surface needs the time between the frames. Give --interval."
         raise SettingError("option.missing", sentence, option="interval")
@@ -100,8 +100,8 @@ def calm_frames(
                     " glints, a wrong interval or depth). Do not rely on the surfaces."
                 )
                 notes.append(PcfixWarning("waves.explained", words, explained=water.explained))
-    # with the metadata of the first
-    write_photograph(found.photographs[0], target, median, np.ones(median.shape[:2], bool))
+    source = found.photographs[0] if found.photographs else found.path  # of the metadata
+    write_photograph(source, target, median, np.ones(median.shape[:2], bool))
     write_spread(spread_path, spread)
     middle = np.array([0.5 * found.columns, 0.5 * found.rows, 1.0])
     moved = homographies @ middle

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ Pixels = npt.NDArray[Any]
 def photographs_in(folder: Path) -> list[Path]:
     """Return the photographs directly in a folder, in the order of their names."""
     if not folder.is_dir():
-        sentence = "is not a folder of photographs. Extract those of a video with ffmpeg."
+        sentence = "is not a folder of photographs."
         raise bad_file(folder, "photos.no_folder", sentence)
     found = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file())
     if not found:
@@ -85,9 +86,10 @@ def read_colours(path: Path) -> Pixels:
 def write_photograph(source: Path, target: Path, pixels: Pixels, touched: BoolArray) -> None:
     """Write a photograph whose pixels differ from the source where `touched`.
 
-    Both files have the same suffix; the shapes are (rows, columns, bands) and (rows, columns).
+    Both files have the same suffix, except for PNG files of a video; the shapes are (rows, columns,
+    bands) and (rows, columns).
     """
-    suffix = source.suffix.lower()
+    suffix = target.suffix.lower()
     with temporary_output(target) as path:
         if not touched.any():
             shutil.copyfile(source, path)
@@ -159,44 +161,76 @@ _COPIED_TAGS = {270, 271, 272, 274, 282, 283, 296, 305, 306, 315, 700, 33432, 33
 
 @dataclass(frozen=True)
 class Burst:
-    """A burst: the photographs of a sequence in a folder, all of one size."""
+    """A burst: the photographs of a sequence in a folder, all of one size, or frames of a video."""
 
     path: Path
-    photographs: tuple[Path, ...]
+    photographs: tuple[Path, ...]  # none of a video
+    names: tuple[str, ...]  # of the frames, without a suffix
     columns: int
     rows: int
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the frames without a suffix."""
-        return tuple(one.stem for one in self.photographs)
+    every: int = 1  # frames of the video for one of the burst
+    interval_s: float | None = None  # between frames of the burst, if a video states it
 
     def __iter__(self) -> Iterator[Pixels]:
         """Yield the pixels of each frame, shape (rows, columns, bands), as they are stored."""
-        return map(read_photograph, self.photographs)
+        if self.photographs:
+            return map(read_photograph, self.photographs)
+        return islice(_video_frames(self.path), 0, None, self.every)
 
 
 def read_frames(path: File, every: int = 1) -> Burst:
-    """Return the frames of a folder, one in `every`; none is decoded yet."""
+    """Return the frames of a folder or of a video, one in `every`."""
     place = Path(path)
-    paths = tuple(photographs_in(place)[::every])
+    found = _frames_of_video(place, every) if place.is_file() else _frames_of_folder(place, every)
+    if len(found.names) < LEAST_FRAMES:
+        sentence = f"gives {len(found.names)} frames, of {LEAST_FRAMES} at least. Give more, or"
+        raise bad_file(
+            place, "frames.too_few", f"{sentence} lower --every.", frames=len(found.names)
+        )
+    return found
+
+
+def _frames_of_folder(folder: Path, every: int) -> Burst:
+    paths = tuple(photographs_in(folder)[::every])
     sizes = [size_of(one) for one in paths]
     for one, size in zip(paths, sizes, strict=True):
         if size != sizes[0]:
             sentence = f"has {size} pixels, {paths[0].name} {sizes[0]}. Give one size."
             raise bad_file(one, "photos.size", sentence, size=size)
-    if len(paths) < LEAST_FRAMES:
-        sentence = f"gives {len(paths)} frames, of {LEAST_FRAMES} at least. Give more, or lower"
-        raise bad_file(place, "frames.too_few", f"{sentence} --every.", frames=len(paths))
-    return Burst(place, paths, *sizes[0])
+    return Burst(folder, paths, tuple(one.stem for one in paths), *sizes[0])
+
+
+def _frames_of_video(path: Path, every: int) -> Burst:
+    # headers of videos may state a wrong number of frames, so they are counted
+    shapes = [frame.shape for frame in _video_frames(path)][::every]
+    if not shapes:
+        sentence = "has no frames that OpenCV can read. Convert it to MP4, or give a folder."
+        raise bad_file(path, "video.unreadable", sentence)
+    cv2 = photo_library("cv2")
+    rate = float(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FPS))
+    names = tuple(f"{path.stem}_{every * number:05d}" for number in range(len(shapes)))
+    interval_s = every / rate if 0.1 <= rate <= 10_000.0 else None
+    return Burst(path, (), names, shapes[0][1], shapes[0][0], every, interval_s)
+
+
+def _video_frames(path: Path) -> Iterator[Pixels]:
+    """Yield the frames of a video, red first."""
+    cv2 = photo_library("cv2")
+    film = cv2.VideoCapture(str(path))
+    film.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as stored, like photographs
+    found, pixels = film.read()
+    while found:
+        yield pixels[..., ::-1]
+        found, pixels = film.read()
+    film.release()
 
 
 def check_calm(path: File, frames: Burst, *, overwrite: bool) -> tuple[Path, Path]:
     """Return the paths of the median and of its spread; refuse names that cannot be used."""
-    first = frames.photographs[0]
-    how: dict[str, Any] = {"overwrite": overwrite, "inputs": frames.photographs}
-    target = check_output(path, suffixes=(first.suffix.lower(),), **how)
-    if target.parent.resolve() == first.parent.resolve():
+    suffixes = (frames.photographs[0].suffix.lower(),) if frames.photographs else PNG
+    how: dict[str, Any] = {"overwrite": overwrite, "inputs": frames.photographs or (frames.path,)}
+    target = check_output(path, suffixes=suffixes, **how)
+    if frames.photographs and target.parent.resolve() == frames.path.resolve():
         sentence = f"{target}: is in the folder of the frames. Give a file in another folder."
         raise SettingError("output.is_input", sentence, path=target)
     return target, check_output(target.with_name(f"{target.stem}_spread.tif"), **how)

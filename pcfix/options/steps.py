@@ -336,7 +336,7 @@ class CalmOptions(JobOptions, SummaryOption, CameraFileOptions, IndexOptions, pa
     gsd: float | None = option(None, basic=True, above=0, needs="surface")
     """With --surface, instead of --cameras, for a nadir view: pixel size at the bed. [m]"""
     interval: float | None = option(None, above=0, needs="surface")
-    """With --surface: time between frames, before --every. [s]"""
+    """With --surface: time between frames, before --every. [s] [default: that of a video]"""
     resolution: float | None = option(None, basic=True, above=0)
     """Cell size of the rasters of the water. [m] [default: so that there are 2,000 cells]"""
     every: int = option(1, least=1, most=100_000, panel=Panel.METHOD)

@@ -9,6 +9,7 @@ import cv2
 
 import pcfix
 from pcfix.flow.photos import map_photos
+from pcfix.io.photographs import read_frames
 from pcfix.io.water import read_water_raster
 from pcfix.model import Lens
 from pcfix.photos.calm import corners_in, register, warped
@@ -112,6 +113,28 @@ def test_calm(tmp_path, folder, calm):
     assert (tmp_path / "calm_spread.tif").exists()
 
 
+def test_video(tmp_path, folder):
+    """A lossless video gives the same image as its frames in a folder."""
+    frames = [cv2.imread(str(path)) for path in sorted(folder.iterdir())]
+    film = tmp_path / "film.avi"
+    size = frames[0].shape[1::-1]
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter_fourcc(*"FFV1"), 10.0, size)
+    for one in frames:
+        one[..., 0] //= 2  # colours in another order would show
+        writer.write(one)
+    writer.release()
+    colours = tmp_path / "frames"
+    colours.mkdir()
+    for number, one in enumerate(frames[::2]):
+        cv2.imwrite(str(colours / f"{number}.png"), one)
+    found = pcfix.calm_frames(film, tmp_path / "film.png", every=2)
+    pcfix.calm_frames(colours, tmp_path / "calm.png")
+    assert found.frames == 6
+    median = cv2.imread(str(tmp_path / "film.png"))
+    assert (median == cv2.imread(str(tmp_path / "calm.png"))).all()
+    assert read_frames(film, 2).interval_s == pytest.approx(0.2)
+
+
 def test_water(tmp_path, folder, calm):
     """Heights and slopes against those of the sea that the frames were made with."""
     found = pcfix.calm_frames(
@@ -172,7 +195,7 @@ def test_bad_frames(tmp_path, folder, calm):
     with refused("frames.no_overlap", frames=["2"]):
         pcfix.calm_frames(mixed, tmp_path / "calm.png")
     (tmp_path / "film.mp4").write_bytes(b"no film")
-    with refused("photos.no_folder"):
+    with refused("video.unreadable"):
         pcfix.calm_frames(tmp_path / "film.mp4", tmp_path / "calm.png")
     with refused("output.suffix"):
         pcfix.calm_frames(folder, tmp_path / "calm.jpg")
