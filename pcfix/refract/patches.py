@@ -25,7 +25,10 @@ from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Batch, stacked
 from pcfix.running import current
 
-PATCHES, FEWEST_POINTS = 750, 400
+PATCHES, TEST_PATCHES = 750, 375
+"""To detect the type, and to test one that the user set: the standard error of the evidence is
+mostly that of the models, which more patches do not lower."""
+FEWEST_POINTS = 400
 PATCH_POINTS = (32, 16)
 """Of a patch, or of sparse clouds."""
 FEWEST_WITHOUT_LIST = 2000
@@ -58,7 +61,7 @@ Patches: TypeAlias = tuple[IntArray, IntArray]
 shape (p, 32) or (p, 16), patch by patch."""
 
 
-def patches_of(batch: Batch, *, at_borders: bool) -> Patches | None:
+def patches_of(batch: Batch, *, at_borders: bool, most: int = PATCHES) -> Patches | None:
     """Return patches of neighbours; None where there are too few points, or too sparse ones.
 
     With `at_borders` those of dense clouds lie where the nearest image changes.
@@ -86,8 +89,8 @@ def patches_of(batch: Batch, *, at_borders: bool) -> Patches | None:
         close = np.arange(len(xy))
         if at_borders and points == PATCH_POINTS[0]:
             border_m = _border_distance_m(xy, batch.survey.cameras.centres[:, :2])
-            close = np.sort(np.argsort(border_m)[: max(PATCHES, int(BORDER_SHARE * len(xy)))])
-        seeds = np.unique(close[np.linspace(0, len(close) - 1, PATCHES).astype(int)])
+            close = np.sort(np.argsort(border_m)[: max(most, int(BORDER_SHARE * len(xy)))])
+        seeds = np.unique(close[np.linspace(0, len(close) - 1, most).astype(int)])
         tree = cKDTree(xy, balanced_tree=False, compact_nodes=False)
         patch = some[tree.query(xy[seeds], k=points)[1]]
         across = np.ptp(batch.xyz[patch, :2], axis=1).prod(axis=1)

@@ -273,7 +273,8 @@ def weigh(
         types = *types, given
     # else they differ in what a view list means, or in the largest angle
     by_images = batch.views is None and LIMITS[0] not in types
-    sample = patches.patches_of(batch, at_borders=by_images) if len(types) > 1 else None
+    most = patches.PATCHES if given is None else patches.TEST_PATCHES
+    sample = patches.patches_of(batch, at_borders=by_images, most=most) if types[1:] else None
     if sample is None:
         return None
     rows, place = sample
