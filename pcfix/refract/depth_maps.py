@@ -227,9 +227,12 @@ def _invert_tiles(
 ) -> None:
     """Invert the fusion of the points of some tiles or, where `likely` has rows, fill these in."""
     (k, partners), maps = given.matcher.matched.shape, room_for_maps(given.matcher, given.listed)
-    row = np.empty(k, np.int64)
+    row, points, room = np.empty(k, np.int64), np.empty(_POINT * TILE), np.empty(_ROOM * TILE)
+    compared = np.empty((partners, _PARTNER * TILE))
+    pairs = np.empty((partners * (partners - 1) // 2, _PAIR * TILE))
+    shown = np.empty((k, _SHOWN * TILE))  # of all images; the system provides what is used
     for t in range(*span):
-        rows, points = order[t * TILE : (t + 1) * TILE], np.empty(_POINT * TILE)
+        rows = order[t * TILE : (t + 1) * TILE]
         tiling.gather(points, rows, given.points)
         tiling.gather_three(points[_ORIGINAL * TILE :], rows, given.points.original_xyz)
         start, camera = _maps_of(rows, maps.place, points, given)
@@ -238,10 +241,7 @@ def _invert_tiles(
             row[near[q]] = q
         tile = MapTile(
             rows, start, camera, near, row, marks, np.zeros(marks.shape), np.empty(rows.size),
-            np.ones(rows.size, np.bool_), points, np.empty(_ROOM * TILE),
-            np.empty((partners, _PARTNER * TILE)),
-            np.empty((partners * (partners - 1) // 2, _PAIR * TILE)),
-            np.empty((near.size, _SHOWN * TILE)),
+            np.ones(rows.size, np.bool_), points, room, compared, pairs, shown,
         )  # fmt: skip
         for j in range(rows.size):
             tile.room[_BED * TILE + j] = given.first[rows[j]]
@@ -294,6 +294,9 @@ def _maps_of(
 
 
 # 1. The depth of a bed in one depth map
+#
+# Functions that are called for each map are inlined: a call would put their forty arrays on the
+# stack, which took a sixth of the time.
 
 
 @device
@@ -341,7 +344,7 @@ def _look(tile: MapTile, weights: FloatArray, given: MapInputs) -> None:
             shown[_BY_HEIGHT * TILE + j] = -change * per_length if found else np.nan
 
 
-@device
+@device(forceinline=True)
 def _trace_to_bed(shown: FloatArray, c: int, count: int, tile: MapTile, given: MapInputs) -> None:
     """Trace the ray on which image c shows each point through the water to Q on the bed."""
     points, images, room = given.points, given.images, tile.room
@@ -373,7 +376,7 @@ def _trace_to_bed(shown: FloatArray, c: int, count: int, tile: MapTile, given: M
         room[_SLANT * TILE + j] = away * per_across
 
 
-@device
+@device(forceinline=True)
 def _see_from(
     partner: FloatArray, shown: FloatArray, c: int, count: int, tile: MapTile, given: MapInputs
 ) -> None:
@@ -486,7 +489,7 @@ def _choose_maps(
             tile.weights[tile.row[images[q]], j] = maps.weight[q]
 
 
-@device
+@device(forceinline=True)
 def _gather_maps(
     maps: PointMaps, images: IntArray, j: int, tile: MapTile, given: MapInputs
 ) -> None:

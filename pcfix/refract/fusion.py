@@ -126,7 +126,7 @@ def _set_members(members: IntArray, q: int, others: IntArray, place: IntArray) -
     members[count:] = ABSENT
 
 
-@device
+@device(forceinline=True)
 def find_rises(maps: PointMaps, k: int, listed: bool) -> None:
     """Find the bed and the size of the group of each seed, of k maps.
 
@@ -159,7 +159,7 @@ def _set_bed(maps: PointMaps, k: int, rise: float) -> float:
     return high - low
 
 
-@device
+@device(forceinline=True)
 def _average_group(maps: PointMaps, seed: int) -> None:
     """Average the depths that may be fused with that of a seed."""
     for q in maps.fused[seed]:
@@ -185,27 +185,30 @@ def _average(maps: PointMaps, q: int) -> None:
 
 
 @device(forceinline=True)
-def _agrees(maps: PointMaps, q: int, seed: int, listed: bool) -> bool:
-    """Whether a depth is fused with that of a seed; every known depth of a list is."""
-    mean = maps.mean[q]
-    return abs(mean - maps.mean[seed]) < AGREE or (listed and abs(mean) < np.inf)
+def _range_of(maps: PointMaps, seed: int, listed: bool) -> tuple[float, float]:
+    """Return the middle of the depths that are fused with a seed, and how far they may be from it.
+
+    All depths of a list are fused, but none that is NaN.
+    """
+    return (0.0, np.inf) if listed else (maps.mean[seed], AGREE)
 
 
 @device(forceinline=True)
 def _fuse(maps: PointMaps, seed: int, listed: bool) -> tuple[float, float]:
     """Return by how much the bed of the group of a seed is higher, and the size of the group."""
     total, change, members = 0.0, 0.0, 0.0
+    middle, within = _range_of(maps, seed, listed)
     for q in maps.fused[seed]:
         if q < 0:
             break
-        agrees = _agrees(maps, q, seed, listed)
+        agrees = abs(maps.mean[q] - middle) < within
         total += maps.share[q] * maps.mean[q] if agrees else 0.0
         change += maps.share[q] * maps.mean_slope[q] if agrees else 0.0
         members += 1.0 if agrees else 0.0
     return -total / change, members
 
 
-@device
+@device(forceinline=True)
 def set_weights(maps: PointMaps, seed: int, k: int, listed: bool) -> None:
     """Set the weights of k maps if the group of a seed made the point; all zero without a seed.
 
@@ -216,15 +219,16 @@ def set_weights(maps: PointMaps, seed: int, k: int, listed: bool) -> None:
         return
     _set_bed(maps, k, maps.rise[seed])
     _average_group(maps, seed)
+    middle, within = _range_of(maps, seed, listed)
     for q in maps.fused[seed]:
-        if q < 0 or not _agrees(maps, q, seed, listed):
+        if q < 0 or not abs(maps.mean[q] - middle) < within:
             continue
         for a in maps.averaged[q]:
             if a >= 0 and abs(maps.own[a] - maps.own[q]) < AVERAGED_WITHIN:
                 maps.weight[a] += maps.share[q] / maps.number[q]
 
 
-@device
+@device(forceinline=True)
 def likely_seed(maps: PointMaps, k: int, wanted: float, width_m: float) -> tuple[int, float]:
     """Return the seed of the group that made the point, -1 if no map has a depth; the ambiguity.
 

@@ -115,7 +115,7 @@ def _step(room: FloatArray, count: int) -> bool:
     return searched
 
 
-@device
+@device(forceinline=True)
 def _set_rays(
     ray: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, optics: Optics,
     plain: Plain | None,
@@ -154,7 +154,7 @@ def _settle(
             ray[(_PLANE + i) * TILE + j] = plane[i]
 
 
-@device
+@device(forceinline=True)
 def _find_light(
     room: FloatArray, ray: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int,
     n: float,
@@ -173,7 +173,7 @@ def _find_light(
         put(room, (_LIGHT + 3) * TILE + j, s)
 
 
-@device
+@device(forceinline=True)
 def _add(
     room: FloatArray, ray: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int,
     optics: Optics, plain: Plain | None, n: float,
