@@ -432,8 +432,6 @@ def sample_cloud(xyz: FloatArray, rgb: npt.NDArray[Any] | None) -> Samples:
 
     Colours, shape (n, 3), are in any unit from zero up; equal ones count as none.
     """
-    from scipy import ndimage  # slow to import
-
     origin = xyz.min(axis=0)
     local = xyz - origin
     # cells of about `POINTS_PER_CELL`, at most `MOST_CELLS`; clouds seldom fill their bounding box
@@ -444,7 +442,10 @@ def sample_cloud(xyz: FloatArray, rgb: npt.NDArray[Any] | None) -> Samples:
     tiles = square_tiles(local, cell_m)
     _, of_point, count = np.unique(tiles, return_inverse=True, return_counts=True)
     x, y = (np.bincount(of_point, local[:, i]) / count for i in (0, 1))
-    ground = np.column_stack([x, y, ndimage.median(local[:, 2], of_point, np.arange(len(count)))])
+    # the median of each cell; scipy.ndimage would take longer to import than this takes
+    z, first = local[np.lexsort((local[:, 2], of_point)), 2], np.cumsum(count) - count
+    median = 0.5 * (z[first + (count - 1) // 2] + z[first + count // 2])
+    ground = np.column_stack([x, y, median])
     redness = np.zeros(0)
     if rgb is not None and (rgb != rgb[:1]).any():
         light = rgb.astype(np.float64)
@@ -469,5 +470,7 @@ def _smoothed(ground: FloatArray) -> FloatArray:
     _, near = cKDTree(ground[:, :2]).query(ground[:, :2], k=k + 1)
     around = ground[np.asarray(near)[:, 1:]] - ground[:, None]
     design = np.concatenate([np.ones((*around.shape[:2], 1)), around[..., :2]], axis=2)
-    plane = np.linalg.pinv(design) @ around[..., 2:]
+    # by the normal equations: three unknowns, and half the time
+    normal, right = (np.swapaxes(design, 1, 2) @ one for one in (design, around[..., 2:]))
+    plane = np.linalg.pinv(normal, hermitian=True) @ right
     return np.asarray(ground[:, 2] + plane[:, 0, 0])
