@@ -99,7 +99,8 @@ def _keyword(one: Option, is_shown: bool) -> inspect.Parameter:
     elif one.is_path:
         kind = Path | None
     elif one.parse is not None or one.type is Any:
-        kind = str | None
+        # cyclopts may check the default, too
+        kind = str | one.type if isinstance(one.default, tuple) else str | None
     default = "" if one.needed else one.default_text
     has_opposite = one.off or (one.type is bool and one.default)
     parameter = Parameter(

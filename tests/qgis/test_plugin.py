@@ -129,7 +129,9 @@ def qgis(packed, tmp_path_factory):
             f"[Processing]\nConfiguration\\PCFIX_PROGRAM={setting}\n"
         )
         words = [f"{key}={value}" for key, value in values.items()]
+        # QGIS needs the Python that it was built with, not that of a virtual environment
         settings = {"QGIS_CUSTOM_CONFIG_PATH": str(root), "QT_QPA_PLATFORM": "offscreen"}
+        settings["PATH"] = os.defpath
         return subprocess.run(
             [QGIS, "run", f"pcfix:{name}", "--", *words], capture_output=True, text=True,
             env=os.environ | settings, check=False,
