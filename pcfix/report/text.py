@@ -144,6 +144,11 @@ class Summary(Figures):
     """The results of a correction by name; `as_dict` is what ``--summary`` writes."""
 
     @property
+    def absorbed(self) -> bool | None:
+        """Whether the poses have absorbed the refraction; None if that is unknown."""
+        return None if self.poses is None else self.poses["absorbed"]
+
+    @property
     def why_no_order(self) -> str:
         """Why no order of S-44 is claimed, as the whole bed may be off; empty if one is."""
         found = self.reconstruction or {}
@@ -156,7 +161,7 @@ class Summary(Figures):
             True: "the poses have absorbed the refraction",
             None: "the poses were not checked for absorbed refraction",
             False: "",
-        }[(self.poses or {"absorbed": None})["absorbed"]]
+        }[self.absorbed]
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON; optional parts only if there are any."""

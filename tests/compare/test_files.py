@@ -242,7 +242,7 @@ def test_refused(tmp_path, monkeypatch):
             compare_clouds(cloud, reference, **options)
     noise = write_las(tmp_path / "noise.las", plane(10, 22), 7)
     for name, content in [
-        ("broken.tif", b"II*\0 no grid at all"), ("note.pdf", b"x"), ("t.csv", b"x,y,h\n1,2,3\n")
+        ("broken.tif", b"II*\0 no grid at all"), ("note.pdf", b"x"), ("t.csv", b"x,y,q\n1,2,3\n")
     ]:  # fmt: skip
         (tmp_path / name).write_bytes(content)
     for files, options in [

@@ -52,13 +52,13 @@ def write_vis(path, lists):
     return path
 
 
-def write_ply(path, xyz, lists=None, weights=None, order="<", count="uint8"):
+def write_ply(path, xyz, lists=None, weights=None, order="<", count="uint8", position="float"):
     """Write a PLY file point by point, with a second element before the vertices."""
     names = {"<": "binary_little_endian", ">": "binary_big_endian"}
     head = [
         *("ply", f"format {names[order]} 1.0", "comment by a test", "element camera 2"),
         *("property double focal", f"element vertex {len(xyz)}"),
-        *(f"property float {axis}" for axis in "xyz"),
+        *(f"property {position} {axis}" for axis in "xyz"),
         "property uchar red",
     ]
     head += [] if lists is None else [f"property list {count} uint32 view_indices"]
@@ -73,7 +73,7 @@ def write_ply(path, xyz, lists=None, weights=None, order="<", count="uint8"):
 
     put("d", 1.0, 2.0)
     for i, point in enumerate(xyz.tolist()):
-        put("f", *point)
+        put(position[0], *point)
         put("B", 7)
         if lists is not None:
             put(letter[count], len(lists[i]))
