@@ -25,7 +25,7 @@ from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Batch, stacked
 from pcfix.running import current
 
-PATCHES, TEST_PATCHES = 750, 375
+PATCHES, TEST_PATCHES = 750, 500
 """To detect the type, and to test one that the user set: the standard error of the evidence is
 mostly that of the models, which more patches do not lower."""
 FEWEST_POINTS = 400
