@@ -34,8 +34,8 @@ EXACT = 1e-10
 
 ROUNDING = 1e-9
 """Share of the cost by which it may rise at the minimum. In large blocks some points near the water
-surface change sides at each step, so that the cost does not fall further; shorter steps do not help
-either, and would double the time. Of a million observations it is 0.03 standard errors at most."""
+surface change sides at each step, so that the cost does not fall further. Shorter steps do not help
+and would double the time. With a million observations this is 0.04 standard errors at most."""
 
 
 # Steps

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -19,12 +21,20 @@ MAX_CORE_POINTS = 100_000
 
 
 def load_py4dgeo() -> Any:
-    """Import py4dgeo; InputError ``library.missing`` if it is not installed.
+    """Import py4dgeo; InputError ``library.missing`` if it is not installed."""
+    with _silence():
+        return optional_library("py4dgeo", "m3c2", "M3C2")
 
-    It no longer writes its progress to stdout and to a log file in the working folder.
-    """
-    logging.getLogger("py4dgeo").disabled = True
-    return optional_library("py4dgeo", "m3c2", "M3C2")
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Keep py4dgeo's progress from stdout and from a log file in the working folder."""
+    logger = logging.getLogger("py4dgeo")
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = before
 
 
 def sample_rows(count: int, most: int) -> IntArray:
@@ -54,20 +64,25 @@ def m3c2_distances(xyz: FloatArray, reference: FloatArray, max_distance_m: float
     max_distance_m = (max(pieces, 1) - 1e-6) * cylinder
     core = xyz[sample_rows(len(xyz), MAX_CORE_POINTS)]
     origin = np.floor(reference.min(axis=0))
-    cloud = py4dgeo.Epoch(xyz - origin)
-    distance, uncertainty = py4dgeo.M3C2(
-        epochs=(py4dgeo.Epoch(reference - origin), cloud),
-        corepoints=core - origin,
-        normal_radii=[normal],
-        cyl_radius=cylinder,
-        max_distance=max_distance_m,
-        cloud_for_normals=cloud,
-    ).run()
+    with _silence():
+        cloud = py4dgeo.Epoch(xyz - origin)
+        distance, uncertainty = py4dgeo.M3C2(
+            epochs=(py4dgeo.Epoch(reference - origin), cloud),
+            corepoints=core - origin,
+            normal_radii=[normal],
+            cyl_radius=cylinder,
+            max_distance=max_distance_m,
+            cloud_for_normals=cloud,
+        ).run()
     detection = uncertainty["lodetection"]
     known = np.isfinite(distance)
     if not known.any():
-        sentence = f"M3C2: no points within {max_distance_m:.3g} m. Check that the clouds overlap."
-        raise GeometryError("reference.no_overlap", sentence, max_distance_m=max_distance_m)
+        sentence = (
+            f"M3C2: no cylinder of {cylinder:.3g} m radius holds points of both clouds within"
+            f" {max_distance_m:.3g} m. Check that they overlap."
+        )
+        values = {"radius_m": cylinder, "max_distance_m": max_distance_m}
+        raise GeometryError("reference.no_overlap", sentence, **values)
     distance, detection = distance[known], detection[known]
     certain = np.isfinite(detection)
     beyond = np.abs(distance[certain]) > detection[certain]

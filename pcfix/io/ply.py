@@ -126,7 +126,7 @@ def read_columns(path: Path, element: Element, *names: str) -> dict[str, Column]
             # a view whose item i is the number of this type that begins at byte i
             items = np.ndarray(max(len(data) - number.itemsize + 1, 0), number, data, strides=(1,))
             many, step = count[rows, field].copy(), sizes[field, 0]
-            # item k of all lists is at the start of its own, plus the steps since that one's first
+            # items are numbered through all lists; each is at the start of its list plus its steps
             first_of_all = begin[rows, field] + offset - step * (np.cumsum(many) - many)
             parts.append(items[np.repeat(first_of_all, many) + step * np.arange(many.sum())])
             counts.append(many)

@@ -298,7 +298,7 @@ class RasterSource(LasSource):
         with raster_errors(self.path):
             stored = read_masked(self.raster, self.band, window=slices(window))
             for number, kind in enumerate(self.raster.colorinterp, start=1):
-                if kind.name == "alpha":  # which GDAL ignores beside a band of floating point
+                if kind.name == "alpha":  # GDAL ignores it next to a band of floating point
                     stored[self.raster.read(number, window=slices(window)) == 0] = np.nan
         height = stored * self.scale + self.offset
         height[~(np.abs(height) <= IMPOSSIBLE_M)] = np.nan

@@ -62,7 +62,7 @@ def coefficients(lens: Lens) -> FloatArray:
     more = (*lens.radial[4:], *lens.denominator, *lens.tangential[2:], *lens.thin_prism)
     is_plain = not (lens.inverse or lens.in_turn or any(more))
     c[PLAIN] = is_plain and lens.projection == "perspective"
-    # what has no fixed length stands at the end
+    # parts of variable length come last
     radial = (*lens.radial, *(0.0,) * (LEAST_RADIALS - len(lens.radial)))
     shape = (*lens.shape, *(0.0,) * (LEAST_SHAPES - len(lens.shape)))
     counts = len(radial), len(lens.denominator), len(shape)

@@ -41,7 +41,7 @@ def window_of(port: Port | None) -> Window:
             kind = DOME
         case _:
             kind, size, thickness, glass, where = NO_PORT, 0.0, 0.0, 1.0, (0.0, 0.0, 0.0)
-    x, y, z = map(float, where)  # numba compiles whole numbers anew
+    x, y, z = map(float, where)  # numba would compile another version for integers
     return Window(kind, (x, y, z), float(size), float(thickness), float(glass))
 
 

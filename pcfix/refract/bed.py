@@ -31,7 +31,8 @@ OUTLIER = 0.01
 BINS, DEVIATIONS = 2.0, 3
 """Bins for a standard deviation of the likely beds, and how many deviations count to both sides."""
 FAR_OFF_M, REACH = 0.4, 2
-"""A cell farther from the median of so many cells to each side gets that median."""
+"""A cell that is farther than this from the median of its neighbours, up to `REACH` cells to each
+side, gets that median."""
 
 
 def bed_around(batch: Batch) -> Bed | None:
