@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -79,8 +81,11 @@ def nearest_distance(places: FloatArray, points: FloatArray) -> FloatArray:
     Places and points, (n, 3), are metres in one frame. Where the two clouds sample a surface at
     different places it is at least about half the spacing of the points.
     """
-    near = Neighbours(make_tiles(points), 3)
-    asked, distance = make_tiles(places), empty((len(places),))
+    tiles, distance = make_tiles(points), empty((len(places),))
+    with ThreadPoolExecutor(1) as pool:  # scipy builds a tree on one core
+        search = pool.submit(copy_context().run, Neighbours, tiles, 3)
+        asked = make_tiles(places)
+    near = search.result()
     for piece in asked.pieces(POINTS_PER_TILE):
         distance[asked.row[piece]] = near.nearest(asked.xyz[piece], 1)[0][:, 0]
     return distance
