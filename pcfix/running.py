@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -64,6 +65,13 @@ def running(**changes: Any) -> Iterator[None]:
         yield
     finally:
         _RUN.reset(token)
+
+
+@contextmanager
+def meanwhile(function: Callable[..., Any], *given: Any) -> Iterator[Future[Any]]:
+    """Call a function in another thread, with the settings of this one, while the block runs."""
+    with ThreadPoolExecutor(1) as pool:
+        yield pool.submit(copy_context().run, function, *given)
 
 
 def threads(jobs: int | None) -> AbstractContextManager[None]:
@@ -158,11 +166,13 @@ def grouped(number: Array, groups: int, *columns: Array) -> tuple[Array, list[Ar
     for rows in blocks(count):
         order = np.argsort(number[rows], kind="stable")
         some = np.bincount(number[rows], minlength=groups)
-        # from the place in the sorted block to that in the result
-        further = place - (np.cumsum(some) - some)
-        to = np.repeat(further, some) + np.arange(len(order))
+        ends = np.cumsum(some)
         for one, into in zip(columns, result, strict=True):
-            into[to] = one[rows][order]
+            # `take` gathers rows three times as fast as an index
+            part = one[rows].take(order, axis=0)
+            for group in np.flatnonzero(some):
+                first, end = ends[group] - some[group], ends[group]
+                into[place[group] : place[group] + some[group]] = part[first:end]
         place += some
     return start, result
 

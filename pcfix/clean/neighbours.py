@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextvars import copy_context
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -27,6 +25,7 @@ from pcfix.running import (
     empty,
     grouped,
     mapped,
+    meanwhile,
     release,
     row_numbers,
 )
@@ -72,7 +71,7 @@ def nearest_of(
     near, asked = Neighbours(make_tiles(points), 2), make_tiles(places)
     for piece in asked.pieces(PIECE_ROWS):
         xyz = asked.xyz[piece]
-        yield asked.row[piece], xyz, near.tiles.xyz[near.nearest(xyz, k)[1]]
+        yield asked.row[piece], xyz, near.tiles.xyz.take(near.nearest(xyz, k)[1], axis=0)
 
 
 def nearest_distance(places: FloatArray, points: FloatArray) -> FloatArray:
@@ -82,8 +81,7 @@ def nearest_distance(places: FloatArray, points: FloatArray) -> FloatArray:
     different places it is at least about half the spacing of the points.
     """
     tiles, distance = make_tiles(points), empty((len(places),))
-    with ThreadPoolExecutor(1) as pool:  # scipy builds a tree on one core
-        search = pool.submit(copy_context().run, Neighbours, tiles, 3)
+    with meanwhile(Neighbours, tiles, 3) as search:  # scipy builds a tree on one core
         asked = make_tiles(places)
     near = search.result()
     for piece in asked.pieces(POINTS_PER_TILE):
@@ -93,7 +91,7 @@ def nearest_distance(places: FloatArray, points: FloatArray) -> FloatArray:
 
 POINTS_PER_TILE = 250_000
 MOST_SQUARES = 5_000_000
-"""Squares of blocks of points that wait to be merged."""
+"""Squares over which the spacing of points is computed."""
 _MOST_TILES_A_SIDE = 200
 _SAMPLE = 10_000
 _CELLS_ACROSS = 256
@@ -158,7 +156,7 @@ def make_tiles(xyz: FloatArray, points: int | None = None) -> Tiles:
         x, y = (np.floor(places[a:b, axis] * (_CELLS_ACROSS / side)) for axis in (0, 1))
         x, y = (one.astype(np.int64) % _CELLS_ACROSS for one in (x, y))
         order = np.argsort((x + _CELLS_ACROSS * y).astype(np.uint16), kind="stable")
-        places[a:b], row[a:b] = places[a:b][order], row[a:b][order]
+        places[a:b], row[a:b] = places[a:b].take(order, axis=0), row[a:b][order]
         boxes.append(bounds(places[a:b]))
         release()
     low, high = np.swapaxes(np.array(boxes), 0, 1)
@@ -167,15 +165,20 @@ def make_tiles(xyz: FloatArray, points: int | None = None) -> Tiles:
 
 def spacing_m(xyz: FloatArray, side_m: float) -> float:
     """Return the spacing of points (n, 3) in plan, over squares with points; 0 on a line."""
-    squares, more = np.empty(0, np.int64), list[IntArray]()
-    for rows in blocks(len(xyz)):
-        column, row = (np.floor(xyz[rows, axis] / side_m).astype(np.int64) for axis in (0, 1))
-        more.append(distinct((row << 32) + column))
-        if sum(map(len, more)) > MOST_SQUARES:  # seldom: each time all squares are sorted
-            squares, more = distinct(np.concatenate([squares, *more])), []
-    squares = distinct(np.concatenate([squares, *more]))
     low, high = bounds(xyz[:, :2])
-    row = squares >> 32
-    corner = np.column_stack([squares - (row << 32), row]) * side_m
-    sides = np.minimum(corner + side_m, high) - np.maximum(corner, low)
-    return float(np.sqrt(np.maximum(sides, 0.0).prod(axis=1).sum() / len(xyz)))
+    extent = high - low
+    fewest = max(math.sqrt(extent.prod() / MOST_SQUARES), float(extent.max()) / MOST_SQUARES)
+    side_m = max(side_m, fewest)
+    first, last = np.floor(low / side_m), np.floor(high / side_m)
+    columns, rows = (last - first).astype(int) + 1
+    is_held = np.zeros(rows * columns, np.bool_)
+    for some in blocks(len(xyz)):
+        column, row = (
+            (np.floor(xyz[some, axis] / side_m) - first[axis]).astype(np.int64) for axis in (0, 1)
+        )
+        is_held[row * columns + column] = True
+    # the sides of the squares, as far as they are in the bounding box
+    edges = (np.arange(first[axis], last[axis] + 2.0) * side_m for axis in (0, 1))
+    width, height = (np.diff(np.clip(e, low[i], high[i])) for i, e in enumerate(edges))
+    area = height @ (is_held.reshape(rows, columns) @ width)
+    return math.sqrt(area / len(xyz))

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import laspy
 import numpy as np
-import shapely
 from laspy.vlrs.vlr import VLR
 
 from pcfix.errors import SettingError, bad_file, warn
@@ -211,6 +210,8 @@ def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
                 sentence = f"{first.name} has the {words} {one}, {path.name} {other}. Convert them"
                 sentence += " to the same, or correct them separately."
                 raise bad_file(name, "cloud.mixed_tiles", sentence, paths=[first, path])
+    import shapely  # slow to import
+
     # Warn of tiles that reach into each other by more than rounding, as points may be double
     margin = OVERLAP / 2.0 * (tiles.highs - tiles.lows)[:, :2]
     boxes = shapely.box(*(tiles.lows[:, :2] + margin).T, *(tiles.highs[:, :2] - margin).T)

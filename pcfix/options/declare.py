@@ -203,7 +203,7 @@ def option(default: Any, **declared: Any) -> Any:
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True)
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class OptionSet:
     """The base of all classes of options, which are frozen dataclasses.
 
@@ -216,7 +216,18 @@ class OptionSet:
     def __init_subclass__(cls, panel: str = "") -> None:
         """Make a subclass a dataclass."""
         cls.panel = panel
-        dataclass(frozen=True, kw_only=True)(cls)
+        # dataclasses would compile other methods for each class, which delays every start
+        dataclass(frozen=True, kw_only=True, eq=False, repr=False)(cls)
+
+    def __repr__(self) -> str:
+        given = ", ".join(f"{name}={value!r}" for name, value in vars(self).items())
+        return f"{type(self).__name__}({given})"
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and vars(self) == vars(other)
+
+    def __hash__(self) -> int:
+        return hash(tuple(vars(self).values()))
 
     def __post_init__(self) -> None:
         """Check every option, then the rules between options."""
