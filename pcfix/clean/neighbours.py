@@ -21,7 +21,6 @@ from pcfix.running import (
     blocks,
     bounds,
     current,
-    distinct,
     empty,
     grouped,
     mapped,

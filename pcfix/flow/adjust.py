@@ -29,8 +29,8 @@ from pcfix.adjust.methods import (
 from pcfix.adjust.parameters import Unknowns, default_lens
 from pcfix.adjust.result import Adjusted, adjustment_dict
 from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError, bad_file
-from pcfix.flow.diagnosis import flags_of, water_word
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
+from pcfix.flow.poses import flags_of, water_word
 from pcfix.flow.runner import check_folder
 from pcfix.flow.surfaces import CloudView, sample_of, view_of
 from pcfix.io.cameras.colmap import write_colmap
@@ -292,8 +292,26 @@ def _ties_of_cloud(view: CloudView | None, cameras: Cameras, name: str, measured
 
 def _write(folder: Path, found: Adjusted, model: str) -> None:
     """Write an adjusted block: model, camera files, summary, report; all or nothing."""
+    ties, cameras = None, found.cameras
+    if found.source != "cloud":  # the adjusted tie points without outliers
+        block, m = found.block, found.block.tie_points
+        o = block.start[m]
+        views = Views(block.start[: m + 1], block.camera[:o])
+        ties = TiePoints(found.xyz[:m], views, block.image_xy[:o])
+        ties = well_observed(ties, found.used[:o])
     with temporary_output(folder, is_folder=True) as draft:
-        _write_models(draft, found)
+        # the model in each format that holds its lenses exactly
+        failed = ""
+        try:
+            write_colmap(draft / MODELS[0], cameras, ties)
+        except InputError as error:
+            failed = f"{MODELS[0]} was not written: {str(error).replace(f'{draft}/', '')}"
+            found.notes.append(PcfixWarning("output.format", failed, name=MODELS[0]))
+        try:
+            write_table(draft, cameras)
+        except InputError:  # the table is for blocks with one simple lens
+            if failed:
+                raise
         if found.unknowns.surface.get("shape") and isinstance(found.water, WaterRaster):
             write_water_raster(draft / WATER_FILE, found.water, found.cameras.crs)
         if found.precision.members is not None:
@@ -302,28 +320,6 @@ def _write(folder: Path, found: Adjusted, model: str) -> None:
         text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
         write_text(draft / SUMMARY, text, overwrite=False)
         write_text(draft / "report.html", adjustment_page(summary), overwrite=False)
-
-
-def _write_models(folder: Path, found: Adjusted) -> None:
-    """Write the model in each format that holds its lenses exactly."""
-    ties, cameras = None, found.cameras
-    if found.source != "cloud":  # the adjusted tie points without outliers
-        block, m = found.block, found.block.tie_points
-        o = block.start[m]
-        views = Views(block.start[: m + 1], block.camera[:o])
-        ties = TiePoints(found.xyz[:m], views, block.image_xy[:o])
-        ties = well_observed(ties, found.used[:o])
-    failed = ""
-    try:
-        write_colmap(folder / MODELS[0], cameras, ties)
-    except InputError as error:
-        failed = f"{MODELS[0]} was not written: {str(error).replace(f'{folder}/', '')}"
-        found.notes.append(PcfixWarning("output.format", failed, name=MODELS[0]))
-    try:
-        write_table(folder, cameras)
-    except InputError:  # the table is for blocks with one simple lens
-        if failed:
-            raise
 
 
 def correct_words(found: Adjusted, model: File, out_dir: File, options: AdjustOptions) -> str:

@@ -9,9 +9,9 @@ import numpy as np
 
 from pcfix.adjust.diagnosis import EXPORT, Diagnosis
 from pcfix.errors import InputError, SettingError, plain
-from pcfix.flow.diagnosis import adjust_words, diagnose_inputs, has_datum, quick_ties
 from pcfix.flow.inputs import Inputs, paths_in
 from pcfix.flow.plausibility import likely_mistake, plausible
+from pcfix.flow.poses import adjust_words, diagnose_inputs, has_datum, quick_ties
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import CloudView, sample_of, view_of
 from pcfix.io.cameras.georeference import adjusted_minus_gnss

@@ -22,10 +22,10 @@ import numpy.typing as npt
 
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, coded
 from pcfix.flow.correction import CloudTally, Plan, correct_chunk
-from pcfix.flow.diagnosis import diagnose_in_passing, quick_ties
 from pcfix.flow.inputs import Inputs, paths_in, read_blocks
 from pcfix.flow.planning import plan_correction, plan_of, read_inputs
 from pcfix.flow.plausibility import CloudSample, Plausible, likely_mistake, plausible
+from pcfix.flow.poses import diagnose_in_passing, quick_ties
 from pcfix.flow.raster import check_heights
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
@@ -154,13 +154,25 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         *([] if absorbed is None else [absorbed]),
     ]
     figures, reconstruction = tally.figures, plan.reconstruction
+    found, survey = figures.as_dict(), plan.survey
+    if plan.inputs.port is not None:  # no depths, and no orders by depth
+        water, uncertainty = f"all around, seen through a {plan.inputs.port}", None
+        found["depth_m"] = {}
+    else:
+        water, uncertainty = str(plan.found.surface), figures.uncertainty(reconstruction)
+        if (moved := survey.level_offset_m) is not None:
+            water += f", {moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
+        if uncertainty is not None and survey.learned.poses is not None:
+            uncertainty["poses_m"] = round(survey.learned.poses.middle_m, 4)
     because = "" if reconstruction is None else reconstruction["because"]
     unused = list(compress(plan.cameras.labels, ~figures.camera_used))
     return Summary(
         input=str(task.source),
         output=str(task.target),
         pcfix=__version__,
-        **_figures(plan, figures),
+        **found,
+        water=water,
+        uncertainty=uncertainty,
         cameras=len(plan.cameras),
         cameras_used=len(plan.cameras) - len(unused),
         cameras_unused=unused,  # labels of those without corrected points
@@ -177,21 +189,6 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
         poses=poses,  # whether they have absorbed the refraction
         fit=None if fit is None else fit.as_dict(),
     )
-
-
-def _figures(plan: Plan, figures: Tally) -> dict[str, Any]:
-    """Return counts, depths, water and uncertainty, by their names in the summary."""
-    found = figures.as_dict()
-    if plan.inputs.port is not None:  # no depths, and no orders by depth
-        water = f"all around, seen through a {plan.inputs.port}"
-        return found | {"depth_m": {}, "water": water, "uncertainty": None}
-    water, moved = str(plan.found.surface), plan.survey.level_offset_m
-    if moved is not None:
-        water += f", {moved.min():+.3f} to {moved.max():+.3f} m at the times of the images"
-    uncertainty, by_poses = figures.uncertainty(plan.reconstruction), plan.survey.learned.poses
-    if uncertainty is not None and by_poses is not None:
-        uncertainty["poses_m"] = round(by_poses.middle_m, 4)
-    return found | {"water": water, "uncertainty": uncertainty}
 
 
 def _check_inputs(plan: Plan, tally: CloudTally) -> list[str]:

@@ -19,7 +19,7 @@ from pcfix.adjust.precision import precision_of
 from pcfix.adjust.problem import prepare
 from pcfix.errors import SettingError, silently
 from pcfix.flow.correct import correct_points
-from pcfix.flow.pose_errors import pose_errors
+from pcfix.flow.poses import pose_errors
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import Points
 from pcfix.model import Correction, FloatArray, GnssPositions, TiePoints, Views, WaterPlane
@@ -99,7 +99,15 @@ def _predicted(given: PlanOptions, depth_m: float) -> Figures:
     bed, apparent = _bed(given, depth_m)
     corrected, adjusted_m = _corrected(given, bed, apparent), 0.0
     if given.sigma_centre == given.sigma_attitude == 0.0:
-        adjusted_m = _of_adjusted_poses(given, bed, apparent)
+        # what the errors of poses add after `pcfix adjust`, with a calibrated lens
+        water, wet = WaterPlane(0.0), np.ones(len(bed.xyz), np.bool_)
+        block = replace(bed, water=water, refractive_index=given.refractive_index, wet=wet)
+        members, found = precision_of(*prepare(block, Unknowns(lens=()))).members, None
+        if members is not None:
+            survey = Survey(water, bed.cameras, _refraction(given).part(ScienceOptions))
+            classes, views = np.zeros(len(apparent), np.uint8), Views(bed.start, bed.camera)
+            found = pose_errors(Points(apparent, None, classes, views=views), survey, members, None)
+        adjusted_m = float("nan") if found is None else found.middle_m
     sigma_m = float(np.hypot(_rms(corrected.sigma_z_m), adjusted_m))
     parts_m = {part: _rms(_corrected(given, bed, apparent, part).sigma_z_m) for part in PARTS}
     parts_m["poses"] = float(np.hypot(parts_m["poses"], adjusted_m))
@@ -175,19 +183,6 @@ def _refraction(given: PlanOptions) -> RefractionOptions:
 
 def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def _of_adjusted_poses(given: PlanOptions, bed: Block, apparent: FloatArray) -> float:
-    """Return what the errors of poses add after `pcfix adjust`, with a calibrated lens."""
-    water, wet = WaterPlane(0.0), np.ones(len(bed.xyz), np.bool_)
-    index = given.refractive_index
-    block = replace(bed, water=water, refractive_index=index, wet=wet)
-    members, found = precision_of(*prepare(block, Unknowns(lens=()))).members, None
-    if members is not None:
-        survey = Survey(water, bed.cameras, _refraction(given).part(ScienceOptions))
-        classes, views = np.zeros(len(apparent), np.uint8), Views(bed.start, bed.camera)
-        found = pose_errors(Points(apparent, None, classes, views=views), survey, members, None)
-    return float("nan") if found is None else found.middle_m
 
 
 def plan_text(plan: Figures) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError, coded
 from pcfix.flow.correction import Plan, batch_of, transferred
 from pcfix.flow.inputs import CameraInputs, Inputs, labelling_of, original_ties, read_blocks
+from pcfix.flow.poses import SAMPLE_POINTS, members_of, pose_errors, with_poses
 from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
 from pcfix.io.las.source import CHUNK_POINTS
 from pcfix.io.tables import read_check_depths
@@ -44,8 +45,15 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
     """Read the inputs of a correction and check them against each other; estimate nothing."""
     options = with_index(options)
     inputs = options.part(Inputs)
-    if inputs.port is not None:
-        _check_port(options)
+    if inputs.port is not None:  # without a water surface
+        for name, allowed in (
+            ("camera_set", ("auto", "all")), ("occlusion", ("auto", "off")),
+            ("method", ("auto", "consistent")),
+        ):  # fmt: skip
+            if (value := getattr(options, name)) not in allowed:
+                sentence = f"{name.replace('_', '-')} {value} has no effect with a port. Omit it;"
+                sentence += " the method is consistent."
+                raise SettingError("port.excludes", sentence, option=name)
     elif not options.cameras:
         options.check_no_cameras()
     blocks = read_blocks(inputs, view)
@@ -107,18 +115,6 @@ def _check_frames(cameras: Cameras, options: CorrectOptions) -> None:
         raise SettingError("cameras.no_frames", sentence, missing=missing)
 
 
-def _check_port(options: CorrectOptions) -> None:
-    """Refuse values that need a water surface."""
-    for name, allowed in (
-        ("camera_set", ("auto", "all")), ("occlusion", ("auto", "off")),
-        ("method", ("auto", "consistent")),
-    ):  # fmt: skip
-        if (value := getattr(options, name)) not in allowed:
-            sentence = f"{name.replace('_', '-')} {value} has no effect with a port. Omit it; the"
-            sentence += " method is consistent."
-            raise SettingError("port.excludes", sentence, option=name)
-
-
 def plan_correction(plan: Plan) -> Plan:
     """Return the plan with everything estimated that points have in common; resolve ``auto``.
 
@@ -147,8 +143,17 @@ def plan_correction(plan: Plan) -> Plan:
     has_line = plan.survey.learned.regression is not None
     if plan.options.dimensions == "all" and len(plan.cameras) and not has_line:
         plan = _with_pose_errors(plan)
-    if first is not None and plan.kind is not None:
-        plan = _with_type_of_list(plan, first)
+    if first is not None and plan.kind is not None:  # the type of the list, by the first points
+        points = transferred(plan, first, 0)[0]
+        batch = replace(batch_of(points, plan.survey, plan.original), views=points.views)
+        # a file of view lists does not state what its images are
+        is_open = plan.match is not None and plan.inputs.views_are == "auto"
+        is_open = is_open and plan.kind == "depth-maps"
+        verdict = learning.weigh_lists(learning.submerged_of(batch), is_open=is_open)
+        if verdict is not None:
+            kind = verdict.chosen.kind or plan.kind
+            survey = learning.with_verdict(plan.survey, verdict)
+            plan = replace(plan, survey=survey, kind=kind, verdicts=(verdict,))
     remarks = dict.fromkeys(note for one in plan.verdicts for note in one.warnings())
     return replace(plan, notes=(*plan.notes, *coded("cloud.reconstruction", remarks)))
 
@@ -209,8 +214,6 @@ def fit_check_depths(path: File, parts: Iterable[Part]) -> DepthRegression:
 
 def _with_pose_errors(plan: Plan) -> Plan:
     """Return the plan with the errors of adjusted poses, if the adjustment left its members."""
-    from pcfix.flow.pose_errors import SAMPLE_POINTS, members_of, pose_errors, with_poses
-
     try:
         members = members_of(plan.inputs.cameras, plan.cameras)
     except InputError as error:
@@ -230,20 +233,6 @@ def _all_chunks(plan: Plan) -> Iterator[Points]:
     for points in plan.view.chunks(plan.found.surface):
         yield points if plan.transfer is None else transferred(plan, points, row)[0]
         row += len(points.xyz)
-
-
-def _with_type_of_list(plan: Plan, first: Points) -> Plan:
-    """Return the plan with the type of its view list, as the first points show it."""
-    points = transferred(plan, first, 0)[0]
-    batch = replace(batch_of(points, plan.survey, plan.original), views=points.views)
-    # a file of view lists does not state what its images are
-    is_open = plan.match is not None and plan.inputs.views_are == "auto"
-    is_open = is_open and plan.kind == "depth-maps"
-    verdict = learning.weigh_lists(learning.submerged_of(batch), is_open=is_open)
-    if verdict is None:
-        return plan
-    survey, kind = learning.with_verdict(plan.survey, verdict), verdict.chosen.kind or plan.kind
-    return replace(plan, survey=survey, kind=kind, verdicts=(verdict,))
 
 
 def _estimated_from_cloud(plan: Plan) -> Plan:

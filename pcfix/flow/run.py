@@ -21,10 +21,10 @@ from pcfix.flow.adjust import FOLDER, MODELS, SUMMARY, adjust_into
 from pcfix.flow.clean import clean_file
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.correct import correct_file
-from pcfix.flow.diagnosis import diagnose_inputs, has_datum
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.outputs import DIFFERENCE, PAGE, SECTIONS, report_run
+from pcfix.flow.poses import diagnose_inputs, has_datum
 from pcfix.flow.run_folder import RECORD, STEPS, SURFACE, Record, RunFolder, read_steps
 from pcfix.flow.runner import Bar, Progress, check_folder, no_bar
 from pcfix.flow.surfaces import view_of

@@ -10,8 +10,8 @@ import pcfix
 from pcfix.adjust.diagnosis import Diagnosis, land_sign, neighbours_sign
 from pcfix.errors import PcfixWarning
 from pcfix.flow.cameras import cameras_text, check_cameras
-from pcfix.flow.diagnosis import adjust_words
 from pcfix.flow.inputs import Inputs
+from pcfix.flow.poses import adjust_words
 from tests.utils.crops import middle_of
 from tests.utils.shared import SCENE, needs
 

@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import pcfix
-from pcfix.flow.diagnosis import quick_ties
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.plausibility import CloudSample, plausible
+from pcfix.flow.poses import quick_ties
 from pcfix.flow.surfaces import view_of
 from pcfix.io.las.source import read_xyz
 from tests.utils.codes import refused, warned

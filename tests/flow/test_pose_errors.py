@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import pcfix
 from pcfix.adjust.precision import Members
 from pcfix.adjust.transfer import CloudTransfer
-from pcfix.flow.pose_errors import variances
+from pcfix.flow.poses import variances
 from pcfix.flow.surfaces import Points
 from pcfix.io.files import ENSEMBLE, write_members
 from pcfix.model import Cameras, Lens, Views, WaterPlane
