@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
-from contextvars import ContextVar, copy_context
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -65,13 +64,6 @@ def running(**changes: Any) -> Iterator[None]:
         yield
     finally:
         _RUN.reset(token)
-
-
-@contextmanager
-def meanwhile(function: Callable[..., Any], *given: Any) -> Iterator[Future[Any]]:
-    """Call a function in another thread, with the settings of this one, while the block runs."""
-    with ThreadPoolExecutor(1) as pool:
-        yield pool.submit(copy_context().run, function, *given)
 
 
 def threads(jobs: int | None) -> AbstractContextManager[None]:

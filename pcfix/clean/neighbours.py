@@ -17,17 +17,7 @@ from itertools import pairwise
 import numpy as np
 
 from pcfix.model import FloatArray, IntArray
-from pcfix.running import (
-    blocks,
-    bounds,
-    current,
-    empty,
-    grouped,
-    mapped,
-    meanwhile,
-    release,
-    row_numbers,
-)
+from pcfix.running import blocks, bounds, current, empty, grouped, mapped, release, row_numbers
 
 PIECE_ROWS = 65_536
 LEAF_POINTS = 32
@@ -79,10 +69,8 @@ def nearest_distance(places: FloatArray, points: FloatArray) -> FloatArray:
     Places and points, (n, 3), are metres in one frame. Where the two clouds sample a surface at
     different places it is at least about half the spacing of the points.
     """
-    tiles, distance = make_tiles(points), empty((len(places),))
-    with meanwhile(Neighbours, tiles, 3) as search:  # scipy builds a tree on one core
-        asked = make_tiles(places)
-    near = search.result()
+    near = Neighbours(make_tiles(points), 3)
+    asked, distance = make_tiles(places), empty((len(places),))
     for piece in asked.pieces(POINTS_PER_TILE):
         distance[asked.row[piece]] = near.nearest(asked.xyz[piece], 1)[0][:, 0]
     return distance

@@ -19,7 +19,6 @@ from pcfix.io.tiles import Clouds, band_of, cloud_of, inputs_of
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CompareOptions, CompareRules
-from pcfix.running import meanwhile
 
 DEPTHS = "depth_bins.csv"
 
@@ -64,15 +63,13 @@ def compare_clouds(
     outputs = [path for path in (given.out_dir, given.summary, given.plot) if path is not None]
     near = Path([*outputs, Path(tempfile.gettempdir()) / "pcfix"][0])
     with scratch_arrays(near):  # arrays of large clouds
-        with meanwhile(read_reference, surveyed) as reading:
-            survey = read_cloud(source, water)
-        target = reading.result()
+        target = read_reference(surveyed)
 
         def matched_to(one: SurveyCloud) -> Match:
             check_same_crs(one.name, one.crs, target.name, target.crs)
             return match(one, target, given.part(CompareRules), given=water is not None)
 
-        matched, others = matched_to(survey), {}
+        matched, others = matched_to(read_cloud(source, water)), {}
         for name, further in also.items():  # at the places of the first
             others[name] = replace(matched_to(read_cloud(further, water)), places=matched.places)
         result = figures_of(matched, lines, others)
