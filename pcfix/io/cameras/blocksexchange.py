@@ -55,10 +55,8 @@ CENTRE = [f"Center/{axis}" for axis in "xyz"]
 DEGREES = ["Longitude", "Latitude", "Altitude"]
 MATRIX = [f"Rotation/M_{row}{column}" for row in range(3) for column in range(3)]
 ANGLES = [f"Rotation/{angle}" for angle in ("Omega", "Phi", "Kappa")]
-EXIF = "EPSG:4326"
-"""The CRS of positions in ExifData."""
-FIRST_PIXEL = 0.5
-"""The centre of the first pixel, seen from its corner."""
+EXIF = "EPSG:4326"  # of positions in ExifData
+FIRST_PIXEL = 0.5  # its centre, seen from its corner
 DIRECTIONS = {"Right": (1, 0, 0), "Left": (-1, 0, 0), "Down": (0, 1, 0), "Up": (0, -1, 0)}
 
 
@@ -82,8 +80,8 @@ def read(source: Source) -> Cameras:
     photos, unposed = _photos(path, root)
     labels, centres = tuple(photo.label for photo in photos), [photo.centre for photo in photos]
     turns = [photo.rotation for photo in photos if photo.rotation is not None]
-    lenses = [photo.lens for photo in photos if photo.lens is not None] if turns else []
-    known = tuple(lenses) if len(lenses) == len(photos) else None
+    lenses = tuple(photo.lens for photo in photos if photo.lens is not None and turns)
+    known = lenses if len(lenses) == len(photos) else None
     priors = {i: photo.prior for i, photo in enumerate(photos) if photo.prior is not None}
     gnss_srs = next(iter(priors.values()), ("",))[0]  # positions of other systems are skipped
     places = {i: (xyz, [np.nan] * 3) for i, (srs, xyz) in priors.items() if srs == gnss_srs}
@@ -111,10 +109,15 @@ def _photos(path: Path, root: Element) -> tuple[list[Photo], tuple[str, ...]]:
                 if is_ignored or pose is None or pose.find("Center") is None:
                     unposed.append(label)
                     continue
-                key = i, text_of(element, "Id")
-                centre = _numbers(path, f"image {label}", pose, CENTRE)
+                key, where = (i, text_of(element, "Id")), f"image {label}"
+                centre = _numbers(path, where, pose, CENTRE)
                 turn = _rotation(path, label, pose, axes)
-                prior = _prior(path, label, element, srs)
+                metadata, gps, prior = pose.find("Metadata"), element.find("ExifData/GPS"), None
+                if metadata is not None and metadata.find("Center") is not None:
+                    place = _numbers(path, f"{where}, Metadata", metadata, CENTRE)
+                    prior = text_of(metadata, "SRSId") or srs, place
+                elif gps is not None and all(gps.findtext(name) for name in DEGREES):
+                    prior = EXIF, _numbers(path, f"{where}, GPS", gps, DEGREES)
                 is_main = text_of(element, "Component") in ("", MAIN_COMPONENT)
                 listed.append(Photo(is_main, key, label, lens, centre, turn, srs, prior))
         unposed += [_label(element) for element in block.iterfind("BulkPhotos/Photo")]
@@ -128,17 +131,6 @@ def _photos(path: Path, root: Element) -> tuple[list[Photo], tuple[str, ...]]:
     chosen = {photo.key for photo in photos}
     unposed += [photo.label for photo in listed if photo.key not in chosen]
     return photos, tuple(unposed)
-
-
-def _prior(path: Path, label: str, photo: Element, srs: str) -> tuple[str, FloatArray] | None:
-    """Return the SRS and the GNSS position of a photo."""
-    metadata, gps = photo.find("Pose/Metadata"), photo.find("ExifData/GPS")
-    if metadata is not None and metadata.find("Center") is not None:
-        place = _numbers(path, f"image {label}, Metadata", metadata, CENTRE)
-        return text_of(metadata, "SRSId") or srs, place
-    if gps is not None and all(gps.findtext(name) for name in DEGREES):
-        return EXIF, _numbers(path, f"image {label}, GPS", gps, DEGREES)
-    return None
 
 
 def _rotation(path: Path, label: str, pose: Element, axes: FloatArray) -> FloatArray | None:

@@ -3,10 +3,9 @@
 Lenses are made of parameters by name, as all packages have the same few. Here they are called
 ``f``, or ``fx`` across and ``fy`` down the image; ``cx``, ``cy``, the principal point from the
 upper left corner of the image, or ``dx``, ``dy`` from its centre; ``skew`` and ``b3``, the affine
-terms off the diagonal; ``k1``, ...
-radial and ``d1``, ... in the denominator; ``p1``, ``p2``, ... in Brown's order, so OpenCV's p1 is
-``p2``; ``s1``, ... of thin prisms; and the parameters of a projection, see `SHAPES`.
-`pcfix.model.Lens` has the formulas.
+terms off the diagonal; ``k1``, ... radial and ``d1``, ... in the denominator; ``p1``, ``p2``, ...
+in Brown's order, so OpenCV's p1 is ``p2``; ``s1``, ... of thin prisms; and the parameters of a
+projection, see `SHAPES`. `pcfix.model.Lens` has the formulas.
 """
 
 from __future__ import annotations
