@@ -283,9 +283,8 @@ def name_of(element: Element) -> str:
 
 def _calibration(sensor: Element) -> Element | None:
     """Return the last adjusted calibration, else the last one."""
-    found = sensor.findall("calibration")
-    chosen = [one for one in found if one.get("class") == "adjusted"] or found
-    return chosen[-1] if chosen else None
+    found = sensor.findall("calibration[@class='adjusted']") or sensor.findall("calibration")
+    return found[-1] if found else None
 
 
 def _kind(sensor: Element) -> str:
@@ -313,17 +312,15 @@ def _calibrated(
     path: Path, sensor: str, kind: str, calibration: Element, size: list[float]
 ) -> Lens:
     """Return the lens of a calibration of a known kind, for an image of a size in pixels."""
-    given = {
-        entry.tag: number(path, f"sensor {sensor}, {entry.tag}", entry.text)
-        for entry in calibration
-        if entry.tag in PARAMETERS
-    }
-    value = defaultdict(float, given)
+    given = defaultdict[str, float](float)
+    for entry in calibration:
+        if entry.tag in PARAMETERS:
+            given[entry.tag] = number(path, f"sensor {sensor}, {entry.tag}", entry.text)
     if "f" in given:
-        given = given | {"fx": value["f"] + value["b1"], "skew": value["b2"]}
+        given |= {"fx": given["f"] + given["b1"], "skew": given["b2"]}
         given |= {"dx": given.pop("cx", 0.0), "dy": given.pop("cy", 0.0)}
     else:  # PhotoScan's
-        given |= {"fy": given.get("fy", value["fx"]), "p1": value["p2"], "p2": value["p1"]}
+        given |= {"fy": given.get("fy", given["fx"]), "p1": given["p2"], "p2": given["p1"]}
     return checks.lens_by_name(given, *size, projection=PROJECTIONS[kind], sensor=sensor)
 
 

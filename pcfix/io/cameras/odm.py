@@ -59,10 +59,7 @@ SCALE_TOLERANCE = 0.1
 """Of the squared scale of a map projection, which excludes feet."""
 ROUNDING_M = 2e-3
 """Newer ODM puts the origin at whole metres; reference_lla is rounded a little."""
-SAME_FOCAL = 1e-6
 GNSS_KEYS = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev")
-NO_GNSS = 999999.0
-"""The gps_dop that OpenSfM writes for an image without a position."""
 
 _FOLDERS = ("opensfm", "odm_georeferencing", "odm_georeferencing_25d", "odm_report")
 _OF_CRS = ("proj.txt", "coords.txt", "odm_georeferencing_model_geo.txt")
@@ -90,10 +87,12 @@ def read(source: Source) -> Cameras:
         return _read_shots(files)
     own, _ = read_reconstruction(files["poses"])
     frame, (gnss, listed) = _frame(files, own), _read_images(files, own.labels)
+    # the nearest rotations, as the map scales a bit
+    u, _, v = np.linalg.svd(np.asarray(own.rotations) @ np.linalg.inv(frame.matrix))
     return replace(
         own,
         centres=frame.points(own.centres),
-        rotations=frame.rotations(np.asarray(own.rotations)),
+        rotations=u @ v,
         crs=frame.crs,
         project_crs=frame.project_crs,
         gnss=gnss or own.gnss,
@@ -254,7 +253,7 @@ def _read_shots(files: Files) -> Cameras:
     for shot in each:
         plain = {"f": float(shot["focal"])}
         own = lens_by_name(plain, float(shot["width"]), float(shot["height"]), relative=True)
-        near = SAME_FOCAL * own.focal
+        near = 1e-6 * own.focal
         alike = [one for one in known.values() if abs(one.focal + one.b1 - own.focal) < near]
         found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else own)
         bare += found is own
@@ -324,7 +323,7 @@ def read_reconstruction(path: Path) -> tuple[Cameras, dict[str, Any]]:
         places = {}
         for label, shot in shots.items():
             position, dop = shot.get("gps_position"), shot.get("gps_dop")
-            if position is not None and dop != NO_GNSS:
+            if position is not None and dop != 999999.0:  # which stands for no position
                 places[label] = position, [np.nan if dop is None else dop] * 3
         origin, other = chosen.get("reference_lla"), path.with_name("reference_lla.json")
         if origin is None and other.is_file() and other.read_bytes()[:100].lstrip()[:1] == b"{":
