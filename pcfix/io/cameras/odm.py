@@ -54,11 +54,6 @@ SHOTS = "shots.geojson"
 RECONSTRUCTION = "reconstruction.json"
 TRANSFORMATION = "geocoords_transformation.txt"
 TOPOCENTRIC = "reconstruction.topocentric.json"
-TOPOCENTRIC_LIMIT_M = 1e5
-SCALE_TOLERANCE = 0.1
-"""Of the squared scale of a map projection, which excludes feet."""
-ROUNDING_M = 2e-3
-"""Newer ODM puts the origin at whole metres; reference_lla is rounded a little."""
 GNSS_KEYS = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev")
 
 _FOLDERS = ("opensfm", "odm_georeferencing", "odm_georeferencing_25d", "odm_report")
@@ -158,7 +153,7 @@ def _frame(files: Files, own: Cameras) -> AffineFrame:
     located = _located(lon, lat, crs) if origin else None
     unmoved = AffineFrame(np.eye(3), np.zeros(3), own_crs, crs)
     if not (located or files.keys() & {*_OF_CRS, SHOTS, TOPOCENTRIC}):  # OpenSfM's own
-        is_far = np.abs(np.median(own.centres[:, :2], axis=0)).max() > TOPOCENTRIC_LIMIT_M
+        is_far = np.abs(np.median(own.centres[:, :2], axis=0)).max() > 1e5
         return unmoved._replace(crs=None) if is_far else unmoved
     if origin is None or files["poses"].name == TOPOCENTRIC:
         return unmoved
@@ -167,7 +162,8 @@ def _frame(files: Files, own: Cameras) -> AffineFrame:
             rows = [row.split()[:4] for row in read_lines(path) if row.strip()]
             matrix = np.array(rows, float).reshape(4, 4)
         turn, shift = matrix[:3, :3], matrix[:3, 3]
-        if not (np.abs(turn.T @ turn - np.eye(3)).max() <= SCALE_TOLERANCE):
+        # the squared scale of a map projection is within 0.1 of 1, that of feet is not
+        if not (np.abs(turn.T @ turn - np.eye(3)).max() <= 0.1):
             raise damaged(path, "it does not turn and shift the reconstruction")
         if named := _located(lon, lat, crs, shift[:2]):  # else the file is of another origin
             return AffineFrame(turn, shift, named[0])
@@ -206,7 +202,8 @@ def _located(
     zones = [f"EPSG:{first + (zone + step) % 60}" for step in (0, -1, 1)]
     for candidate in [crs] if crs else zones:
         there = _projected(candidate, np.array([[lon, lat]]))[0]
-        expected, within_m = (np.round(there), ROUNDING_M) if place is None else (place, 1.0)
+        # 2 mm, as reference_lla is rounded a little
+        expected, within_m = (np.round(there), 2e-3) if place is None else (place, 1.0)
         if np.linalg.norm(there - expected) < within_m:
             return candidate, expected
     return None
