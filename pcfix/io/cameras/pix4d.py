@@ -34,9 +34,8 @@ from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import Cameras, FloatArray, Lens, TiePoints
 
-PARAMETERS = "calibrated_camera_parameters.txt"
 NAMES = {
-    "parameters": PARAMETERS,
+    "parameters": "calibrated_camera_parameters.txt",
     "external": "calibrated_external_camera_parameters.txt",
     "offset": "offset.xyz",
     "wkt": "wkt.prj",
@@ -98,7 +97,7 @@ def read(source: Source) -> Cameras:
                 rows.append(rows_of[name].pop(int(np.argmin(off))) if len(off) else -1)
             posed = [i for i in posed if rows[i] >= 0]
             if not posed:
-                raise damaged(path, f"names none of the images of {PARAMETERS}")
+                raise damaged(path, f"names none of the images of {NAMES['parameters']}")
             centres, rotations = (each[rows][posed] for each in (centres, rotations))
     else:
         labels, rotations = names, turns
