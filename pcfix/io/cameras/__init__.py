@@ -174,14 +174,11 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
 def _recognised(path: File, sensor: File | None, angles: Angles | None) -> tuple[Source, str]:
     """Return the input and the module that reads it."""
     where = Path(path)
-    source = Source(
-        where if where.is_dir() else check_input(where),
-        None if sensor is None else check_input(sensor),
-        angles,
-    )
+    is_folder = where.is_dir()
+    own_sensor = None if sensor is None else check_input(sensor)
+    source = Source(where if is_folder else check_input(where), own_sensor, angles)
     if form := _format_of(source):
         return source, form
-    is_folder = where.is_dir()
     files = sorted(filter(Path.is_file, where.iterdir())) if is_folder else [where]
     for file in files:
         if form := _format_of(Source(file)):

@@ -101,8 +101,7 @@ def read(source: Source) -> Cameras:
             centres, rotations = (each[rows][posed] for each in (centres, rotations))
     else:
         labels, rotations = names, turns
-        centres = np.array([image.centre for image in images]).reshape(-1, 3)
-        centres += _offset(files)
+        centres = np.array([image.centre for image in images]).reshape(-1, 3) + _offset(files)
     every = dict.fromkeys([*names, *labels])
     labels = [names[i] for i in posed] or labels
     unposed = tuple(name for name in every if name not in set(labels))
