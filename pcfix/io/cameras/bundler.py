@@ -117,7 +117,7 @@ def _model(source: Source) -> Model:
     kind = "view" if is_mve else "camera"
     unnamed = [f"{kind} {i}" for i in range(count)]
     found = next((some for some in named if len(some) == count), unnamed)
-    names = [re.sub(r"\s+0\s+[\d.]+$", "", name.strip()) for name in found]  # its focal length
+    names = [re.sub(r"\s+0\s+[\d.]+$", "", name.strip()) for name in found]  # no focal length
     rows, points, labels = _posed(path, rows, points, names)
     rotations = checks.rotations(path, labels, rows[:, 3:12])
     centres, least = checks.centres(rotations, rows[:, 12:]), np.zeros((len(rows), 2))

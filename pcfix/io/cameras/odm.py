@@ -59,9 +59,7 @@ GNSS_KEYS = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev
 _FOLDERS = ("opensfm", "odm_georeferencing", "odm_georeferencing_25d", "odm_report")
 _OF_CRS = ("proj.txt", "coords.txt", "odm_georeferencing_model_geo.txt")
 _NAMES = (SHOTS, TRANSFORMATION, TOPOCENTRIC, "cameras.json", "images.json", *_OF_CRS)
-_SHOTS_HEAD = re.compile(
-    r'\s*\{.*"features"\s*:\s*\[.*"(translation|rotation|filename)"', re.DOTALL
-)
+_SHOTS_HEAD = re.compile(r'(?s)\s*\{.*"features"\s*:\s*\[.*"(translation|rotation|filename)"')
 _KEYS = "cameras|shots|points|pano_shots|reference_lla|biases|rig_cameras|rig_instances"
 _HEAD = re.compile(rf'\s*\[\s*\{{\s*"({_KEYS})"\s*:\s*\{{')
 Files = Mapping[str, Path]
