@@ -38,7 +38,6 @@ from pcfix.io.crs import is_topocentric
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 from pcfix.options.declare import File
 
-_PART = re.compile(r"(cameras|images|points3D|rigs|frames)\.(bin|txt)")
 FILE, WRITER = "georeference.json", "pcfix"
 
 
@@ -79,7 +78,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
 def _models_at(path: Path) -> list[Path]:
     """Return the camera lists of the models in a folder or its ``sparse``, the largest first."""
     if not path.is_dir():
-        part = _PART.fullmatch(path.name)
+        part = re.fullmatch(r"(cameras|images|points3D|rigs|frames)\.(bin|txt)", path.name)
         listed = path.with_name(f"cameras.{part[2] if part else ''}")
         return [listed] if _is_model(listed) else []
     for folders in ([path], path.glob("[0-9]*"), [path / "sparse"], path.glob("sparse/[0-9]*")):

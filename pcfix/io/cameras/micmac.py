@@ -38,8 +38,6 @@ from pcfix.model import Cameras, FloatArray, Lens
 
 PREFIX, PREFIX_2, SUFFIX = "Orientation-", "Ori-PerspCentral-", ".xml"
 CONTENT, INSIDE = "<OrientationConique|<NameInternalCalib>", rf"({PREFIX}|{PREFIX_2}).*\{SUFFIX}"
-UNIFIED = ("eModele_DRad_PPaEqPPs", "eModele_Fraser_PPaEqPPs")
-"""Of `ModUnif`: radial and Fraser's about the principal point; five k, P1, P2, b1, b2."""
 NAMES = (*(f"k{i}" for i in range(1, 10)), "p1", "p2", "b1", "b2")
 _IS_INVERSE = {"": False, "eConvApero_DistM2C": False, "eConvApero_DistC2M": True}
 
@@ -102,7 +100,8 @@ def _calibration(path: Path, element: Element) -> Lens:
         raise _not_held(path, " after ".join(name for name, _ in models))
     centre, given = principal, dict[str, float]()
     for name, model in models:
-        if name in UNIFIED:
+        # of ModUnif: radial and Fraser's about the principal point; five k, P1, P2, b1, b2
+        if name in ("eModele_DRad_PPaEqPPs", "eModele_Fraser_PPaEqPPs"):
             values = [number(path, "Params", e.text) for e in model.findall("Params")]
             if any(values[9:]):
                 raise damaged(path, f"{name} has {len(values)} Params instead of 9")

@@ -49,8 +49,6 @@ HEADER = re.compile(
     r" omega phi kappa)\s*?$",
     re.MULTILINE,
 )
-FOLDERS = ("", "params/", "1_initial/params/", "*/params/", "*/1_initial/params/")
-"""Folders of the files, seen from the folder of a project."""
 FIELDS = {
     "camera matrix": "fx skew cx b3 fy cy - - -",
     "radial": "k1 k2 k3",
@@ -62,7 +60,6 @@ FIELDS = {
     "rotation": "rotation",
 }
 """Words in the header of the camera parameters, and the names of the numbers in `checks`."""
-SHAPE = re.compile(r"^(.*?)\s*\[\s*(\d{1,2})\s*x\s*(\d{1,2})\s*\]\s*$")
 
 
 def recognises(source: Source) -> bool:
@@ -140,7 +137,7 @@ def _tables_in(root: Path) -> list[tuple[Path, str]]:
     """Return folders with tables of poses, and the name of the project before that of each."""
     return [
         (file.parent, found[1])
-        for inside in FOLDERS
+        for inside in ("", "params/", "1_initial/params/", "*/params/", "*/1_initial/params/")
         for file in sorted(root.glob(f"{inside}*.txt"))
         if (found := TABLE.fullmatch(file.name)) and not found[2]
     ]
@@ -176,7 +173,7 @@ def read_parameters(path: Path) -> list[Image]:
     lines = [line for line in read_lines(path) if line.strip()]
     layout, row = [], 1
     for i, line in enumerate(lines[:20], start=1):
-        if shape := SHAPE.match(line):
+        if shape := re.match(r"(.*?)\s*\[\s*(\d{1,2})\s*x\s*(\d{1,2})\s*\]\s*$", line):
             words = shape[1].lower()
             name = next((name for word, name in FIELDS.items() if word in words), "")
             layout.append((name, int(shape[2]) * int(shape[3])))

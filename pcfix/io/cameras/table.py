@@ -138,7 +138,6 @@ def read(source: Source) -> Cameras:
 
 GEO = ("label", "x", "y", "z", "yaw", "pitch", "roll", "accuracy_horz", "accuracy_vert")
 """Fields of ODM's geo.txt, the last six optional; more may follow."""
-_GEO_CRS = re.compile(r"(EPSG:\d+|\+proj=.+|WGS84 UTM \d\d?\s*[NS])\s*", re.IGNORECASE)
 
 
 def open_table(path: Path) -> Table:
@@ -205,7 +204,7 @@ def crs(columns: Table) -> tuple[str | None, str]:
 
 def is_geo(lines: list[str]) -> bool:
     """Whether these lines are a CRS and then images, not control points."""
-    if not lines or not _GEO_CRS.fullmatch(lines[0]):
+    if not re.fullmatch(r"(?i)(EPSG:\d+|\+proj=.+|WGS84 UTM \d\d?\s*[NS])\s*", [*lines, ""][0]):
         return False
     first = next((line.split() for line in lines[1:] if line.strip()), [])
     return len(first) >= 3 and np.isnan(tables.number(first[0]))
@@ -217,8 +216,6 @@ CONVERSIONS = {
     "yaw-pitch-roll": rotations.from_yaw_pitch_roll,
     "aircraft": rotations.from_aircraft,
 }
-LOOKS_DOWN = 0.17
-"""Least cosine of the tilt, about 80 degrees, of a camera that looks at the ground."""
 
 
 def _rotations(columns: Table, angles: Angles | None) -> FloatArray | None:
@@ -260,7 +257,8 @@ def _rotations(columns: Table, angles: Angles | None) -> FloatArray | None:
         return gimbal
     down, other = -found[:, 2, 2], -gimbal[:, 2, 2]  # cosines of the tilt from straight down
     reality_capture = columns.after_hash and columns.name("yaw") == "heading"
-    is_likely = other.min() > LOOKS_DOWN and np.median(other) > np.median(down)
+    # a camera that looks at the ground is tilted by at most 80 degrees
+    is_likely = other.min() > 0.17 and np.median(other) > np.median(down)
     if is_likely and not reality_capture:
         sentence = "yaw, pitch, roll are likely those of a gimbal. Give --angles aircraft, or"
         sentence += " --angles yaw-pitch-roll."
@@ -331,9 +329,6 @@ def read_sensor(path: Path) -> Lens:
     return lens
 
 
-WRITTEN = ("label", "x", "y", "z", "qw", "qx", "qy", "qz")
-
-
 def write_table(folder: File, cameras: Cameras) -> None:
     """Write ``cameras.csv`` and ``sensor.csv``.
 
@@ -361,9 +356,10 @@ def write_table(folder: File, cameras: Cameras) -> None:
     poses = np.column_stack([cameras.centres, turns]).tolist()
     has_crs = cameras.crs is not None and cameras.crs.strip().lower() != "local"
     comment = f"# CoordinateSystem: {' '.join((cameras.crs or '').split())}\n" if has_crs else ""
+    names = ("label", "x", "y", "z", *QUATERNION)
     rows = [[label, *row] for label, row in zip(cameras.labels, poses, strict=True)]
     contents = {
-        "cameras.csv": comment.encode() + _csv(WRITTEN, *rows),
+        "cameras.csv": comment.encode() + _csv(names, *rows),
         "sensor.csv": _csv(header, sensor),
     }
     checks.write_new(target, contents)
