@@ -79,7 +79,7 @@ PART = re.compile(
     r"(?i)(.*_)?(calibrated_images_position\.txt|pmatrix\.txt|offset\.xyz"
     r"|internal_camera_parameters\.cam|camera_parameters(_wgs84)?_error\.txt)"
 )
-"""Files of Pix4D's parameters without poses."""
+"""Files of Pix4D's parameters without poses, of which standard errors look like poses."""
 
 
 def read_cameras(
@@ -174,21 +174,18 @@ def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
 def _recognised(path: File, sensor: File | None, angles: Angles | None) -> tuple[Source, str]:
     """Return the input and the module that reads it."""
     where = Path(path)
-    source = Source(
-        where if where.is_dir() else check_input(where),
-        None if sensor is None else check_input(sensor),
-        angles,
-    )
+    is_folder = where.is_dir()
+    own_sensor = None if sensor is None else check_input(sensor)
+    source = Source(where if is_folder else check_input(where), own_sensor, angles)
     if form := _format_of(source):
         return source, form
-    is_folder = where.is_dir()
     files = sorted(filter(Path.is_file, where.iterdir())) if is_folder else [where]
     for file in files:
         if form := _format_of(Source(file)):
             sentence = f"is a folder with a camera file ({FORMATS[form]}). Give {file}."
             raise bad_file(where, "cameras.folder", sentence, file=file.name)
     for file in files:
-        head, found = b"", [PIX4D_PART] if _is_part(file) else []
+        head, found = b"", [PIX4D_PART] if PART.fullmatch(file.name) else []
         with suppress(InputError):  # in a folder
             head = Source(file).head
         found += [of for pattern, *of in REFUSED if re.search(pattern, head, re.MULTILINE)]
@@ -213,14 +210,11 @@ def reader_of(form: str) -> Any:
 
 
 def _format_of(source: Source) -> str | None:
-    """Return the first format that recognises the content."""
-    for form in () if _is_part(source.path) else FORMATS:
+    """Return the first format that recognises the content; none for a part of an export."""
+    if PART.fullmatch(source.path.name) and source.path.is_file():
+        return None
+    for form in FORMATS:
         with suppress(Exception), np.errstate(all="ignore"):
             if checks.recognises(reader_of(form), source):
                 return form
     return None
-
-
-def _is_part(path: Path) -> bool:
-    """Whether a file is by its name a part of an export; standard errors look like poses."""
-    return path.is_file() and bool(PART.fullmatch(path.name))

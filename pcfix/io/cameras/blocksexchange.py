@@ -45,20 +45,13 @@ from pcfix.lens.rotations import from_omega_phi_kappa, from_photogrammetric
 from pcfix.model import Cameras, FloatArray, Lens, TiePoints
 
 CONTENT = "<BlocksExchange"
-COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
 TIE_POINTS = re.compile(rb"<TiePoints>(.*?)</TiePoints>", re.DOTALL)
-EXTERNAL = re.compile(rb"<Path>\s*([^<]*?)\s*</Path>")
-DECLARATION = re.compile(rb"<\?xml.*?\?>")
-SRS_OF_ALL = re.compile(rb"<SRSId>\s*([^<]*?)\s*</SRSId>")
-MAIN_COMPONENT = "1"
 CENTRE = [f"Center/{axis}" for axis in "xyz"]
 DEGREES = ["Longitude", "Latitude", "Altitude"]
 MATRIX = [f"Rotation/M_{row}{column}" for row in range(3) for column in range(3)]
 ANGLES = [f"Rotation/{angle}" for angle in ("Omega", "Phi", "Kappa")]
-EXIF = "EPSG:4326"
-"""The CRS of positions in ExifData."""
-FIRST_PIXEL = 0.5
-"""The centre of the first pixel, seen from its corner."""
+EXIF = "EPSG:4326"  # of positions in ExifData
+FIRST_PIXEL = 0.5  # its centre, seen from its corner
 DIRECTIONS = {"Right": (1, 0, 0), "Left": (-1, 0, 0), "Down": (0, 1, 0), "Up": (0, -1, 0)}
 
 
@@ -82,8 +75,8 @@ def read(source: Source) -> Cameras:
     photos, unposed = _photos(path, root)
     labels, centres = tuple(photo.label for photo in photos), [photo.centre for photo in photos]
     turns = [photo.rotation for photo in photos if photo.rotation is not None]
-    lenses = [photo.lens for photo in photos if photo.lens is not None] if turns else []
-    known = tuple(lenses) if len(lenses) == len(photos) else None
+    lenses = tuple(photo.lens for photo in photos if photo.lens is not None and turns)
+    known = lenses if len(lenses) == len(photos) else None
     priors = {i: photo.prior for i, photo in enumerate(photos) if photo.prior is not None}
     gnss_srs = next(iter(priors.values()), ("",))[0]  # positions of other systems are skipped
     places = {i: (xyz, [np.nan] * 3) for i, (srs, xyz) in priors.items() if srs == gnss_srs}
@@ -95,7 +88,7 @@ def read(source: Source) -> Cameras:
 
 def _read_bytes(path: Path) -> bytes:
     """Return the document in a file or archive without comments."""
-    return COMMENT.sub(b"", checks.read_document(path))
+    return re.sub(rb"<!--.*?-->", b"", checks.read_document(path), flags=re.DOTALL)
 
 
 def _photos(path: Path, root: Element) -> tuple[list[Photo], tuple[str, ...]]:
@@ -111,11 +104,16 @@ def _photos(path: Path, root: Element) -> tuple[list[Photo], tuple[str, ...]]:
                 if is_ignored or pose is None or pose.find("Center") is None:
                     unposed.append(label)
                     continue
-                key = i, text_of(element, "Id")
-                centre = _numbers(path, f"image {label}", pose, CENTRE)
+                key, where = (i, text_of(element, "Id")), f"image {label}"
+                centre = _numbers(path, where, pose, CENTRE)
                 turn = _rotation(path, label, pose, axes)
-                prior = _prior(path, label, element, srs)
-                is_main = text_of(element, "Component") in ("", MAIN_COMPONENT)
+                metadata, gps, prior = pose.find("Metadata"), element.find("ExifData/GPS"), None
+                if metadata is not None and metadata.find("Center") is not None:
+                    place = _numbers(path, f"{where}, Metadata", metadata, CENTRE)
+                    prior = text_of(metadata, "SRSId") or srs, place
+                elif gps is not None and all(gps.findtext(name) for name in DEGREES):
+                    prior = EXIF, _numbers(path, f"{where}, GPS", gps, DEGREES)
+                is_main = text_of(element, "Component") in ("", "1")
                 listed.append(Photo(is_main, key, label, lens, centre, turn, srs, prior))
         unposed += [_label(element) for element in block.iterfind("BulkPhotos/Photo")]
     main = [photo for photo in listed if photo.is_main] or listed
@@ -128,17 +126,6 @@ def _photos(path: Path, root: Element) -> tuple[list[Photo], tuple[str, ...]]:
     chosen = {photo.key for photo in photos}
     unposed += [photo.label for photo in listed if photo.key not in chosen]
     return photos, tuple(unposed)
-
-
-def _prior(path: Path, label: str, photo: Element, srs: str) -> tuple[str, FloatArray] | None:
-    """Return the SRS and the GNSS position of a photo."""
-    metadata, gps = photo.find("Pose/Metadata"), photo.find("ExifData/GPS")
-    if metadata is not None and metadata.find("Center") is not None:
-        place = _numbers(path, f"image {label}, Metadata", metadata, CENTRE)
-        return text_of(metadata, "SRSId") or srs, place
-    if gps is not None and all(gps.findtext(name) for name in DEGREES):
-        return EXIF, _numbers(path, f"image {label}, GPS", gps, DEGREES)
-    return None
 
 
 def _rotation(path: Path, label: str, pose: Element, axes: FloatArray) -> FloatArray | None:
@@ -245,12 +232,13 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     for match in TIE_POINTS.finditer(data):
         i = data.count(b"<Block>", 0, match.start()) - 1
         where, inside = path, match[1]
-        if (other := EXTERNAL.search(inside)) is not None:  # the points are in a file of their own
+        if other := re.search(rb"<Path>\s*([^<]*?)\s*</Path>", inside):  # in a file of their own
             plain = other[1].decode(errors="replace").replace("\\", "/")
             places = (path.parent / plain, path.parent / PureWindowsPath(plain).name)
             where = next((place for place in places if place.is_file()), places[0])
-            inside = DECLARATION.sub(b"", _read_bytes(where))
-        head = SRS_OF_ALL.search(inside[: inside.find(b"<TiePoint>")])
+            inside = re.sub(rb"<\?xml.*?\?>", b"", _read_bytes(where))
+        of_all = inside[: inside.find(b"<TiePoint>")]
+        head = re.search(rb"<SRSId>\s*([^<]*?)\s*</SRSId>", of_all)
         srs_of_all = text_of(blocks[i], "SRSId") if head is None else head[1].decode()
         with checks.reading(where):
             for _, element in iterparse(io.BytesIO(b"<All>" + inside + b"</All>")):
@@ -263,14 +251,12 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
                     is_known = place is not None and srs == photos[0].srs
                     point += [len(xyz)] * len(rows)
                     camera += rows
-                    uv += [
-                        [float(text_of(mark, axis)) + FIRST_PIXEL for axis in "xy"]
-                        for mark in marks
-                    ]
+                    uv += [[float(text_of(mark, axis)) for axis in "xy"] for mark in marks]
                     axes = [text_of(place, a) for a in "xyz"] if is_known else ["nan"] * 3
                     xyz.append([float(text) for text in axes])
                 element.clear()
     if not xyz:
         raise checks.no_tie_points(path, f"none was seen by one of its {len(cameras)} photos")
-    found = checks.Observations(np.array(xyz), np.array(point), np.array(camera), np.array(uv))
+    uv_px = np.array(uv) + FIRST_PIXEL
+    found = checks.Observations(np.array(xyz), np.array(point), np.array(camera), uv_px)
     return checks.tie_points(found)

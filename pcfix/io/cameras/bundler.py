@@ -43,18 +43,11 @@ from pcfix.lens.rotations import from_photogrammetric
 from pcfix.model import Cameras, FloatArray, TiePoints
 
 CONTENT = r"\A\s*(#\s*Bundle file v0\.3|drews 1\.0|NVM_V3)"
-BUNDLER, MVE, VISUALSFM = "Bundler", "MVE", "VisualSFM"
 _CAMERA_NUMBERS = 15
-_FOCAL_OF_LIST = re.compile(r"\s+0\s+[\d.]+$")
 _NVM = re.compile(r"NVM_V3(_R9T)?\b(?:\s*FixedK\s+(.*))?")
-_QUATERNION_NUMBERS, _MATRIX_NUMBERS = 10, 15
 _BEFORE_VIEWS = 7
 """Numbers of a point before its views: x, y, z, red, green, blue, count of views."""
-_FAR_PX = 5.0
-"""Larger than a median residual that any block has, smaller than half of any frame."""
 _LARGEST_PX = 1e6
-_LEAST_VIEWS = 10
-"""Views of one camera from which the middle of its frame is estimated."""
 
 
 class Model(NamedTuple):
@@ -68,7 +61,8 @@ class Model(NamedTuple):
     lenses: list[dict[str, float]]  # parameters; f is relative in files of MVE
     least_px: FloatArray
     points: Observations
-    software: str
+    is_mve: bool = False
+    is_nvm: bool = False
 
 
 def read(source: Source) -> Cameras:
@@ -77,7 +71,7 @@ def read(source: Source) -> Cameras:
     A size is that of the image, or else of the smallest frame, about the middle, that contains the
     tie points of all images.
     """
-    cameras, parameters, least_px, _, software = _model(source)
+    cameras, parameters, least_px, _, is_mve, is_nvm = _model(source)
     folder = source.path.parent
     sizes = np.array([checks.image_size(folder, one) or (0, 0) for one in cameras.labels], float)
     missing = sizes[:, 0] == 0
@@ -88,15 +82,17 @@ def read(source: Source) -> Cameras:
         sentence = f"the size of {missing.sum()} images is unknown; {width:.0f} x {height:.0f} px"
         sentence += " is estimated. Put the images next to the file."
         checks.warn(source.path, "cameras.frames_estimated", sentence, size_px=[width, height])
-    more = {"relative": software == MVE, "inverse": software == VISUALSFM}
-    pairs = zip(parameters, sizes.tolist(), strict=True)
-    return replace(cameras, lenses=tuple(lens_by_name(of, *size, **more) for of, size in pairs))
+    lenses = (
+        lens_by_name(given, *size, relative=is_mve, inverse=is_nvm)
+        for given, size in zip(parameters, sizes.tolist(), strict=True)
+    )
+    return replace(cameras, lenses=tuple(lenses))
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
     """Read the points of the largest model and where the images saw them."""
     model = _model(source)
-    if model.software == MVE:
+    if model.is_mve:
         raise checks.no_tie_points(source.path, "MVE writes no image coordinates")
     middles = [(one.principal_x, one.principal_y) for one in cameras.lenses or ()]
     uv = np.array(middles).reshape(-1, 2)[model.points.camera] + model.points.uv
@@ -121,7 +117,7 @@ def _model(source: Source) -> Model:
     kind = "view" if is_mve else "camera"
     unnamed = [f"{kind} {i}" for i in range(count)]
     found = next((some for some in named if len(some) == count), unnamed)
-    names = [_FOCAL_OF_LIST.sub("", name.strip()) for name in found]
+    names = [re.sub(r"\s+0\s+[\d.]+$", "", name.strip()) for name in found]  # no focal length
     rows, points, labels = _posed(path, rows, points, names)
     rotations = checks.rotations(path, labels, rows[:, 3:12])
     centres, least = checks.centres(rotations, rows[:, 12:]), np.zeros((len(rows), 2))
@@ -131,7 +127,7 @@ def _model(source: Source) -> Model:
         least = _least_frames(points, len(rows))
     given = [dict(zip(("f", "k1", "k2"), row, strict=True)) for row in rows[:, :3].tolist()]
     cameras = Cameras(labels, centres, rotations, unposed=tuple(sorted({*names} - {*labels})))
-    return Model(cameras, given, least, points, MVE if is_mve else BUNDLER)
+    return Model(cameras, given, least, points, is_mve)
 
 
 def _posed(
@@ -158,7 +154,7 @@ def _read_nvm(path: Path) -> Model:
     head, *lines = [x for line in read_lines(path) if (x := line.strip()) and x[0] != "#"]
     found = _NVM.match(head)
     matrix, stated = found.groups() if found else (None, None)
-    width = _MATRIX_NUMBERS if matrix else _QUATERNION_NUMBERS
+    width = 15 if matrix else 10
     fixed = dict(zip(("fx", "cx", "fy", "cy"), map(float, (stated or "").split()), strict=False))
     models: list[tuple[list[str], FloatArray, Observations]] = []
     at = 0
@@ -193,7 +189,7 @@ def _read_nvm(path: Path) -> Model:
     given = [{"f": f, "k1": k1} | fixed for f, k1 in rows[:, [0, -2]].tolist()]
     checks.warn_several(path, len(among), len(labels))
     cameras = Cameras(labels, centres, rotations, unposed=tuple(sorted(every - {*labels})))
-    return Model(cameras, given, least, points, VISUALSFM)
+    return Model(cameras, given, least, points, is_nvm=True)
 
 
 def _points(path: Path, body: FloatArray, count: int, images: int, width: int) -> Observations:
@@ -231,13 +227,14 @@ def _from_the_middle(
     expected = np.where(np.abs(expected) < _LARGEST_PX, expected, np.nan)
     known = np.isfinite(expected).all(axis=1)
     is_from_corner = ((seen >= 0.0) & (seen < _LARGEST_PX)).all() and known.any()
-    if not (is_from_corner and np.median(np.abs(seen - expected)[known]) > _FAR_PX):
+    # 5 px: more than the median residual of any block, less than half of any frame
+    if not (is_from_corner and np.median(np.abs(seen - expected)[known]) > 5.0):
         return points, _least_frames(points, len(focal))
     least = np.zeros((len(focal), 2))
     for f in np.unique(focal[image[known]]):  # OpenSfM's, from the corner
         rows = focal[image] == f
         here = rows & known
-        if here.sum() >= _LEAST_VIEWS:
+        if here.sum() >= 10:
             # seen = side / longer side (expected + longer side / 2); medians tolerate outliers
             half = np.median(seen[here] - expected[here], axis=0).max()
             frame = np.round(2.0 * half * np.median(seen[here] / (expected[here] + half), axis=0))

@@ -3,10 +3,9 @@
 Lenses are made of parameters by name, as all packages have the same few. Here they are called
 ``f``, or ``fx`` across and ``fy`` down the image; ``cx``, ``cy``, the principal point from the
 upper left corner of the image, or ``dx``, ``dy`` from its centre; ``skew`` and ``b3``, the affine
-terms off the diagonal; ``k1``, ...
-radial and ``d1``, ... in the denominator; ``p1``, ``p2``, ... in Brown's order, so OpenCV's p1 is
-``p2``; ``s1``, ... of thin prisms; and the parameters of a projection, see `SHAPES`.
-`pcfix.model.Lens` has the formulas.
+terms off the diagonal; ``k1``, ... radial and ``d1``, ... in the denominator; ``p1``, ``p2``, ...
+in Brown's order, so OpenCV's p1 is ``p2``; ``s1``, ... of thin prisms; and the parameters of a
+projection, see `SHAPES`. `pcfix.model.Lens` has the formulas.
 """
 
 from __future__ import annotations
@@ -295,11 +294,6 @@ class AffineFrame(NamedTuple):
         """Return points in `crs`."""
         return np.asarray(xyz @ self.matrix.T + self.shift)
 
-    def rotations(self, rotations: FloatArray) -> FloatArray:
-        """Return world to camera rotations in `crs`: the nearest ones, as the map scales a bit."""
-        u, _, v = np.linalg.svd(rotations @ np.linalg.inv(self.matrix))
-        return np.asarray(u @ v)
-
 
 # ---- lenses ----
 
@@ -311,8 +305,6 @@ SHAPES: Mapping[Projection, str] = {
     "dual": "transition",
 }
 LETTERS = {"radial": "k", "denominator": "d", "tangential": "p", "thin_prism": "s"}
-EXACT = 1e-11
-"""Of the image of a lens that is written, in focal lengths."""
 
 
 class LensModel(NamedTuple):
@@ -379,7 +371,7 @@ def model_of(
     for name in sorted(alike, key=lambda one: models[one].names.count(" ")):
         given = {one: values.get(one, 0.0) for one in models[name].names.split()}
         held = project(models[name].lens(given, lens.width, lens.height), rays)
-        if np.allclose(held, exact, rtol=0.0, atol=EXACT * lens.focal, equal_nan=True):
+        if np.allclose(held, exact, rtol=0.0, atol=1e-11 * lens.focal, equal_nan=True):
             return name, given
     kind = f"{lens.sensor or 'of the images'} ({lens.projection} in {lens.unit})"
     sentence = f"the format cannot hold the lens {kind} exactly. Use another format."

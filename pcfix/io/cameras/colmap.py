@@ -38,7 +38,6 @@ from pcfix.io.crs import is_topocentric
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, TiePoints
 from pcfix.options.declare import File
 
-_PART = re.compile(r"(cameras|images|points3D|rigs|frames)\.(bin|txt)")
 FILE, WRITER = "georeference.json", "pcfix"
 
 
@@ -79,7 +78,7 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
 def _models_at(path: Path) -> list[Path]:
     """Return the camera lists of the models in a folder or its ``sparse``, the largest first."""
     if not path.is_dir():
-        part = _PART.fullmatch(path.name)
+        part = re.fullmatch(r"(cameras|images|points3D|rigs|frames)\.(bin|txt)", path.name)
         listed = path.with_name(f"cameras.{part[2] if part else ''}")
         return [listed] if _is_model(listed) else []
     for folders in ([path], path.glob("[0-9]*"), [path / "sparse"], path.glob("sparse/[0-9]*")):
@@ -250,8 +249,6 @@ def read_points(path: Path) -> tuple[IntArray, FloatArray]:
 
 WRITTEN = {k: model for k, model in BY_NAME.items() if k not in ("SIMPLE_FISHEYE", "FISHEYE")}
 """Models that are written: older versions of COLMAP do not know the two others."""
-GREY = (128, 128, 128)
-ROUND_M = 100.0
 
 
 def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = None) -> None:
@@ -274,7 +271,7 @@ def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = 
             raise bad_file(target, "output.label", sentence, image=label)
     middle = np.median(cameras.centres, axis=0)
     middle[2] = 0.0  # heights are small numbers
-    offset = np.round(middle / ROUND_M) * ROUND_M
+    offset = np.round(middle / 100.0) * 100.0
     # COLMAP lists observations by image, and in tracks as number of the image and place in its list
     seen: list[list[tuple[list[float], int]]] = [[] for _ in cameras.labels]
     points = list[bytes]()
@@ -287,7 +284,8 @@ def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = 
             for image, uv in zip(images, tie_points.image_xy[views].tolist(), strict=True):
                 track += [image + 1, len(seen[image])]
                 seen[image].append((uv, number))
-            head = struct.pack("<Q3d3BdQ", number, *xyz[row], *GREY, 0.0, len(images))
+            grey = (128, 128, 128)
+            head = struct.pack("<Q3d3BdQ", number, *xyz[row], *grey, 0.0, len(images))
             points.append(head + struct.pack(f"<{len(track)}I", *track))
     number_of = {lens: i for i, lens in enumerate(dict.fromkeys(lenses), start=1)}
     listed = list[bytes]()

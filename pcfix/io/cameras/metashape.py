@@ -69,7 +69,7 @@ CONTENT = re.compile(  # a project, chunks or a chunk, after the declaration and
 def read(source: Source) -> Cameras:
     """Read the aligned images of a chunk: geocentric, or in a ``local`` frame."""
     chunk = open_chunk(source.path)
-    images, unposed = aligned_images(chunk)
+    images, unposed, is_placed = aligned_images(chunk)
     labels = tuple(image.label for image in images)
     in_world = np.array([image.place @ image.pose for image in images])
     turns, centres = in_world[:, :3, :3], in_world[:, :3, 3]
@@ -77,7 +77,14 @@ def read(source: Source) -> Cameras:
     rotations = np.ascontiguousarray((turns / scales).transpose(0, 2, 1))  # world to camera
     lens_of = {one: _lens(chunk.path, one) for one in dict.fromkeys(i.sensor for i in images)}
     lenses = tuple(lens_of[image.sensor] for image in images)
-    crs, project_crs = _world(chunk)
+    text, crs, project_crs = text_of(chunk.root, "reference"), LOCAL, None
+    if text and is_placed and not is_local(stated := parse_crs(text, str(chunk.path))):
+        # the geocentric CRS on the same datum; of WGS 84 it has the code 4978
+        axes = {"coordinate_system": type(stated)("EPSG:4978").to_json_dict()["coordinate_system"]}
+        datum = unbound(stated.geodetic_crs or stated).to_json_dict()
+        given = datum | axes | {"type": "GeodeticCRS", "id": None}
+        crs = crs_text(type(stated).from_json_dict({k: v for k, v in given.items() if v}))
+        project_crs = crs if stated.is_geocentric else text
     gnss = _gnss_positions(chunk, images)
     return Cameras(
         labels, centres, rotations, lenses, crs, project_crs=project_crs, gnss=gnss, unposed=unposed
@@ -157,14 +164,14 @@ class Image(NamedTuple):
     place: FloatArray
 
 
-def aligned_images(chunk: Document) -> tuple[list[Image], tuple[str, ...]]:
-    """Return the images of a chunk that are read, and the names of all others.
+def aligned_images(chunk: Document) -> tuple[list[Image], tuple[str, ...], bool]:
+    """Return the images of a chunk that are read, the names of all others, and `_places`'s flag.
 
     The others are not aligned, disabled (they took no part in the dense cloud), not of a central
     projection, or in a component without a transform. Keyframes of animations are no images.
     """
     path, element = chunk.path, chunk.root
-    places, _ = _places(path, element)
+    places, is_placed = _places(path, element)
     sensors = {sensor.get("id"): sensor for sensor in element.iterfind("sensors/sensor")}
     photos = {
         camera.get("id") or f"#{i}": camera
@@ -203,7 +210,7 @@ def aligned_images(chunk: Document) -> tuple[list[Image], tuple[str, ...]]:
         raise checks.no_pose(path, f"no image is aligned, or all are {why}")
     if unused:
         warn(path, "cameras.left_out", f"{unused} aligned images are skipped: {why}.")
-    return images, tuple(others)
+    return images, tuple(others), is_placed
 
 
 def _places(path: Path, chunk: Element) -> tuple[dict[str | None, FloatArray | None], bool]:
@@ -248,20 +255,6 @@ def _similarity(path: Path, element: Element | None) -> FloatArray | None:
     return matrix
 
 
-def _world(chunk: Document) -> tuple[str, str | None]:
-    """Return the frame that a chunk's transforms lead to, and its CRS if that is another."""
-    text = text_of(chunk.root, "reference")
-    has_place = bool(text) and _places(chunk.path, chunk.root)[1]
-    if not has_place or is_local(crs := parse_crs(text, str(chunk.path))):
-        return LOCAL, None
-    # the geocentric CRS on the same datum; of WGS 84 it has the code 4978
-    axes = {"coordinate_system": type(crs)("EPSG:4978").to_json_dict()["coordinate_system"]}
-    datum = unbound(crs.geodetic_crs or crs).to_json_dict()
-    given = datum | axes | {"type": "GeodeticCRS", "id": None}
-    frame = crs_text(type(crs).from_json_dict({k: v for k, v in given.items() if v}))
-    return frame, frame if crs.is_geocentric else text
-
-
 # ---- lenses ----
 
 
@@ -283,9 +276,8 @@ def name_of(element: Element) -> str:
 
 def _calibration(sensor: Element) -> Element | None:
     """Return the last adjusted calibration, else the last one."""
-    found = sensor.findall("calibration")
-    chosen = [one for one in found if one.get("class") == "adjusted"] or found
-    return chosen[-1] if chosen else None
+    found = sensor.findall("calibration[@class='adjusted']") or sensor.findall("calibration")
+    return found[-1] if found else None
 
 
 def _kind(sensor: Element) -> str:
@@ -313,17 +305,15 @@ def _calibrated(
     path: Path, sensor: str, kind: str, calibration: Element, size: list[float]
 ) -> Lens:
     """Return the lens of a calibration of a known kind, for an image of a size in pixels."""
-    given = {
-        entry.tag: number(path, f"sensor {sensor}, {entry.tag}", entry.text)
-        for entry in calibration
-        if entry.tag in PARAMETERS
-    }
-    value = defaultdict(float, given)
+    given = defaultdict[str, float](float)
+    for entry in calibration:
+        if entry.tag in PARAMETERS:
+            given[entry.tag] = number(path, f"sensor {sensor}, {entry.tag}", entry.text)
     if "f" in given:
-        given = given | {"fx": value["f"] + value["b1"], "skew": value["b2"]}
+        given |= {"fx": given["f"] + given["b1"], "skew": given["b2"]}
         given |= {"dx": given.pop("cx", 0.0), "dy": given.pop("cy", 0.0)}
     else:  # PhotoScan's
-        given |= {"fy": given.get("fy", value["fx"]), "p1": value["p2"], "p2": value["p1"]}
+        given |= {"fy": given.get("fy", given["fx"]), "p1": given["p2"], "p2": given["p1"]}
     return checks.lens_by_name(given, *size, projection=PROJECTIONS[kind], sensor=sensor)
 
 

@@ -38,9 +38,6 @@ from pcfix.model import Cameras, FloatArray, Lens
 
 PREFIX, PREFIX_2, SUFFIX = "Orientation-", "Ori-PerspCentral-", ".xml"
 CONTENT, INSIDE = "<OrientationConique|<NameInternalCalib>", rf"({PREFIX}|{PREFIX_2}).*\{SUFFIX}"
-UNIFIED = ("eModele_DRad_PPaEqPPs", "eModele_Fraser_PPaEqPPs")
-"""Of `ModUnif`: radial and Fraser's about the principal point; five k, P1, P2, b1, b2."""
-NO_DISTORTION = ("ModNoDist", "eModelePolyDeg0")
 NAMES = (*(f"k{i}" for i in range(1, 10)), "p1", "p2", "b1", "b2")
 _IS_INVERSE = {"": False, "eConvApero_DistM2C": False, "eConvApero_DistC2M": True}
 
@@ -98,12 +95,13 @@ def _calibration(path: Path, element: Element) -> Lens:
     principal, size = (numbers(path, tag, element.findtext(tag), 2) for tag in ("PP", "SzIm"))
     found = [model for entry in element.iter("CalibDistortion") for model in entry]
     named = [(text_of(model, "TypeModele") or str(model.tag), model) for model in found]
-    models = [(name, model) for name, model in named if name not in NO_DISTORTION]
+    models = [one for one in named if one[0] not in ("ModNoDist", "eModelePolyDeg0")]  # none
     if len(models) > 1:
         raise _not_held(path, " after ".join(name for name, _ in models))
     centre, given = principal, dict[str, float]()
     for name, model in models:
-        if name in UNIFIED:
+        # of ModUnif: radial and Fraser's about the principal point; five k, P1, P2, b1, b2
+        if name in ("eModele_DRad_PPaEqPPs", "eModele_Fraser_PPaEqPPs"):
             values = [number(path, "Params", e.text) for e in model.findall("Params")]
             if any(values[9:]):
                 raise damaged(path, f"{name} has {len(values)} Params instead of 9")

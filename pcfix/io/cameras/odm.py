@@ -54,22 +54,12 @@ SHOTS = "shots.geojson"
 RECONSTRUCTION = "reconstruction.json"
 TRANSFORMATION = "geocoords_transformation.txt"
 TOPOCENTRIC = "reconstruction.topocentric.json"
-TOPOCENTRIC_LIMIT_M = 1e5
-SCALE_TOLERANCE = 0.1
-"""Of the squared scale of a map projection, which excludes feet."""
-ROUNDING_M = 2e-3
-"""Newer ODM puts the origin at whole metres; reference_lla is rounded a little."""
-SAME_FOCAL = 1e-6
 GNSS_KEYS = ("longitude", "latitude", "altitude", "gps_xy_stddev", "gps_z_stddev")
-NO_GNSS = 999999.0
-"""The gps_dop that OpenSfM writes for an image without a position."""
 
 _FOLDERS = ("opensfm", "odm_georeferencing", "odm_georeferencing_25d", "odm_report")
 _OF_CRS = ("proj.txt", "coords.txt", "odm_georeferencing_model_geo.txt")
 _NAMES = (SHOTS, TRANSFORMATION, TOPOCENTRIC, "cameras.json", "images.json", *_OF_CRS)
-_SHOTS_HEAD = re.compile(
-    r'\s*\{.*"features"\s*:\s*\[.*"(translation|rotation|filename)"', re.DOTALL
-)
+_SHOTS_HEAD = re.compile(r'(?s)\s*\{.*"features"\s*:\s*\[.*"(translation|rotation|filename)"')
 _KEYS = "cameras|shots|points|pano_shots|reference_lla|biases|rig_cameras|rig_instances"
 _HEAD = re.compile(rf'\s*\[\s*\{{\s*"({_KEYS})"\s*:\s*\{{')
 Files = Mapping[str, Path]
@@ -90,10 +80,12 @@ def read(source: Source) -> Cameras:
         return _read_shots(files)
     own, _ = read_reconstruction(files["poses"])
     frame, (gnss, listed) = _frame(files, own), _read_images(files, own.labels)
+    # the nearest rotations, as the map scales a bit
+    u, _, v = np.linalg.svd(np.asarray(own.rotations) @ np.linalg.inv(frame.matrix))
     return replace(
         own,
         centres=frame.points(own.centres),
-        rotations=frame.rotations(np.asarray(own.rotations)),
+        rotations=u @ v,
         crs=frame.crs,
         project_crs=frame.project_crs,
         gnss=gnss or own.gnss,
@@ -159,7 +151,7 @@ def _frame(files: Files, own: Cameras) -> AffineFrame:
     located = _located(lon, lat, crs) if origin else None
     unmoved = AffineFrame(np.eye(3), np.zeros(3), own_crs, crs)
     if not (located or files.keys() & {*_OF_CRS, SHOTS, TOPOCENTRIC}):  # OpenSfM's own
-        is_far = np.abs(np.median(own.centres[:, :2], axis=0)).max() > TOPOCENTRIC_LIMIT_M
+        is_far = np.abs(np.median(own.centres[:, :2], axis=0)).max() > 1e5
         return unmoved._replace(crs=None) if is_far else unmoved
     if origin is None or files["poses"].name == TOPOCENTRIC:
         return unmoved
@@ -168,7 +160,8 @@ def _frame(files: Files, own: Cameras) -> AffineFrame:
             rows = [row.split()[:4] for row in read_lines(path) if row.strip()]
             matrix = np.array(rows, float).reshape(4, 4)
         turn, shift = matrix[:3, :3], matrix[:3, 3]
-        if not (np.abs(turn.T @ turn - np.eye(3)).max() <= SCALE_TOLERANCE):
+        # the squared scale of a map projection is within 0.1 of 1, that of feet is not
+        if not (np.abs(turn.T @ turn - np.eye(3)).max() <= 0.1):
             raise damaged(path, "it does not turn and shift the reconstruction")
         if named := _located(lon, lat, crs, shift[:2]):  # else the file is of another origin
             return AffineFrame(turn, shift, named[0])
@@ -207,7 +200,8 @@ def _located(
     zones = [f"EPSG:{first + (zone + step) % 60}" for step in (0, -1, 1)]
     for candidate in [crs] if crs else zones:
         there = _projected(candidate, np.array([[lon, lat]]))[0]
-        expected, within_m = (np.round(there), ROUNDING_M) if place is None else (place, 1.0)
+        # 2 mm, as reference_lla is rounded a little
+        expected, within_m = (np.round(there), 2e-3) if place is None else (place, 1.0)
         if np.linalg.norm(there - expected) < within_m:
             return candidate, expected
     return None
@@ -254,7 +248,7 @@ def _read_shots(files: Files) -> Cameras:
     for shot in each:
         plain = {"f": float(shot["focal"])}
         own = lens_by_name(plain, float(shot["width"]), float(shot["height"]), relative=True)
-        near = SAME_FOCAL * own.focal
+        near = 1e-6 * own.focal
         alike = [one for one in known.values() if abs(one.focal + one.b1 - own.focal) < near]
         found = known.get(str(shot.get("camera"))) or (alike[0] if len(alike) == 1 else own)
         bare += found is own
@@ -324,7 +318,7 @@ def read_reconstruction(path: Path) -> tuple[Cameras, dict[str, Any]]:
         places = {}
         for label, shot in shots.items():
             position, dop = shot.get("gps_position"), shot.get("gps_dop")
-            if position is not None and dop != NO_GNSS:
+            if position is not None and dop != 999999.0:  # which stands for no position
                 places[label] = position, [np.nan if dop is None else dop] * 3
         origin, other = chosen.get("reference_lla"), path.with_name("reference_lla.json")
         if origin is None and other.is_file() and other.read_bytes()[:100].lstrip()[:1] == b"{":

@@ -35,7 +35,6 @@ from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import Cameras, GnssPositions, Lens, TiePoints
 
 FORMAT = "application/opf-{}+json"
-PROJECT = FORMAT.format("project")
 CONTENT = '"application/opf-|"orientation_deg"'
 INSIDE = r".*\.opf"
 INTERNALS = {
@@ -109,7 +108,7 @@ class Project(NamedTuple):
 def _open_project(path: Path) -> Project:
     """Read the project at a path, in a folder, or that a part belongs to."""
     content = {} if path.is_dir() else load_json(path)
-    if content.get("format") != PROJECT:
+    if content.get("format") != FORMAT.format("project"):
         folders = [path] if path.is_dir() else [*path.resolve().parents][:2]
         found = [one for folder in folders for one in sorted(folder.glob("*.opf"))]
         if len(found) != 1:
@@ -181,8 +180,6 @@ def _gnss(path: Path, captures: list[Part], ids: list[int]) -> GnssPositions | N
 
 
 COMPONENTS = {"5121": "u1", "5123": "<u2", "5125": "<u4", "5126": "<f4"}
-MATCHES = "OPF_mesh_primitive_matches"
-OFFSET_BITS = 40
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:
@@ -197,9 +194,11 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
             for node in model.get("nodes", []):
                 matrix = np.array(node.get("matrix", np.eye(4).ravel()), float).reshape(4, 4).T
                 for primitive in model["meshes"][node["mesh"]]["primitives"]:
-                    matches = primitive.get("extensions", {}).get(MATCHES, {})
+                    extensions = primitive.get("extensions", {})
+                    matches = extensions.get("OPF_mesh_primitive_matches", {})
                     if "pixelCoordinates" in matches.get("imagePoints", {}):
-                        seen = _matches(path, model, primitive, row_of)
+                        place = primitive["attributes"]["POSITION"]
+                        seen = _matches(path, model, place, matches, row_of)
                         x, y, z = (seen.xyz @ matrix[:3, :3].T + matrix[:3, 3]).T
                         xyz = frame.points(np.column_stack([x, -z, y]))  # the model has y up
                         found.append(seen._replace(xyz=xyz))
@@ -209,16 +208,15 @@ def tie_points(source: Source, cameras: Cameras) -> TiePoints:
 
 
 def _matches(
-    path: Path, model: Part, primitive: Part, row_of: dict[int, int]
+    path: Path, model: Part, place: int, matches: Part, row_of: dict[int, int]
 ) -> checks.Observations:
     """Return the points of a primitive, in the axes of its node, and their observations."""
-    matches = primitive["extensions"][MATCHES]
-    xyz = _accessor(path, model, primitive["attributes"]["POSITION"], 3).astype(np.float64)
+    xyz = _accessor(path, model, place, 3).astype(np.float64)
     uv = _accessor(path, model, matches["imagePoints"]["pixelCoordinates"], 2).astype(np.float64)
     ranges = _accessor(path, model, matches["pointIndexRanges"], 2)
     packed = ranges.astype("<u4").view("<u8")[:, 0]
-    first = (packed & np.uint64(2**OFFSET_BITS - 1)).astype(np.int64)
-    count = (packed >> np.uint64(OFFSET_BITS)).astype(np.int64)
+    first = (packed & np.uint64(2**40 - 1)).astype(np.int64)
+    count = (packed >> np.uint64(40)).astype(np.int64)
     index = _accessor(path, model, matches["cameraIds"], 1)[:, 0].astype(np.int64)
     rows = np.array([row_of.get(i, -1) for i in matches["cameraUids"]], np.int64)
     if (first + count > len(index)).any() or len(count) > len(xyz):

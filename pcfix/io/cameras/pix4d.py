@@ -34,9 +34,8 @@ from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import Cameras, FloatArray, Lens, TiePoints
 
-PARAMETERS = "calibrated_camera_parameters.txt"
 NAMES = {
-    "parameters": PARAMETERS,
+    "parameters": "calibrated_camera_parameters.txt",
     "external": "calibrated_external_camera_parameters.txt",
     "offset": "offset.xyz",
     "wkt": "wkt.prj",
@@ -50,8 +49,6 @@ HEADER = re.compile(
     r" omega phi kappa)\s*?$",
     re.MULTILINE,
 )
-FOLDERS = ("", "params/", "1_initial/params/", "*/params/", "*/1_initial/params/")
-"""Folders of the files, seen from the folder of a project."""
 FIELDS = {
     "camera matrix": "fx skew cx b3 fy cy - - -",
     "radial": "k1 k2 k3",
@@ -63,7 +60,6 @@ FIELDS = {
     "rotation": "rotation",
 }
 """Words in the header of the camera parameters, and the names of the numbers in `checks`."""
-SHAPE = re.compile(r"^(.*?)\s*\[\s*(\d{1,2})\s*x\s*(\d{1,2})\s*\]\s*$")
 
 
 def recognises(source: Source) -> bool:
@@ -98,12 +94,11 @@ def read(source: Source) -> Cameras:
                 rows.append(rows_of[name].pop(int(np.argmin(off))) if len(off) else -1)
             posed = [i for i in posed if rows[i] >= 0]
             if not posed:
-                raise damaged(path, f"names none of the images of {PARAMETERS}")
+                raise damaged(path, f"names none of the images of {NAMES['parameters']}")
             centres, rotations = (each[rows][posed] for each in (centres, rotations))
     else:
         labels, rotations = names, turns
-        centres = np.array([image.centre for image in images]).reshape(-1, 3)
-        centres += _offset(files)
+        centres = np.array([image.centre for image in images]).reshape(-1, 3) + _offset(files)
     every = dict.fromkeys([*names, *labels])
     labels = [names[i] for i in posed] or labels
     unposed = tuple(name for name in every if name not in set(labels))
@@ -142,7 +137,7 @@ def _tables_in(root: Path) -> list[tuple[Path, str]]:
     """Return folders with tables of poses, and the name of the project before that of each."""
     return [
         (file.parent, found[1])
-        for inside in FOLDERS
+        for inside in ("", "params/", "1_initial/params/", "*/params/", "*/1_initial/params/")
         for file in sorted(root.glob(f"{inside}*.txt"))
         if (found := TABLE.fullmatch(file.name)) and not found[2]
     ]
@@ -178,7 +173,7 @@ def read_parameters(path: Path) -> list[Image]:
     lines = [line for line in read_lines(path) if line.strip()]
     layout, row = [], 1
     for i, line in enumerate(lines[:20], start=1):
-        if shape := SHAPE.match(line):
+        if shape := re.match(r"(.*?)\s*\[\s*(\d{1,2})\s*x\s*(\d{1,2})\s*\]\s*$", line):
             words = shape[1].lower()
             name = next((name for word, name in FIELDS.items() if word in words), "")
             layout.append((name, int(shape[2]) * int(shape[3])))

@@ -90,9 +90,8 @@ def recognises(source: Source) -> bool:
     if text[:1] in ("", "<", "{") or "\0" in text:
         return False
     lines = text.splitlines()
-    if lines[0].lower().startswith("# coordinatesystem:"):  # it may fill the head
-        return True
-    return is_geo(lines) or has_header(lines)
+    is_crs = lines[0].lower().startswith("# coordinatesystem:")  # it may fill the head
+    return is_crs or is_geo(lines) or has_header(lines)
 
 
 def has_header(lines: list[str]) -> bool:
@@ -137,10 +136,8 @@ def read(source: Source) -> Cameras:
     return Cameras(labels, xyz, turns, known, system, gnss=gnss, unposed=tuple(unposed))
 
 
-WGS84, WGS84_ELLIPSOIDAL = "EPSG:4326", "EPSG:4979"
 GEO = ("label", "x", "y", "z", "yaw", "pitch", "roll", "accuracy_horz", "accuracy_vert")
 """Fields of ODM's geo.txt, the last six optional; more may follow."""
-_GEO_CRS = re.compile(r"(EPSG:\d+|\+proj=.+|WGS84 UTM \d\d?\s*[NS])\s*", re.IGNORECASE)
 
 
 def open_table(path: Path) -> Table:
@@ -151,8 +148,7 @@ def open_table(path: Path) -> Table:
         rows = [[*fields, *[""] * len(GEO)][: len(GEO)] for _, fields in split]
         place = {name: GEO.index(name) for name in ("label", "x", "y", "z")}
         place |= {"sigma_x": 7, "sigma_y": 7, "sigma_z": 8}  # its angles may be 0 for unknown
-        numbers, units = [i for i, _ in split], [""] * len(GEO)
-        return Table(path, [*GEO], rows, numbers, place, units, crs=lines[0].strip())
+        return Table(path, [*GEO], rows, [i for i, _ in split], place, crs=lines[0].strip())
     kinds = [("label", *three) for three in (*AXES, ("x_est", "y_est", "z_est"))]
     table = tables.read_table(path, *kinds, spellings=SPELLINGS)
     for role, spellings in SPELLINGS.items():  # a column with the role's own name counts
@@ -172,8 +168,7 @@ def gnss_positions(columns: Table) -> GnssPositions | None:
         return None
     xyz = centres(columns)
     if columns.has("enable"):
-        off = [text == "0" for text in columns.column("enable")]
-        xyz[off] = np.nan
+        xyz[[text == "0" for text in columns.column("enable")]] = np.nan
     sigma = columns.where_there(("sigma_x", "sigma_y", "sigma_z"))
     return GnssPositions(xyz, sigma, crs(columns)[0])
 
@@ -200,7 +195,7 @@ def crs(columns: Table) -> tuple[str | None, str]:
         if axes(columns.place) != ("longitude", "latitude", "z"):
             return None, ""
         ellipsoidal = columns.name("z").startswith("ellipsoid")
-        return WGS84_ELLIPSOIDAL if ellipsoidal else WGS84, ""
+        return "EPSG:4979" if ellipsoidal else "EPSG:4326", ""
     try:
         return checks.crs(columns.path, columns.crs), ""
     except InputError:
@@ -209,21 +204,18 @@ def crs(columns: Table) -> tuple[str | None, str]:
 
 def is_geo(lines: list[str]) -> bool:
     """Whether these lines are a CRS and then images, not control points."""
-    if not lines or not _GEO_CRS.fullmatch(lines[0]):
+    if not re.fullmatch(r"(?i)(EPSG:\d+|\+proj=.+|WGS84 UTM \d\d?\s*[NS])\s*", [*lines, ""][0]):
         return False
     first = next((line.split() for line in lines[1:] if line.strip()), [])
     return len(first) >= 3 and np.isnan(tables.number(first[0]))
 
 
+OMEGA_PHI_KAPPA, YAW_PITCH_ROLL = ("omega", "phi", "kappa"), ("yaw", "pitch", "roll")
 CONVERSIONS = {
-    "omega-phi-kappa": (("omega", "phi", "kappa"), rotations.from_omega_phi_kappa),
-    "yaw-pitch-roll": (("yaw", "pitch", "roll"), rotations.from_yaw_pitch_roll),
-    "aircraft": (("yaw", "pitch", "roll"), rotations.from_aircraft),
+    "omega-phi-kappa": rotations.from_omega_phi_kappa,
+    "yaw-pitch-roll": rotations.from_yaw_pitch_roll,
+    "aircraft": rotations.from_aircraft,
 }
-OMEGA_PHI_KAPPA, YAW_PITCH_ROLL, _ = (roles for roles, _ in CONVERSIONS.values())
-LARGEST_DEG = 360.0
-LOOKS_DOWN = 0.17
-"""Least cosine of the tilt, about 80 degrees, of a camera that looks at the ground."""
 
 
 def _rotations(columns: Table, angles: Angles | None) -> FloatArray | None:
@@ -232,22 +224,21 @@ def _rotations(columns: Table, angles: Angles | None) -> FloatArray | None:
     `angles` is their kind if the user sets it. Otherwise the header decides, or the assumption that
     the cameras look down at the ground.
     """
-    path, wanted = columns.path, CONVERSIONS[angles][0] if angles else ()
-
-    def unclear(sentence: str) -> InputError:
-        return bad_file(path, "cameras.angles", sentence)
-
+    path, wanted = columns.path, tuple[str, ...]()
+    if angles is not None:
+        wanted = OMEGA_PHI_KAPPA if angles == "omega-phi-kappa" else YAW_PITCH_ROLL
     for kind in (OMEGA_PHI_KAPPA, YAW_PITCH_ROLL, QUATERNION, MATRIX):
         missing = [role for role in kind if not columns.has(role)]
         if len(missing) < len(kind) or kind == wanted:
             tables.check_columns(path, columns.header, kind, missing)
     if angles is not None:
-        return CONVERSIONS[angles][1](*_degrees(columns, wanted))
+        return CONVERSIONS[angles](*_degrees(columns, wanted))
     if columns.has(*OMEGA_PHI_KAPPA):
         reality_capture = columns.after_hash and columns.name("label") == "name"
         if columns.place["phi"] < columns.place["omega"] or reality_capture:
             sentence = "omega, phi, kappa may be turns in another order here. Export heading,"
-            raise unclear(f"{sentence} pitch, roll, or give --angles omega-phi-kappa.")
+            sentence += " pitch, roll, or give --angles omega-phi-kappa."
+            raise bad_file(path, "cameras.angles", sentence)
         return rotations.from_omega_phi_kappa(*_degrees(columns, OMEGA_PHI_KAPPA))
     if columns.has(*QUATERNION):
         return checks.quaternions(path, columns.labels, columns.of(QUATERNION))
@@ -255,7 +246,8 @@ def _rotations(columns: Table, angles: Angles | None) -> FloatArray | None:
         found = checks.rotations(path, columns.labels, columns.of(MATRIX))
         back_is_up = found[:, 2, 2] > 0.0
         if back_is_up.any() and not back_is_up.all():
-            raise unclear("r33 has both signs, so the axes are not clear. Give omega, phi, kappa.")
+            sentence = "r33 has both signs, so the axes are not clear. Give omega, phi, kappa."
+            raise bad_file(path, "cameras.angles", sentence)
         return rotations.from_photogrammetric(found) if back_is_up.all() else found
     if not columns.has(*YAW_PITCH_ROLL):
         return None
@@ -265,17 +257,19 @@ def _rotations(columns: Table, angles: Angles | None) -> FloatArray | None:
         return gimbal
     down, other = -found[:, 2, 2], -gimbal[:, 2, 2]  # cosines of the tilt from straight down
     reality_capture = columns.after_hash and columns.name("yaw") == "heading"
-    is_likely = other.min() > LOOKS_DOWN and np.median(other) > np.median(down)
+    # a camera that looks at the ground is tilted by at most 80 degrees
+    is_likely = other.min() > 0.17 and np.median(other) > np.median(down)
     if is_likely and not reality_capture:
         sentence = "yaw, pitch, roll are likely those of a gimbal. Give --angles aircraft, or"
-        raise unclear(f"{sentence} --angles yaw-pitch-roll.")
+        sentence += " --angles yaw-pitch-roll."
+        raise bad_file(path, "cameras.angles", sentence)
     return found
 
 
 def _degrees(columns: Table, roles: tuple[str, ...]) -> FloatArray:
     """Return angles, shape (3, k), none of which is larger than a full turn."""
     values = columns.of(roles)
-    for i, k in np.argwhere(np.abs(values) > LARGEST_DEG)[:1].tolist():
+    for i, k in np.argwhere(np.abs(values) > 360.0)[:1].tolist():
         name, value = columns.name(roles[k]), float(values[i, k])
         sentence = f"{name} = {value:g} is no angle in degrees. Name its unit, as in {name}[gon] or"
         sentence += f" {name}[rad], or check the columns."
@@ -288,10 +282,9 @@ def _degrees(columns: Table, roles: tuple[str, ...]) -> FloatArray:
 
 MILLIMETRES = ("focal", "sensor_x", "sensor_y")
 PIXELS = ("focal_px", "width_px", "height_px")
-OPENCV_NAMES = {"d1": "k4", "d2": "k5", "d3": "k6", "p2": "p1", "p1": "p2"}
-"""What OpenCV calls the parameters that have another name in `checks`."""
-OPENCV = {"OpenCV": LensModel("f cx cy k1 k2 k3 d1 d2 d3 p2 p1")}
-TERMS = OPENCV["OpenCV"].names.split()[1:]
+OPENCV = LensModel("f cx cy k1 k2 k3 d1 d2 d3 p2 p1")
+TERMS = ("cx", "cy", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+"""What OpenCV calls the parameters of `OPENCV` after the focal length."""
 FILM_MM = 36.0
 """Larger side of the film that 35 mm focal lengths mean."""
 
@@ -318,27 +311,22 @@ def read_sensor(path: Path) -> Lens:
         from pcfix.io.cameras.metashape import read_calibration
 
         return checks.lens(path, path.stem, read_calibration(path))
-    names = (*MILLIMETRES, *PIXELS, *(OPENCV_NAMES.get(one, one) for one in TERMS))
-    table = tables.read_table(
-        path, MILLIMETRES, PIXELS, spellings={name: (name,) for name in names}
-    )
+    spellings = {name: (name,) for name in (*MILLIMETRES, *PIXELS, *TERMS)}
+    table = tables.read_table(path, MILLIMETRES, PIXELS, spellings=spellings)
     if len(table.rows) != 1:
         sentence = f"has {len(table.rows)} rows. Give one row for all images."
         raise bad_file(path, "cameras.sensor_rows", sentence, rows=len(table.rows))
     is_px = table.has(*PIXELS)
-    (focal, width, height), given = table.of(PIXELS if is_px else MILLIMETRES)[0].tolist(), {}
-    if is_px:
-        values = table.where_there(OPENCV_NAMES.get(one, one) for one in TERMS)[0].tolist()
-        given = {one: v for one, v in zip(TERMS, values, strict=True) if not math.isnan(v)}
-    lens = lens_by_name({"f": focal} | given, width, height, unit="px" if is_px else "mm")
+    focal, width, height = table.of(PIXELS if is_px else MILLIMETRES)[0].tolist()
+    terms = table.where_there(TERMS)[0].tolist() if is_px else []
+    given = zip(OPENCV.names.split(), [focal, *terms], strict=False)
+    stated = {name: value for name, value in given if not math.isnan(value)}
+    lens = lens_by_name(stated, width, height, unit="px" if is_px else "mm")
     checks.lens(path, path.stem, lens)
     if not all(0.25 < at < 0.75 for at in (lens.principal_x / width, lens.principal_y / height)):
         sentence = "cx, cy is far from the centre. Give pixels from the upper left corner."
         raise bad_file(path, "cameras.principal_point", sentence)
     return lens
-
-
-WRITTEN = ("label", "x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 def write_table(folder: File, cameras: Cameras) -> None:
@@ -361,17 +349,18 @@ def write_table(folder: File, cameras: Cameras) -> None:
         sentence = f"a table has one lens, but the images have {1 + len(others)}. Use another"
         raise bad_file(target, "output.lens", f"{sentence} format.")
     is_px = given.unit == "px"
-    _, values = model_of(target, given, OPENCV if is_px else {"centred": LensModel("f")})
-    frame = (values.pop("f"), given.width, given.height)
-    sensor = dict(zip(PIXELS if is_px else MILLIMETRES, map(float, frame), strict=True))
-    sensor |= {OPENCV_NAMES.get(name, name): float(value) for name, value in values.items()}
+    _, values = model_of(target, given, {"": OPENCV if is_px else LensModel("f")})
+    focal, *terms = map(float, values.values())
+    header = (*PIXELS, *TERMS) if is_px else MILLIMETRES
+    sensor = focal, float(given.width), float(given.height), *terms
     poses = np.column_stack([cameras.centres, turns]).tolist()
     has_crs = cameras.crs is not None and cameras.crs.strip().lower() != "local"
     comment = f"# CoordinateSystem: {' '.join((cameras.crs or '').split())}\n" if has_crs else ""
+    names = ("label", "x", "y", "z", *QUATERNION)
     rows = [[label, *row] for label, row in zip(cameras.labels, poses, strict=True)]
     contents = {
-        "cameras.csv": comment.encode() + _csv(WRITTEN, *rows),
-        "sensor.csv": _csv(sensor, sensor.values()),
+        "cameras.csv": comment.encode() + _csv(names, *rows),
+        "sensor.csv": _csv(header, sensor),
     }
     checks.write_new(target, contents)
 
