@@ -17,8 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.clean.neighbours import Tiles as PointTiles
-from pcfix.clean.neighbours import make_tiles, spacing_m
 from pcfix.errors import bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
 from pcfix.grid.heights import fill_holes, grid_window, margin_cells
@@ -33,6 +31,8 @@ from pcfix.io.tiles import CloudFiles, Clouds, cloud_of, inputs_of, open_cloud
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, FloatArray
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules
+from pcfix.points.neighbours import Tiles as PointTiles
+from pcfix.points.neighbours import make_tiles, spacing_m
 from pcfix.report.styles import raster_style
 from pcfix.running import bounds, empty, release
 from pcfix.sums import Figures

@@ -29,7 +29,7 @@ def grid_window(
 
     Points, shape (n, 3), are all that decide on it, or more: x and y, world frame, metres, and the
     height or another quantity. `reach`, the diameter of the widest circle around a triangle of the
-    TIN, and `spacing` of the points (see `pcfix.clean.neighbours`) are in cells. The bands have the
+    TIN, and `spacing` of the points are in cells. The bands have the
     shape of the window, NaN if unknown.
     """
     shape = window.height, window.width
