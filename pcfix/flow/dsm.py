@@ -19,8 +19,14 @@ import numpy as np
 
 from pcfix.errors import bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
-from pcfix.grid.heights import fill_holes, grid_window, margin_cells
-from pcfix.grid.lattice import Lattice, lattice_over, round_resolution
+from pcfix.grid.lattice import (
+    Lattice,
+    fill_holes,
+    grid_window,
+    lattice_over,
+    margin_cells,
+    round_resolution,
+)
 from pcfix.io import rasters
 from pcfix.io.crs import crs_words, parts
 from pcfix.io.files import all_or_none, check_output, scratch_arrays, write_text

@@ -17,8 +17,7 @@ from pcfix.flow.run_folder import SURFACE, RunFolder
 from pcfix.flow.runner import Progress
 from pcfix.flow.surfaces import file_points, view_of
 from pcfix.grid.lattice import Lattice, Window, round_resolution
-from pcfix.grid.maps import contours, depth_interval, hillshade, relief_colours
-from pcfix.grid.shoreline import NearWater
+from pcfix.grid.maps import NearWater, contours, depth_interval, hillshade, relief_colours
 from pcfix.io import rasters
 from pcfix.io.crs import crs_words
 from pcfix.io.files import read_json, sha256, write_bytes, write_text
@@ -203,7 +202,7 @@ def waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Layer
         above[bed] = -known["WaterDepth"][bed]
         above[~points.counts()] = np.nan
         near += NearWater.of(points.xyz, above, known["SigmaZ"])
-    lines = near.lines(lambda xy: np.full(len(xy), sigma_m))
+    lines = near.lines(sigma_m)
     values = {
         figure: np.array([getattr(one, figure) for one in lines], np.float64)
         for figure in ("level_m", "sigma_m", "length_m")
