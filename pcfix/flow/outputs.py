@@ -15,9 +15,9 @@ from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
 from pcfix.flow.raster import raster_writer
 from pcfix.flow.run_folder import SURFACE, RunFolder
 from pcfix.flow.runner import Progress
-from pcfix.flow.surfaces import file_points, view_of
+from pcfix.flow.surfaces import Points, file_points, view_of
 from pcfix.grid.lattice import Lattice, Window, round_resolution
-from pcfix.grid.maps import NearWater, contours, depth_interval, hillshade, relief_colours
+from pcfix.grid.maps import contours, depth_interval, hillshade, relief_colours, waterlines
 from pcfix.io import rasters
 from pcfix.io.crs import crs_words
 from pcfix.io.files import read_json, sha256, write_bytes, write_text
@@ -194,15 +194,18 @@ def waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Layer
 
     `sigma_m` is that of the height of the water.
     """
-    near = NearWater()
-    for points in file_points(cloud, water, ("WaterDepth", "SigmaZ")):
+
+    def columns(points: Points) -> FloatArray:
+        """Return x, y, z, height above the water, and standard error of points."""
         known = points.dimensions or {}
         above = points.xyz[:, 2] - surface_above(water, points.xyz, points.heights).height_m
         bed = points.classes == BATHYMETRIC_POINT
         above[bed] = -known["WaterDepth"][bed]
         above[~points.counts()] = np.nan
-        near += NearWater.of(points.xyz, above, known["SigmaZ"])
-    lines = near.lines(sigma_m)
+        return np.column_stack([points.xyz, above, known["SigmaZ"]])
+
+    chunks = file_points(cloud, water, ("WaterDepth", "SigmaZ"))
+    lines = waterlines(map(columns, chunks), sigma_m)
     values = {
         figure: np.array([getattr(one, figure) for one in lines], np.float64)
         for figure in ("level_m", "sigma_m", "length_m")

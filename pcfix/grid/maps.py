@@ -10,6 +10,7 @@ error in height moves it by the error over the slope of the bed.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -156,60 +157,41 @@ class Waterline:
     length_m: float  # in plan
 
 
-@dataclass(frozen=True)
-class NearWater:
-    """Points of a cloud near the height of the water; those of two parts of it are added with +."""
+def waterlines(chunks: Iterable[FloatArray], sigma_level_m: float) -> list[Waterline]:
+    """Return where a cloud meets the water, the longest line first; several for islands and pools.
 
-    parts: tuple[FloatArray, ...] = ()  # (n, 5) each: x, y, z, height above the water, sigma
-    every: int = 1  # one point in this number is used
+    Chunks of points have the shape (n, 5): x, y, z, world frame, metres; the height above the water
+    surface, NaN if unknown; and the standard error of z, zero if unknown. `sigma_level_m` is the
+    standard error of the water's height.
+    """
+    from contourpy import contour_generator
 
-    @classmethod
-    def of(cls, xyz: FloatArray, above_m: FloatArray, sigma_z_m: FloatArray) -> NearWater:
-        """Return those of n points, shape (n, 3), world frame, metres.
-
-        `above_m` is the height above the water surface, NaN if unknown, and `sigma_z_m` the
-        standard error of the heights, zero if unknown; both have the shape (n,).
-        """
-        rows = np.flatnonzero(np.abs(above_m) <= 2.0)  # metres
-        return cls((np.column_stack([xyz, above_m, sigma_z_m])[rows],))
-
-    def __add__(self, other: NearWater) -> NearWater:
-        """Return the points of both; every second is dropped while there are too many."""
-        every = max(self.every, other.every)
-        parts = [part[:: every // one.every] for one in (self, other) for part in one.parts]
-        while sum(map(len, parts)) > MOST_POINTS:
-            parts, every = [part[::2] for part in parts], 2 * every
-        return NearWater(tuple(parts), every)
-
-    def lines(self, sigma_level_m: float) -> list[Waterline]:
-        """Return the lines, the longest first; several if there are islands or pools.
-
-        `sigma_level_m` is the standard error of the water's height.
-        """
-        from contourpy import contour_generator
-
-        points = np.concatenate([np.empty((0, 5)), *self.parts])
-        if not len(points) or not points[:, 3].min() < 0.0 < points[:, 3].max():
-            return []
-        field = _field_of(points, _cell_m(points[:, :2]))
-        wanted_m = math.sqrt(2.0 / 7.0 * field.blur_m * field.cell_m)
-        if wanted_m > field.cell_m:  # so that the line's own scatter is half a cell
-            field = _field_of(points, wanted_m)
-        maker = contour_generator(z=np.ma.masked_invalid(field.above_m))
-        found = []
-        for line in maker.lines(0.0):
-            xy = field.low + np.asarray(line) * field.cell_m
-            # the standard error of the heights over the slope, rms along the line
-            slope = np.maximum(np.nan_to_num(_at(field, field.slope, xy)), FLATTEST)
-            height_m = np.hypot(sigma_level_m, _at(field, field.sigma_z_m, xy))
-            step = np.hypot(*np.diff(xy, axis=0).T)
-            weight = np.append(step, 0.0) + np.append(0.0, step)
-            sigma = math.sqrt(float(np.average((height_m / slope) ** 2, weights=weight)))
-            level = float(np.nanmean(_at(field, field.water_m, xy)))
-            found.append(Waterline(xy, level, sigma, float(step.sum())))
-        least_m = 12.0 * field.cell_m  # shorter lines are noise
-        long = [one for one in found if one.length_m >= max(least_m, 4.0 * one.sigma_m)]
-        return sorted(long, key=lambda one: -one.length_m)
+    near, every = [np.empty((0, 5))], 1
+    for chunk in chunks:
+        near.append(chunk[np.abs(chunk[:, 3]) <= 2.0][::every])  # metres
+        while sum(map(len, near)) > MOST_POINTS:
+            near, every = [part[::2] for part in near], 2 * every
+    points = np.concatenate(near)
+    if not len(points) or not points[:, 3].min() < 0.0 < points[:, 3].max():
+        return []
+    field = _field_of(points, _cell_m(points[:, :2]))
+    wanted_m = math.sqrt(2.0 / 7.0 * field.blur_m * field.cell_m)
+    if wanted_m > field.cell_m:  # so that the line's own scatter is half a cell
+        field = _field_of(points, wanted_m)
+    found = []
+    for line in contour_generator(z=np.ma.masked_invalid(field.above_m)).lines(0.0):
+        xy = field.low + np.asarray(line) * field.cell_m
+        # the standard error of the heights over the slope, rms along the line
+        slope = np.maximum(np.nan_to_num(_at(field, field.slope, xy)), FLATTEST)
+        height_m = np.hypot(sigma_level_m, _at(field, field.sigma_z_m, xy))
+        step = np.hypot(*np.diff(xy, axis=0).T)
+        weight = np.append(step, 0.0) + np.append(0.0, step)
+        sigma = math.sqrt(float(np.average((height_m / slope) ** 2, weights=weight)))
+        level = float(np.nanmean(_at(field, field.water_m, xy)))
+        found.append(Waterline(xy, level, sigma, float(step.sum())))
+    least_m = 12.0 * field.cell_m  # shorter lines are noise
+    long = [one for one in found if one.length_m >= max(least_m, 4.0 * one.sigma_m)]
+    return sorted(long, key=lambda one: -one.length_m)
 
 
 def _cell_m(xy: FloatArray) -> float:
