@@ -8,7 +8,7 @@ import pytest
 import shapely
 
 import pcfix
-from pcfix.flow.outputs import waterline
+from pcfix.flow.run_folder import waterline
 from pcfix.grid import maps
 from pcfix.grid.maps import waterlines
 from pcfix.io.scenes import write_scene
