@@ -105,14 +105,13 @@ def grid_dsm(
             crs, count = metric_crs(source), len(source)
             corrected = any(is_ours(vlr) for vlr in source.vlrs)
             used = _points_of(source, rules, report)
-            if given.resolution is None:
-                cell_m = round_resolution(_spacing_m(source, used))
-                rules = replace(rules, resolution=cell_m)
-            gap_m = _spacing_m(source, used, rules.cell_m)
-        lattice = lattice_over(*bounds(used[:, :2]), rules.cell_m, str(task.source))
+            cell_m = rules.resolution or round_resolution(_spacing_m(source, used))
+            rules = replace(rules, resolution=cell_m)
+            gap_m = _spacing_m(source, used, cell_m)
+        lattice = lattice_over(*bounds(used[:, :2]), cell_m, str(task.source))
         tiles = make_tiles(used, points=BIN_POINTS)
         # diameter of the widest circle around a triangle of a TIN
-        reach_m = max(5.0 * gap_m, 3.0 * rules.cell_m, rules.fill or 0.0)
+        reach_m = max(5.0 * gap_m, 3.0 * cell_m, rules.fill or 0.0)
         paths = {"dsm": task.target, **more}
         tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
         counted = _write_rasters(tiles, lattice, reach_m, gap_m, rules, paths, crs, tags, report)
@@ -157,7 +156,7 @@ def _write_rasters(
 
     Returns the numbers of cells and the statistics of their values, by their names in the summary.
     """
-    size_m, method = rules.cell_m, rules.method
+    size_m, method = lattice.resolution_m, rules.method
     reach, spacing = reach_m / size_m, gap_m / size_m
     # the number of cells around a window whose points decide on it
     beyond = int(np.ceil(reach)) + 1 if method == "tin" else 0

@@ -118,11 +118,6 @@ class Lattice:
         corner = np.array([self.left_m, self.top_m, 0.0])
         return corner + first * self.resolution_m, corner + last * self.resolution_m
 
-    def cells(self, xyz: FloatArray) -> IntArray:
-        """Return the column and row of points, shape (n, 2), counted from the top left corner."""
-        first = np.array([self.first_column, self.first_row])
-        return cells_of(xyz, self.resolution_m) - first
-
 
 def cells_of(xyz: FloatArray, resolution_m: float) -> IntArray:
     """Return columns eastwards and rows southwards of points, counted from x = 0 and y = 0.
@@ -189,7 +184,9 @@ def grid_window(
     unknown.
     """
     shape = window.height, window.width
-    column, row = (lattice.cells(points) - (window.column, window.row)).T
+    column, row = cells_of(points, lattice.resolution_m).T
+    column -= lattice.first_column + window.column
+    row -= lattice.first_row + window.row
     inner = (column >= 0) & (column < window.width) & (row >= 0) & (row < window.height)
     code = row[inner] * window.width + column[inner]
     cells = cell_statistics(code, points[inner, 2], window.height * window.width)
@@ -249,7 +246,14 @@ def triangulated(
     from scipy.spatial import Delaunay, QhullError  # slow to import
 
     out = np.full(window.height * window.width, np.nan)
-    position, z = _one_a_place(position, z)
+    # sorted by column and row, each place once
+    order = np.lexsort((position[:, 1], position[:, 0]))
+    position, z = position[order], z[order]
+    new = np.ones(len(z), bool)
+    new[1:] = (position[1:] != position[:-1]).any(axis=1)
+    if not new.all():
+        z = cell_statistics(np.cumsum(new) - 1, z, int(new.sum()))["mean"]
+        position = position[new]
     moved = position + 1e-4 * spacing * _offsets(position)  # for the choice of triangles
     row, column = np.divmod(np.arange(out.size), window.width)
     centre = np.column_stack([column + window.column, row + window.row]) + 0.5
@@ -278,17 +282,6 @@ def triangulated(
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the cross product of vectors in plan, shape (n, 2)."""
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-
-def _one_a_place(position: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points sorted by column and row, each place once, with the mean of its heights."""
-    order = np.lexsort((position[:, 1], position[:, 0]))
-    position, z = position[order], z[order]
-    new = np.ones(len(z), bool)
-    new[1:] = (position[1:] != position[:-1]).any(axis=1)
-    if new.all():
-        return position, z
-    return position[new], cell_statistics(np.cumsum(new) - 1, z, int(new.sum()))["mean"]
 
 
 def _offsets(position: FloatArray) -> FloatArray:
