@@ -37,8 +37,7 @@ from pcfix.io.tiles import CloudFiles, Clouds, cloud_of, inputs_of, open_cloud
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, FloatArray
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules
-from pcfix.points.neighbours import Tiles as PointTiles
-from pcfix.points.neighbours import make_tiles, spacing_m
+from pcfix.points.neighbours import PointTiles, make_tiles, spacing_m
 from pcfix.report.styles import raster_style
 from pcfix.running import bounds, empty, release
 from pcfix.sums import Figures
