@@ -25,16 +25,7 @@ from pcfix.flow.correct import correct_file
 from pcfix.flow.diagnosis import diagnose_inputs, has_datum
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.run_folder import (
-    DIFFERENCE,
-    PAGE,
-    RECORD,
-    SECTIONS,
-    STEPS,
-    SURFACE,
-    RunFolder,
-    report_run,
-)
+from pcfix.flow.run_folder import DIFFERENCE, PAGE, RECORD, STEPS, SURFACE, RunFolder, report_run
 from pcfix.flow.runner import Bar, Progress, check_folder, json_text, no_bar
 from pcfix.flow.surfaces import view_of
 from pcfix.io import rasters, vectors
@@ -59,6 +50,7 @@ if TYPE_CHECKING:
 
 COMPARED = "compare"
 REFERENCE_DSM = "reference_dsm.tif"
+SECTIONS = 3
 COLMAP = ("cameras.bin", "images.bin", "points3D.bin", "georeference.json")
 ADJUSTED = ("report.html", SUMMARY, ENSEMBLE, *(f"colmap/{name}" for name in COLMAP), *MODELS[1:])
 """The files that an adjustment may leave, its report first."""

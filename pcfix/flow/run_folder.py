@@ -72,17 +72,7 @@ LATER = {
 """The first step that depends on an option, for options that do not affect all steps."""
 BED, DEPTH, UNCERTAINTY = "bed.tif", "depth.tif", "uncertainty.tif"
 COUNTS, SHADED, CORRECTED = "surface_counts.tif", "shaded.tif", "corrected.tif"
-HOLE_CELLS = 3.0
-"""Width of holes that are filled: of cells with random points, one in twenty is empty."""
-MOST_CELLS = 4_000_000
-"""Of the rasters for contours and outline."""
-SECTIONS = 3
-DARK, RED, GREY = (8, 48, 107), (203, 24, 29), (120, 120, 120)
-ORANGE, GREEN = (253, 141, 60), (35, 139, 69)
-DIFFERENCE = "compare/dod.tif"
-MOST_PAGE_CELLS = 300_000
-"""Of the map on the page, so that this stays below 4 MB."""
-PAGE = "report.html"
+DIFFERENCE, PAGE = "compare/dod.tif", "report.html"
 RESULTS = {
     "corrected.laz": "all points, the bed corrected",
     "cleaned.laz": "all points, with outliers flagged as noise",
@@ -209,6 +199,9 @@ class RunFolder:
 
 # The rasters
 
+HOLE_CELLS = 3.0
+"""Width of holes that are filled: of cells with random points, one in twenty is empty."""
+
 
 def raster_files(run: RunFolder, errors: bool) -> list[Path]:
     """Return the files of `write_rasters`; `errors` is whether the cloud has standard errors."""
@@ -287,6 +280,11 @@ def _write_shaded(folder: Path) -> None:
 
 
 # The layers
+
+MOST_CELLS = 4_000_000
+"""Of the rasters for contours and outline."""
+DARK, RED, GREY = (8, 48, 107), (203, 24, 29), (120, 120, 120)
+ORANGE, GREEN = (253, 141, 60), (35, 139, 69)
 
 
 def write_map(path: Path, run: RunFolder, corrected: Plain, compared: Plain) -> None:
@@ -388,6 +386,9 @@ def _checks(folder: Path, points: FloatArray, depths: File | None) -> list[Layer
 
 
 # The report page
+
+MOST_PAGE_CELLS = 300_000
+"""Of the map on the page, so that this stays below 4 MB."""
 
 
 def report_run(
