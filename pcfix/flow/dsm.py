@@ -28,13 +28,14 @@ from pcfix.grid.lattice import (
     round_resolution,
 )
 from pcfix.io import rasters
+from pcfix.io.clouds import points_of
 from pcfix.io.crs import crs_words, parts
 from pcfix.io.files import all_or_none, check_output, scratch_arrays, write_text
-from pcfix.io.las.source import LasSource, coordinates, metric_crs
+from pcfix.io.las.source import LasSource, metric_crs
 from pcfix.io.las.writing import is_ours
 from pcfix.io.rasters import METRE, TO_95
 from pcfix.io.tiles import CloudFiles, Clouds, cloud_of, inputs_of, open_cloud
-from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, FloatArray
+from pcfix.model import BATHYMETRIC_POINT, FloatArray
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules
 from pcfix.points.neighbours import PointTiles, make_tiles, spacing_m
@@ -232,19 +233,18 @@ def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], Non
         sentence = f"has no dimension {dimension}. Correct the cloud first, with --dimensions all."
         raise bad_file(source.path, "cloud.no_dimension", sentence, dimension=dimension)
     result, count, done = empty((len(source), 3)), 0, 0
-    for points in source.chunks():
-        xyz = coordinates(points)
+    for chunk in source.chunks():
+        points = points_of(chunk, source, None)
+        xyz, wanted = points.xyz, points.counts()
         if dimension is not None:
-            xyz[:, 2] = source.dimension(points, dimension)
-        classes = np.asarray(points["classification"])
-        is_bed = classes == BATHYMETRIC_POINT
-        wanted = is_bed if rules.surface == "bed" else ~np.isin(classes, NOISE_CLASSES)
-        wanted &= ~np.asarray(points["withheld"]).astype(bool) & np.isfinite(xyz[:, 2])
+            xyz[:, 2] = source.dimension(chunk, dimension)
+        if rules.surface == "bed":
+            wanted &= points.classes == BATHYMETRIC_POINT
         if dimension == "SigmaZ":
             wanted &= xyz[:, 2] > 0.0  # others have none
-        xyz = xyz[wanted]
+        xyz = xyz[wanted & np.isfinite(xyz[:, 2])]
         result[count : count + len(xyz)] = xyz
-        count, done = count + len(xyz), done + len(points)
+        count, done = count + len(xyz), done + len(chunk)
         release()
         report(0.5 * done / len(source))
     if count == 0 and rules.surface == "bed":
