@@ -26,11 +26,10 @@ FLOORS = (
     ("cells",),
     ("lens",),
     ("water",),
-    ("label",),
+    ("points",),
     ("refract",),
     ("port",),
     ("adjust",),
-    ("clean",),
     ("grid", "compare"),
     ("photos",),
     ("simulate",),
@@ -43,7 +42,7 @@ FLOORS = (
     ("__main__",),
 )
 # The simulator checks the rooms that correct, so it may not use what they do.
-TWINS = {"simulate": {"label", "refract", "port", "adjust", "clean", "grid", "compare"}}
+TWINS = {"simulate": {"points", "refract", "port", "adjust", "grid", "compare"}}
 
 FILE_LIBRARIES = {
     "laspy",

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.clean.neighbours import Neighbours, make_tiles
 from pcfix.compare.statistics import statistics_of
 from pcfix.errors import GeometryError
 from pcfix.libraries import optional_library
 from pcfix.model import FloatArray, IntArray
+from pcfix.points.neighbours import Neighbours, make_tiles
 from pcfix.sums import Figures
 
 MAX_CORE_POINTS = 100_000

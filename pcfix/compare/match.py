@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.clean.neighbours import nearest_of
 from pcfix.errors import GeometryError, SettingError, bad_file
 from pcfix.model import BoolArray, FloatArray, IntArray, WaterSurface
 from pcfix.options.steps import CompareRules
+from pcfix.points.neighbours import nearest_of
 from pcfix.running import blocks, bounds, distinct, empty, mapped, subset
 
 GAP_SPACINGS, MIN_GAP_M = 5.0, 1.0

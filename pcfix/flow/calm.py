@@ -84,7 +84,12 @@ def calm_frames(
         view, crs = _view(given, found) if given.surface else (None, None)
         homographies, scatter = np.tile(np.eye(3), (len(found.names), 1, 1)), np.empty(0)
         if not given.still:
-            homographies, scatter = _registered(found, count(found))
+            homographies, scatter = register(np.stack(list(corners_in(count(found)))))
+            lost = np.flatnonzero(~np.isfinite(homographies).all(axis=(1, 2)))
+            if len(lost):
+                names = [found.names[row] for row in lost]
+                sentence = f"{', '.join(names[:3])}: do not match the first frame. Omit these"
+                raise InputError("frames.no_overlap", f"{sentence} frames.", frames=names)
         median, spread, stack = _median(found, homographies, empty, count(found))
         notes, water = list[PcfixWarning](), None
         if view is not None and interval is not None:
@@ -123,17 +128,6 @@ def calm_frames(
         spread=round(float(np.nanmedian(spread)), 2),  # of the frames, median, grey values
         water=water,
     )
-
-
-def _registered(frames: Burst, images: Iterable[Any]) -> tuple[FloatArray, FloatArray]:
-    """Register all frames to the first as `register`, or refuse them."""
-    homographies, scatter = register(np.stack(list(corners_in(images))))
-    lost = np.flatnonzero(~np.isfinite(homographies).all(axis=(1, 2)))
-    if len(lost):
-        names = [frames.names[row] for row in lost]
-        sentence = f"{', '.join(names[:3])}: do not match the first frame. Omit these frames."
-        raise InputError("frames.no_overlap", sentence, frames=names)
-    return homographies, scatter
 
 
 def _median(

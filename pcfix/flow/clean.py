@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.clean.points import WEAK, Cloud, Reason, flag_neighbours
 from pcfix.errors import bad_file
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
 from pcfix.flow.surfaces import CloudView, find_surface, view_of
@@ -22,6 +21,7 @@ from pcfix.model import LOW_NOISE, BoolArray
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CleanOptions, CleanRules
+from pcfix.points.noise import WEAK, Cloud, Reason, flag_neighbours
 from pcfix.running import current, empty, release, running
 from pcfix.sums import Figures
 from pcfix.version import __version__

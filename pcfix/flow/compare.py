@@ -16,7 +16,7 @@ from pcfix.flow.runner import check_summary, json_text, write_summary
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
 from pcfix.io.files import all_or_none, check_output, scratch_arrays, write_bytes, write_text
 from pcfix.io.tiles import Clouds, band_of, cloud_of, inputs_of
-from pcfix.options.declare import File, taken
+from pcfix.options.declare import taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CompareOptions, CompareRules
 
@@ -51,8 +51,19 @@ def compare_clouds(
     source = band_of(cloud_of(cloud), given)
     also = {name: cloud_of(path) for name, path in given.also}
     surveyed = reference_of(reference)
-    read = (source, surveyed, *also.values())
-    _check_outputs(given, [path for one in read for path in inputs_of(one)])
+    inputs = [path for one in (source, surveyed, *also.values()) for path in inputs_of(one)]
+    if given.out_dir is not None:  # refuse what cannot be written before anything is computed
+        folder = Path(given.out_dir)
+        if folder.is_dir():
+            ours = [*folder.glob("section_*.csv"), folder / "compare.json", folder / DEPTHS]
+            for path in ours:
+                check_output(path, overwrite=given.overwrite, inputs=inputs)
+        elif folder.exists():
+            sentence = f"{folder} is a file. Give a folder."
+            raise SettingError("output.no_folder", sentence, path=folder)
+        else:
+            check_output(folder, overwrite=False)
+    check_summary(given, inputs)
     if given.m3c2:
         load_py4dgeo()
     water = None
@@ -76,22 +87,6 @@ def compare_clouds(
     result.seconds = round(time.perf_counter() - started, 3)
     _write(result, given)
     return result
-
-
-def _check_outputs(given: CompareOptions, inputs: list[File]) -> None:
-    """Raise an error for outputs that cannot be written, before anything is computed."""
-    if given.out_dir is not None:
-        folder = Path(given.out_dir)
-        if folder.is_dir():
-            ours = [*folder.glob("section_*.csv"), folder / "compare.json", folder / DEPTHS]
-            for path in ours:
-                check_output(path, overwrite=given.overwrite, inputs=inputs)
-        elif folder.exists():
-            sentence = f"{folder} is a file. Give a folder."
-            raise SettingError("output.no_folder", sentence, path=folder)
-        else:
-            check_output(folder, overwrite=False)
-    check_summary(given, inputs)
 
 
 def _write(result: Comparison, given: CompareOptions) -> None:

@@ -33,7 +33,6 @@ from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header
 from pcfix.io.tiles import Clouds, is_raster
-from pcfix.label.labelling import Labelling
 from pcfix.lens.frames import count_visible_cameras
 from pcfix.model import (
     BATHYMETRIC_POINT,
@@ -49,6 +48,7 @@ from pcfix.model import (
 from pcfix.options.correct import CorrectOptions, PointsOptions, RefractionOptions, ScienceOptions
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import LandRules
+from pcfix.points.labelling import Labelling
 from pcfix.refract.regression import DepthRegression
 from pcfix.refract.tally import Tally
 from pcfix.report.text import Summary

@@ -19,7 +19,6 @@ from pcfix.flow.inputs import Inputs
 from pcfix.flow.plausibility import CloudSample
 from pcfix.flow.surfaces import CloudView, Points
 from pcfix.io.views import ViewMatch, ViewReport
-from pcfix.label.labelling import LabelCounts, Labelling
 from pcfix.model import (
     BoolArray,
     Cameras,
@@ -31,6 +30,7 @@ from pcfix.model import (
     WaterPlane,
 )
 from pcfix.options.correct import CorrectOptions, ScienceOptions
+from pcfix.points.labelling import LabelCounts, Labelling
 from pcfix.port.methods import correct_through_port
 from pcfix.refract.batch import Batch, Intersection, OriginalModel, Survey
 from pcfix.refract.methods import correct, shift_of_land

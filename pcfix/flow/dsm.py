@@ -17,22 +17,28 @@ from typing import Any
 
 import numpy as np
 
-from pcfix.clean.neighbours import Tiles as PointTiles
-from pcfix.clean.neighbours import make_tiles, spacing_m
 from pcfix.errors import bad_file
 from pcfix.flow.runner import Progress, file_task, write_summary
-from pcfix.grid.heights import fill_holes, grid_window, margin_cells
-from pcfix.grid.lattice import Lattice, lattice_over, round_resolution
+from pcfix.grid.lattice import (
+    Lattice,
+    fill_holes,
+    grid_window,
+    lattice_over,
+    margin_cells,
+    round_resolution,
+)
 from pcfix.io import rasters
+from pcfix.io.clouds import points_of
 from pcfix.io.crs import crs_words, parts
 from pcfix.io.files import all_or_none, check_output, scratch_arrays, write_text
-from pcfix.io.las.source import LasSource, coordinates, metric_crs
+from pcfix.io.las.source import LasSource, metric_crs
 from pcfix.io.las.writing import is_ours
 from pcfix.io.rasters import METRE, TO_95
 from pcfix.io.tiles import CloudFiles, Clouds, cloud_of, inputs_of, open_cloud
-from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, FloatArray
+from pcfix.model import BATHYMETRIC_POINT, FloatArray
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules
+from pcfix.points.neighbours import PointTiles, make_tiles, spacing_m
 from pcfix.report.styles import raster_style
 from pcfix.running import bounds, empty, release
 from pcfix.sums import Figures
@@ -99,14 +105,13 @@ def grid_dsm(
             crs, count = metric_crs(source), len(source)
             corrected = any(is_ours(vlr) for vlr in source.vlrs)
             used = _points_of(source, rules, report)
-            if given.resolution is None:
-                cell_m = round_resolution(_spacing_m(source, used))
-                rules = replace(rules, resolution=cell_m)
-            gap_m = _spacing_m(source, used, rules.cell_m)
-        lattice = lattice_over(*bounds(used[:, :2]), rules.cell_m, str(task.source))
+            cell_m = rules.resolution or round_resolution(_spacing_m(source, used))
+            rules = replace(rules, resolution=cell_m)
+            gap_m = _spacing_m(source, used, cell_m)
+        lattice = lattice_over(*bounds(used[:, :2]), cell_m, str(task.source))
         tiles = make_tiles(used, points=BIN_POINTS)
         # diameter of the widest circle around a triangle of a TIN
-        reach_m = max(5.0 * gap_m, 3.0 * rules.cell_m, rules.fill or 0.0)
+        reach_m = max(5.0 * gap_m, 3.0 * cell_m, rules.fill or 0.0)
         paths = {"dsm": task.target, **more}
         tags = {"pcfix": __version__, "corrected": corrected, **asdict(rules)}
         counted = _write_rasters(tiles, lattice, reach_m, gap_m, rules, paths, crs, tags, report)
@@ -151,7 +156,7 @@ def _write_rasters(
 
     Returns the numbers of cells and the statistics of their values, by their names in the summary.
     """
-    size_m, method = rules.cell_m, rules.method
+    size_m, method = lattice.resolution_m, rules.method
     reach, spacing = reach_m / size_m, gap_m / size_m
     # the number of cells around a window whose points decide on it
     beyond = int(np.ceil(reach)) + 1 if method == "tin" else 0
@@ -228,19 +233,18 @@ def _points_of(source: LasSource, rules: DsmRules, report: Callable[[float], Non
         sentence = f"has no dimension {dimension}. Correct the cloud first, with --dimensions all."
         raise bad_file(source.path, "cloud.no_dimension", sentence, dimension=dimension)
     result, count, done = empty((len(source), 3)), 0, 0
-    for points in source.chunks():
-        xyz = coordinates(points)
+    for chunk in source.chunks():
+        points = points_of(chunk, source, None)
+        xyz, wanted = points.xyz, points.counts()
         if dimension is not None:
-            xyz[:, 2] = source.dimension(points, dimension)
-        classes = np.asarray(points["classification"])
-        is_bed = classes == BATHYMETRIC_POINT
-        wanted = is_bed if rules.surface == "bed" else ~np.isin(classes, NOISE_CLASSES)
-        wanted &= ~np.asarray(points["withheld"]).astype(bool) & np.isfinite(xyz[:, 2])
+            xyz[:, 2] = source.dimension(chunk, dimension)
+        if rules.surface == "bed":
+            wanted &= points.classes == BATHYMETRIC_POINT
         if dimension == "SigmaZ":
             wanted &= xyz[:, 2] > 0.0  # others have none
-        xyz = xyz[wanted]
+        xyz = xyz[wanted & np.isfinite(xyz[:, 2])]
         result[count : count + len(xyz)] = xyz
-        count, done = count + len(xyz), done + len(points)
+        count, done = count + len(xyz), done + len(chunk)
         release()
         report(0.5 * done / len(source))
     if count == 0 and rules.surface == "bed":

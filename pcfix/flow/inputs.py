@@ -26,10 +26,10 @@ from pcfix.io.tables import match_labels
 from pcfix.io.tides import level_offsets, read_image_times, read_tide
 from pcfix.io.vectors import LAYER_MARK, read_water_polygons
 from pcfix.io.views import ViewList, ViewMatch, read_views, track_views
-from pcfix.label.labelling import Labelling, WaterMask
 from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints, Views
 from pcfix.options.declare import File, OptionSet, options_of
 from pcfix.options.shared import InputOptions, LandRules, MaskOption
+from pcfix.points.labelling import Labelling, WaterMask
 from pcfix.port.shapes import port_of
 from pcfix.water.surface import FoundSurface
 

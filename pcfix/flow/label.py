@@ -16,10 +16,10 @@ from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header
 from pcfix.io.tiles import Clouds
-from pcfix.label.labelling import Classes, LabelCounts, Labelling
 from pcfix.model import WaterPlane, WaterSurface
 from pcfix.options.correct import LabelOptions
 from pcfix.options.declare import File, taken
+from pcfix.points.labelling import Classes, LabelCounts, Labelling
 from pcfix.sums import Figures
 from pcfix.version import __version__
 from pcfix.water.checks import check_submerged, check_tilt

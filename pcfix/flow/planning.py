@@ -17,10 +17,10 @@ from pcfix.flow.poses import SAMPLE_POINTS, members_of, pose_errors, with_poses
 from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
 from pcfix.io.las.source import CHUNK_POINTS
 from pcfix.io.tables import read_check_depths
-from pcfix.label.labelling import Labelling, Part
 from pcfix.model import NOISE_CLASSES, Cameras, WaterPlane
 from pcfix.options.correct import CorrectOptions, ScienceOptions
 from pcfix.options.declare import File
+from pcfix.points.labelling import Labelling, Part
 from pcfix.refract import learning
 from pcfix.refract.batch import Batch, Learned, Survey, require_orientation, stacked
 from pcfix.refract.occlusion import Occluder, OccluderBuilder, wants_occlusion

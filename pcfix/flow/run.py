@@ -5,8 +5,9 @@ The results are opened as rasters, lines and tables (`RunResults`).
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from numbers import Real
@@ -16,23 +17,21 @@ from typing import TYPE_CHECKING, Any
 from pcfix.adjust.diagnosis import MOST_STATED_M
 from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.errors import InputError, PcfixError, SettingError, bad_file, plain, silently
-from pcfix.flow import outputs as results
+from pcfix.flow import run_folder as results
 from pcfix.flow.adjust import FOLDER, MODELS, SUMMARY, adjust_into
 from pcfix.flow.clean import clean_file
 from pcfix.flow.compare import compare_clouds
 from pcfix.flow.correct import correct_file
 from pcfix.flow.dsm import grid_dsm
 from pcfix.flow.inputs import Inputs
-from pcfix.flow.outputs import DIFFERENCE, PAGE, SECTIONS, report_run
 from pcfix.flow.poses import diagnose_inputs, has_datum
-from pcfix.flow.run_folder import RECORD, STEPS, SURFACE, Record, RunFolder, read_steps
-from pcfix.flow.runner import Bar, Progress, check_folder, no_bar
+from pcfix.flow.run_folder import DIFFERENCE, PAGE, RECORD, STEPS, SURFACE, RunFolder, report_run
+from pcfix.flow.runner import Bar, Progress, check_folder, json_text, no_bar
 from pcfix.flow.surfaces import view_of
 from pcfix.io import rasters, vectors
 from pcfix.io.clouds import is_cloud
-from pcfix.io.files import ENSEMBLE, read_json
+from pcfix.io.files import ENSEMBLE, file_state, read_json, refusing, write_text
 from pcfix.io.ground_control import read_gnss
-from pcfix.io.las.source import RasterBand
 from pcfix.io.tiles import Tiles
 from pcfix.libraries import analysis_library
 from pcfix.model import WaterDimension
@@ -51,6 +50,7 @@ if TYPE_CHECKING:
 
 COMPARED = "compare"
 REFERENCE_DSM = "reference_dsm.tif"
+SECTIONS = 3
 COLMAP = ("cameras.bin", "images.bin", "points3D.bin", "georeference.json")
 ADJUSTED = ("report.html", SUMMARY, ENSEMBLE, *(f"colmap/{name}" for name in COLMAP), *MODELS[1:])
 """The files that an adjustment may leave, its report first."""
@@ -118,21 +118,31 @@ def run(
 
     # a cloud in many files is a folder for the user
     main, outputs = adjusted.path_of("corrected"), adjusted.cloud_files("corrected")
-    corrected = step("correct", "Correcting", outputs, partial(_correct, adjusted), main=main)
+    to_correct = replace(adjusted.options, overwrite=True).part(CorrectOptions)
+    corrected = step(
+        "correct", "Correcting", outputs, main=main,
+        work=lambda bar: vars(
+            correct_file(adjusted.source, main, options=to_correct, progress=bar)
+        ),
+    )  # fmt: skip
     poses = corrected["poses"]
     if first["absorbed"] is False and poses is not None and poses["absorbed"] is None:
         # the first step has surveys that the correction has not
         words = "have not absorbed the refraction, as the step adjust found"
         corrected = {**corrected, "poses": {**poses, "absorbed": False, "words": words}}
-    main, outputs = adjusted.path_of("cleaned"), adjusted.cloud_files("cleaned")
-    step("clean", "Cleaning", outputs, partial(_clean, adjusted), main=main)
+    cleaned, outputs = adjusted.path_of("cleaned"), adjusted.cloud_files("cleaned")
+    to_clean = CleanOptions(overwrite=True, jobs=options.jobs, scheduler=options.scheduler)
+    step(
+        "clean", "Cleaning", outputs, main=cleaned,
+        work=lambda bar: clean_file(
+            adjusted.cloud("corrected"), cleaned, options=to_clean, progress=bar
+        ).as_dict(),
+    )  # fmt: skip
 
     errors = corrected["uncertainty"] is not None
-    cells = isinstance(adjusted.source, RasterBand)
-    outputs = results.raster_files(folder, errors=errors, cells=cells)
     gridded = step(
-        "dsm", "Gridding", outputs, partial(results.write_rasters, adjusted, errors),
-        "{main}, cells of {resolution_m:g} m",
+        "dsm", "Gridding", results.raster_files(adjusted, errors),
+        partial(results.write_rasters, adjusted, errors), "{main}, cells of {resolution_m:g} m",
     )  # fmt: skip
     compared: Plain = {}
     if options.reference is not None:
@@ -146,8 +156,10 @@ def run(
     except InputError as error:  # the extra vector is not installed
         say(f"{'map':<9} not written: {error}")
     else:
-        draw = partial(results.write_map, layers, adjusted, corrected, compared)
-        step("map", "Drawing the map", [layers], lambda _: draw())
+        step(
+            "map", "Drawing the map", [layers],
+            lambda _: results.write_map(layers, adjusted, corrected, compared),
+        )  # fmt: skip
     step(
         "report", "Writing the report", [folder / PAGE],
         lambda _: report_run(adjusted, inputs, first, corrected, compared), "{main}: {in_short}",
@@ -207,7 +219,15 @@ def adjust_first(run: RunFolder, files: list[Path]) -> Plain:
     try:
         why, absorbed = _decide(run)
         if absorbed or options.adjust == "yes":
-            model = _adjust(run, files)
+            target = run.folder / FOLDER
+            check_folder(target, files, mark=SUMMARY)  # the adjustment replaces it
+            given = AdjustOptions(
+                gcps=options.gcps, gnss=options.gnss, lens=options.lens,
+                index=with_index(options).refractive_index, overwrite=True,
+            )  # fmt: skip
+            with threads(options.jobs):
+                adjust_into(target, options.part(Inputs), given, run.source)
+            model = next(name for name in MODELS if (target / name).exists())
     except PcfixError as error:
         if options.adjust == "yes" or _surveys(options):
             raise
@@ -251,33 +271,6 @@ def _decide(run: RunFolder) -> tuple[str, bool | None]:
     return f"the poses {have} absorbed the refraction: {sign.words}", sign.absorbed
 
 
-def _adjust(run: RunFolder, files: list[Path]) -> str:
-    """Adjust, and return which of `MODELS` has the cameras."""
-    target, options = run.folder / FOLDER, run.options
-    check_folder(target, files, mark=SUMMARY)  # the adjustment replaces it
-    given = AdjustOptions(
-        gcps=options.gcps, gnss=options.gnss, lens=options.lens,
-        index=with_index(options).refractive_index, overwrite=True,
-    )  # fmt: skip
-    with threads(options.jobs):
-        adjust_into(target, options.part(Inputs), given, run.source)
-    return next(name for name in MODELS if (target / name).exists())
-
-
-def _correct(run: RunFolder, progress: Progress | None) -> Plain:
-    """Correct the cloud."""
-    options = replace(run.options, overwrite=True).part(CorrectOptions)
-    target = run.path_of("corrected")
-    return vars(correct_file(run.source, target, options=options, progress=progress))
-
-
-def _clean(run: RunFolder, progress: Progress | None) -> Plain:
-    """Clean the corrected cloud, which marks the points below the water."""
-    options = CleanOptions(overwrite=True, jobs=run.options.jobs, scheduler=run.options.scheduler)
-    source, target = run.cloud("corrected"), run.path_of("cleaned")
-    return clean_file(source, target, options=options, progress=progress).as_dict()
-
-
 def _compare(run: RunFolder, resolution_m: float) -> Plain:
     """Compare the cleaned cloud with the reference, and write a raster of differences."""
     folder = run.folder / COMPARED
@@ -298,6 +291,71 @@ def _compare(run: RunFolder, resolution_m: float) -> Plain:
     ]
     points = [] if result.check_points is None else result.check_points
     return {"figures": result.as_dict(), **plain({"sections": sections, "check_points": points})}
+
+
+class Record:
+    """The file run.json: the options of a run, and the steps that are done.
+
+    A step is skipped if an earlier run did it with the same key (see `RunFolder.keys`), its outputs
+    have not changed, and no step before it is done again. The file is written after each step.
+    """
+
+    def __init__(self, run: RunFolder, say: Callable[[str], None], bar: Bar = no_bar) -> None:
+        """Make the folder, or refuse one of another run.
+
+        `say` is called with a line on each step, and `bar` shows the progress of one.
+        """
+        folder = run.folder
+        if not folder.parent.is_dir():
+            sentence = f"{folder}: the folder {folder.parent} does not exist. Create it first."
+            raise SettingError("output.no_folder", sentence, path=folder)
+        folder.mkdir(exist_ok=True)
+        self._path, self._keys, self._say, self._bar = folder / RECORD, run.keys(), say, bar
+        self._content: dict[str, Any] = {"options": run.settings(), "steps": {}}
+        self._earlier = read_steps(self._path) if self._path.exists() else {}
+        resumes = self._has(STEPS[0])
+        if not (run.options.overwrite or resumes) and any(folder.iterdir()):
+            sentence = f"{folder}: holds a run with other options or input files, or other files."
+            sentence += " Add --overwrite to replace them, or give another folder."
+            raise SettingError("run.other", sentence, path=folder)
+
+    def _has(self, step: str) -> bool:
+        return bool(self._earlier.get(step, {}).get("key") == self._keys[step])
+
+    def step(
+        self, name: str, title: str, outputs: Sequence[Path],
+        work: Callable[[Progress | None], Plain | None], text: str = "{main}",
+        main: Path | None = None,
+    ) -> Plain:  # fmt: skip
+        """Do a step unless it is done, and return its result.
+
+        `outputs` are all files that `work` writes, and `main` is shown to the user, by default the
+        first; with the `text`, in which values of the result have their names. The result has what
+        later steps need, in the types of JSON.
+        """
+        done, how = self._earlier.get(name, {}), "already done"
+        if not self._has(name) or done["outputs"] != [file_state(one) for one in outputs]:
+            self._earlier, how = {}, "done"  # later steps must be done again
+            with self._bar(title) as progress:
+                found = json.loads(json.dumps(work(progress)))
+            states = [file_state(one) for one in outputs]
+            done = {"key": self._keys[name], "outputs": states, "result": found}
+        self._content["steps"][name] = done
+        write_text(self._path, json_text(self._content), overwrite=True)
+        result: Plain = done["result"] or {}
+        if name != "adjust" or result["model"] is not None:
+            words = text.format(main=main or outputs[0], **result)
+            self._say(f"{name:<9} {how}: {words}")
+        return result
+
+
+def read_steps(path: Path) -> dict[str, Any]:
+    """Return the steps of a record by name."""
+    sentence = "is not the record of a run ({}). Remove it, or give another folder."
+    with refusing(path, "run.record", sentence):
+        steps: dict[str, Any] = read_json(path)["steps"]
+        _ = [(one["key"], one["outputs"], one["result"]) for one in steps.values()]
+    return steps
 
 
 @dataclass(frozen=True)

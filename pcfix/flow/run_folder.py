@@ -1,37 +1,66 @@
-"""The folder of a run: its inputs, the files that it writes, and the record of its steps."""
+"""The folder of a run: its inputs, and the rasters, layers and page that it gets besides clouds."""
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from pcfix.errors import SettingError, silently
-from pcfix.flow.adjust import FOLDER
+import numpy as np
+import shapely
+
+from pcfix.errors import silently
+from pcfix.flow.adjust import FOLDER, SUMMARY
+from pcfix.flow.dsm import BLOCK_CELLS, grid_dsm, point_spacing_m
 from pcfix.flow.inputs import Inputs, paths_in, read_blocks
-from pcfix.flow.runner import HOW, Bar, Progress, json_text, no_bar
-from pcfix.flow.surfaces import view_of
+from pcfix.flow.raster import raster_writer
+from pcfix.flow.runner import HOW, Progress
+from pcfix.flow.surfaces import Points, file_points, view_of
+from pcfix.grid.lattice import Lattice, Window, round_resolution
+from pcfix.grid.maps import contours, depth_interval, hillshade, relief_colours, waterlines
+from pcfix.io import rasters
 from pcfix.io.clouds import is_cloud, own_water, reference_of
+from pcfix.io.crs import crs_words
 from pcfix.io.files import (
     belonging,
     check_input,
     file_state,
     files_in,
     read_json,
-    refusing,
+    sha256,
+    write_bytes,
     write_text,
 )
-from pcfix.io.tiles import CloudFiles, Tiles, band_of, cloud_of, inputs_of, open_cloud, tiles_from
-from pcfix.model import Cameras, WaterSurface
-from pcfix.options.correct import RunOptions
-from pcfix.options.declare import options_of
-from pcfix.options.steps import DistanceOptions
-from pcfix.report.text import Plain
+from pcfix.io.las.source import RasterBand, stated_crs
+from pcfix.io.tables import read_check_depths
+from pcfix.io.tiles import (
+    CloudFiles,
+    RasterSource,
+    Tiles,
+    band_of,
+    cloud_of,
+    inputs_of,
+    open_cloud,
+    tiles_from,
+)
+from pcfix.io.vectors import Layer, write_layers
+from pcfix.model import BATHYMETRIC_POINT, Cameras, FloatArray, WaterSurface
+from pcfix.options.correct import LEVEL_M, RunOptions
+from pcfix.options.declare import File, options_of
+from pcfix.options.steps import DistanceOptions, DsmOptions
+from pcfix.report.adjustment import adjustment_sentence
+from pcfix.report.comparison import evaluation
+from pcfix.report.page import Table, render
+from pcfix.report.run import RunMaps, run_report
+from pcfix.report.styles import Symbol, limits_of, vector_style
+from pcfix.report.text import Plain, Summary
 from pcfix.version import __version__
+from pcfix.water.surface import surface_above
 
 RECORD, SURFACE = "run.json", "surface.tif"
 STEPS = ("adjust", "correct", "clean", "dsm", "compare", "map", "report")
@@ -41,6 +70,27 @@ LATER = {
     "reference": "compare", "resolution": "dsm", "project": "report", "date": "report",
 }  # fmt: skip
 """The first step that depends on an option, for options that do not affect all steps."""
+BED, DEPTH, UNCERTAINTY = "bed.tif", "depth.tif", "uncertainty.tif"
+COUNTS, SHADED, CORRECTED = "surface_counts.tif", "shaded.tif", "corrected.tif"
+DIFFERENCE, PAGE = "compare/dod.tif", "report.html"
+RESULTS = {
+    "corrected.laz": "all points, the bed corrected",
+    "cleaned.laz": "all points, with outliers flagged as noise",
+    DEPTH: "depth below the water",
+    BED: "heights of the bed",
+    SURFACE: "heights of land and bed",
+    UNCERTAINTY: "vertical uncertainty at 95 %",
+    COUNTS: "number of points in each cell, and their spread",
+    SHADED: "coloured, shaded relief",
+    "map.gpkg": "contours, waterline and other layers for a GIS",
+    "run.json": "options and results of the run",
+    "compare/compare.json": "all figures of the comparison",
+    "compare/depth_bins.csv": "errors by depth",
+    DIFFERENCE: "cloud minus reference",
+    "compare/reference_dsm.tif": "heights of the reference",
+    "adjusted/report.html": "the adjustment of the cameras",
+}
+"""The results of a run by name; only existing ones are listed."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +160,8 @@ class RunFolder:
         for step in STEPS:
             options = sorted(one for one in settings.items() if LATER.get(one[0], "adjust") == step)
             states = [file_state(one) for one in files.get(step, [])]
-            key = keys[step] = sha256(json.dumps([key, options, states]).encode()).hexdigest()
+            text = json.dumps([key, options, states])
+            key = keys[step] = hashlib.sha256(text.encode()).hexdigest()
         return keys
 
     # Results
@@ -146,66 +197,263 @@ class RunFolder:
             return stated or self.options.part(Inputs).surface(view_of(cloud)).surface
 
 
-class Record:
-    """The file run.json: the options of a run, and the steps that are done.
+# The rasters
 
-    A step is skipped if an earlier run did it with the same key (see `RunFolder.keys`), its outputs
-    have not changed, and no step before it is done again. The file is written after each step.
+HOLE_CELLS = 3.0
+"""Width of holes that are filled: of cells with random points, one in twenty is empty."""
+
+
+def raster_files(run: RunFolder, errors: bool) -> list[Path]:
+    """Return the files of `write_rasters`; `errors` is whether the cloud has standard errors."""
+    maps = [SURFACE, BED, DEPTH, *([UNCERTAINTY] if errors else [])]
+    cells = [CORRECTED] if isinstance(run.source, RasterBand) else []
+    files = [run.folder / name for name in (*maps, COUNTS, SHADED, *cells)]
+    return [*files, *((run.folder / name).with_suffix(".qml") for name in maps)]
+
+
+def write_rasters(run: RunFolder, errors: bool, progress: Progress | None = None) -> Plain:
+    """Write all rasters of a corrected cloud as cloud optimised GeoTIFF, with styles for QGIS.
+
+    By default the cells have 2 to 4 points, or those of a raster are as large as its own. This is
+    also written on its own grid. Returns the side of the cells for ``run.json``.
+    """
+    folder, cloud, cell_m = run.folder, run.cloud("cleaned"), run.options.resolution
+    source = run.source
+    if isinstance(source, RasterBand) and isinstance(cloud, Path):
+        cells = RasterSource(source)
+        cell_m = cell_m or cells.cell_m
+        with (
+            cells, open_cloud(cloud) as corrected,
+            raster_writer(cells, corrected.header, {"height": folder / CORRECTED}) as append,
+        ):  # fmt: skip
+            for points in corrected.chunks():
+                append(points)
+    if cell_m is None:
+        cell_m = round_resolution(point_spacing_m(cloud, folder / SURFACE))
+    plain = DsmOptions(resolution=cell_m, style=True, overwrite=True)
+    filled = replace(plain, fill=HOLE_CELLS * cell_m)
+    asked = {
+        SURFACE: replace(filled, counts=folder / COUNTS),
+        BED: replace(filled, surface="bed"),
+        DEPTH: replace(filled, what="depth"),
+        **({UNCERTAINTY: replace(plain, what="uncertainty")} if errors else {}),
+    }
+    for number, (name, options) in enumerate(asked.items()):
+
+        def report(done: int, total: int, number: int = number) -> None:
+            if progress is not None:
+                progress(number * total + done, len(asked) * total)
+
+        grid_dsm(cloud, folder / name, options=options, progress=report)
+    _write_shaded(folder)
+    return {"resolution_m": cell_m}
+
+
+def _write_shaded(folder: Path) -> None:
+    """Write the picture: the bed in the colours of its depth, the land grey.
+
+    Some filled holes of the surface are under water and have no depth: it follows from the water
+    around them.
+    """
+    from scipy.ndimage import minimum_filter
+
+    target, edge = folder / SHADED, int(HOLE_CELLS)
+    high = limits_of(rasters.preview(folder / DEPTH)[0], "depth")[1]
+    one, other = (rasters.open_raster(folder / name) for name in (SURFACE, DEPTH))
+    with one as surface, other as depth:
+        lattice, below = rasters.lattice_of(surface), rasters.lattice_of(depth)
+        down, right = lattice.first_row - below.first_row, lattice.first_column - below.first_column
+        bands = dict.fromkeys(("red", "green", "blue", "alpha"), "")
+        plan = None if depth.crs is None else depth.crs.to_wkt()
+        with rasters.new_raster(target, lattice, plan, bands, dtype="uint8", nodata=None) as out:
+            for window in lattice.window.parts(BLOCK_CELLS):
+                wide = window.grown(edge)
+                height = rasters.read_masked(surface, window=rasters.slices(wide), boundless=True)
+                moved = rasters.slices(Window(*np.add(wide, (down, down, right, right)).tolist()))
+                deep = rasters.read_masked(depth, window=moved, boundless=True)
+                level = minimum_filter(np.nan_to_num(height + deep, nan=np.inf), 2 * edge + 1)
+                is_wet = np.isnan(deep) & (height < level) & np.isfinite(level)
+                deep = np.where(is_wet, level - height, deep)[edge:-edge, edge:-edge]
+                around = height[edge - 1 : 1 - edge, edge - 1 : 1 - edge]
+                light = hillshade(around, lattice.resolution_m)
+                rasters.write_bands(out, relief_colours(light, deep, high), window)
+
+
+# The layers
+
+MOST_CELLS = 4_000_000
+"""Of the rasters for contours and outline."""
+DARK, RED, GREY = (8, 48, 107), (203, 24, 29), (120, 120, 120)
+ORANGE, GREEN = (253, 141, 60), (35, 139, 69)
+
+
+def write_map(path: Path, run: RunFolder, corrected: Plain, compared: Plain) -> None:
+    """Write all layers of a run to a file.
+
+    `corrected` and `compared` are the results of these steps. The height of the water has one
+    standard error for all places.
+    """
+    folder, cloud, options = run.folder, run.cloud("cleaned"), run.options
+    shapes = rasters.outlines(folder / DEPTH, MOST_CELLS)
+    area = shapely.area(np.array(shapes, object)) if shapes else np.zeros(0)
+    style = vector_style({"area": Symbol("fill", DARK, 0.5)})
+    known = options.sigma_level, (corrected["water_fit"] or {}).get("sigma_level_m"), LEVEL_M
+    sigma_m = next(one for one in known if one is not None)
+    # x, y, reference height, and cloud minus reference
+    points = np.array(compared.get("check_points", [])).reshape(-1, 4)
+    sections = compared.get("figures", {}).get("sections", [])
+    layers = [
+        Layer("corrected_area", "Polygon", shapes, {"area_m2": area}, style),
+        _contours(folder),
+        waterline(cloud, run.water, sigma_m),
+    ]
+    if sections:
+        ends = [[(one["x1"], one["y1"]), (one["x2"], one["y2"])] for one in sections]
+        lines = list(shapely.linestrings(ends))
+        names = np.array([f"Cross-section {n}" for n, _ in enumerate(lines, start=1)], object)
+        values = {"name": names, "length_m": shapely.length(lines)}
+        style = vector_style({"line": Symbol("line", GREY, 0.4)}, label='"name"')
+        layers.append(Layer("cross_sections", "LineString", lines, values, style))
+    # the projection centres
+    labels = np.array(run.cameras.labels, object)
+    use = np.where(np.isin(labels, corrected["cameras_unused"]), "not used", "used")
+    values = {"label": labels, "use": use.astype(object)}
+    symbols = {"used": Symbol("marker", GREEN, 2.0), "not used": Symbol("marker", GREY, 1.6)}
+    centres = list(shapely.points(run.cameras.centres))
+    layers.append(Layer("cameras", "Point Z", centres, values, vector_style(symbols, "use")))
+    layers += _checks(folder, points, options.check_depths)
+    write_layers(path, layers, view_of(cloud).crs, overwrite=True)
+
+
+def _contours(folder: Path) -> Layer:
+    """Return the depth contours, no finer than the depth is known."""
+    depth, transform = rasters.preview(folder / DEPTH, MOST_CELLS)
+    path = folder / UNCERTAINTY
+    sigma = rasters.preview(path)[0] if path.exists() else np.zeros(0)
+    interval = depth_interval(depth, sigma)
+    found = contours(depth, interval)
+    places = [rasters.place_of(transform, *(place.T + 0.5)) for _, place in found]
+    lines = [shapely.linestrings(*xy) for xy in places]
+    level = np.array([level for level, _ in found])
+    values = {"depth_m": level, "interval_m": np.full(len(found), interval)}
+    style = vector_style({"line": Symbol("line", DARK, 0.25)}, label='"depth_m"')
+    return Layer("depth_contours", "LineString", lines, values, style)
+
+
+def waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Layer:
+    """Return where the water meets the corrected cloud, with the standard error across the line.
+
+    `sigma_m` is that of the height of the water.
     """
 
-    def __init__(self, run: RunFolder, say: Callable[[str], None], bar: Bar = no_bar) -> None:
-        """Make the folder, or refuse one of another run.
+    def columns(points: Points) -> FloatArray:
+        """Return x, y, z, height above the water, and standard error of points."""
+        known = points.dimensions or {}
+        above = points.xyz[:, 2] - surface_above(water, points.xyz, points.heights).height_m
+        bed = points.classes == BATHYMETRIC_POINT
+        above[bed] = -known["WaterDepth"][bed]
+        above[~points.counts()] = np.nan
+        return np.column_stack([points.xyz, above, known["SigmaZ"]])
 
-        `say` is called with a line on each step, and `bar` shows the progress of one.
-        """
-        folder = run.folder
-        if not folder.parent.is_dir():
-            sentence = f"{folder}: the folder {folder.parent} does not exist. Create it first."
-            raise SettingError("output.no_folder", sentence, path=folder)
-        folder.mkdir(exist_ok=True)
-        self._path, self._keys, self._say, self._bar = folder / RECORD, run.keys(), say, bar
-        self._content: dict[str, Any] = {"options": run.settings(), "steps": {}}
-        self._earlier = read_steps(self._path) if self._path.exists() else {}
-        resumes = self._has(STEPS[0])
-        if not (run.options.overwrite or resumes) and any(folder.iterdir()):
-            sentence = f"{folder}: holds a run with other options or input files, or other files."
-            sentence += " Add --overwrite to replace them, or give another folder."
-            raise SettingError("run.other", sentence, path=folder)
-
-    def _has(self, step: str) -> bool:
-        return bool(self._earlier.get(step, {}).get("key") == self._keys[step])
-
-    def step(
-        self, name: str, title: str, outputs: Sequence[Path],
-        work: Callable[[Progress | None], Plain | None], text: str = "{main}",
-        main: Path | None = None,
-    ) -> Plain:  # fmt: skip
-        """Do a step unless it is done, and return its result.
-
-        `outputs` are all files that `work` writes, and `main` is shown to the user, by default the
-        first; with the `text`, in which values of the result have their names. The result has what
-        later steps need, in the types of JSON.
-        """
-        done, how = self._earlier.get(name, {}), "already done"
-        if not self._has(name) or done["outputs"] != [file_state(one) for one in outputs]:
-            self._earlier, how = {}, "done"  # later steps must be done again
-            with self._bar(title) as progress:
-                found = json.loads(json.dumps(work(progress)))
-            states = [file_state(one) for one in outputs]
-            done = {"key": self._keys[name], "outputs": states, "result": found}
-        self._content["steps"][name] = done
-        write_text(self._path, json_text(self._content), overwrite=True)
-        result: Plain = done["result"] or {}
-        if name != "adjust" or result["model"] is not None:
-            words = text.format(main=main or outputs[0], **result)
-            self._say(f"{name:<9} {how}: {words}")
-        return result
+    chunks = file_points(cloud, water, ("WaterDepth", "SigmaZ"))
+    lines = waterlines(map(columns, chunks), sigma_m)
+    values = {
+        figure: np.array([getattr(one, figure) for one in lines], np.float64)
+        for figure in ("level_m", "sigma_m", "length_m")
+    }
+    geometries = [shapely.linestrings(one.xy) for one in lines]
+    style = vector_style({"line": Symbol("line", RED, 0.5)})
+    return Layer("waterline", "LineString", geometries, values, style)
 
 
-def read_steps(path: Path) -> dict[str, Any]:
-    """Return the steps of a record by name."""
-    sentence = "is not the record of a run ({}). Remove it, or give another folder."
-    with refusing(path, "run.record", sentence):
-        steps: dict[str, Any] = read_json(path)["steps"]
-        _ = [(one["key"], one["outputs"], one["result"]) for one in steps.values()]
-    return steps
+def _checks(folder: Path, points: FloatArray, depths: File | None) -> list[Layer]:
+    """Return surveyed points with the differences of the cloud, or of the map of depths."""
+    symbol = {"point": Symbol("marker", ORANGE, 2.2, "diamond")}
+    style = vector_style(symbol, label="""format_number("residual_m", 2)""")
+    layers = []
+    if len(points):
+        values = {"z_m": points[:, 2], "residual_m": points[:, 3]}
+        places = list(shapely.points(points[:, :3]))
+        layers.append(Layer("check_points", "Point Z", places, values, style))
+    if depths is not None:
+        checks = read_check_depths(Path(depths))
+        raster = BED if checks.are_heights else DEPTH
+        more = rasters.values_at(folder / raster, checks.xy) - checks.value_m
+        values = {"measured_m": checks.value_m, "residual_m": more}
+        places = list(shapely.points(checks.xy))
+        layers.append(Layer("check_depths", "Point", places, values, style))
+    return layers
+
+
+# The report page
+
+MOST_PAGE_CELLS = 300_000
+"""Of the map on the page, so that this stays below 4 MB."""
+
+
+def report_run(
+    run: RunFolder, inputs: list[Path], first: Plain, corrected: Plain, compared: Plain
+) -> Plain:
+    """Write ``report.html`` and ``figures/*.png`` of a run, and return its main figures.
+
+    The page lists size and checksum of the files `inputs`. `first`, `corrected` and `compared` are
+    the results of these steps.
+    """
+    folder, options, summary = run.folder, run.options, Summary(**corrected)
+    names = [SURFACE, DEPTH, *([] if summary.uncertainty is None else [UNCERTAINTY])]
+    maps = _read_maps(run, [*names, *([DIFFERENCE] if compared and run.has_surface else [])])
+    more: Plain = {"verdict": "", "compared": compared.get("figures", {})}
+    if compared:
+        more["pictures"], more["tables"] = evaluation(
+            compared["figures"], compared["sections"], maps.lattice, maps.difference_m
+        )
+    if first["why"]:
+        how = "not adjusted:" if first["model"] is None else "adjusted first, as"
+        more["verdict"] = f" The cameras were {how} {first['why']}."
+    if first["model"] is not None:
+        more["verdict"] += f" {adjustment_sentence(read_json(folder / FOLDER / SUMMARY))}."
+    rows = [[path.name, f"{path.stat().st_size:,}", sha256(path)] for path in inputs]
+    files = []
+    for name, words in RESULTS.items():
+        tiles = folder / name.removesuffix(".laz")
+        if (folder / name).is_file():
+            files.append((name, words))
+        elif tiles.is_dir():  # of many files
+            files.append((f"{tiles.name}/", words))
+    sections = sorted(folder.glob("compare/section_*.csv"))
+    files += [(f"compare/{one.name}", "a cross-section") for one in sections]
+    page = run_report(
+        summary, run.cameras, maps, project=options.project or "", date=options.date or "",
+        inputs=[Table("Input files", ["file", "bytes", "SHA-256"], rows)], files=files, **more,
+    )  # fmt: skip
+    figures = folder / "figures"
+    figures.mkdir(exist_ok=True)
+    for picture in page.pictures:
+        write_bytes(figures / f"{picture.name}.png", picture.png, overwrite=True)
+    write_text(folder / PAGE, render(page), overwrite=True)
+    shown = (
+        f"{', '.join(filter(None, [tile.title, tile.tag]))}: "
+        + ", ".join(f"{name} {value}" for name, value in tile.figures)
+        for tile in page.tiles
+        if tile.figures
+    )
+    return {"in_short": "; ".join(shown)}
+
+
+def _read_maps(run: RunFolder, names: Sequence[str]) -> RunMaps:
+    """Read rasters of a run by name, in cells of theirs, or of several where there are many."""
+    with rasters.open_raster(run.folder / SURFACE) as surface:
+        fine = rasters.lattice_of(surface)
+    k = max(1, math.ceil(math.sqrt(fine.width * fine.height / MOST_PAGE_CELLS)))
+    column, row = fine.first_column // k, fine.first_row // k
+    width = (fine.first_column + fine.width - 1) // k - column + 1
+    height = (fine.first_row + fine.height - 1) // k - row + 1
+    lattice = Lattice(k * fine.resolution_m, column, row, width, height)
+    values = {name: rasters.read_onto(run.folder / name, lattice) for name in names}
+    with open_cloud(run.cloud("cleaned")) as source:
+        crs, heights = crs_words(stated_crs(source))
+    return RunMaps(
+        lattice, values[SURFACE], values[DEPTH],
+        values.get(UNCERTAINTY, np.full((height, width), np.nan)),
+        values.get(DIFFERENCE), crs, heights,
+    )  # fmt: skip

@@ -19,7 +19,6 @@ from pcfix.io.las.source import metric_crs, stated_crs
 from pcfix.io.tiles import CloudFiles, open_cloud
 from pcfix.io.vectors import SHORE_RADIUS_M, is_vector_file, read_shoreline
 from pcfix.io.water import rasters_of_images, read_water, read_water_raster
-from pcfix.label.labelling import Part
 from pcfix.model import (
     NOISE_CLASSES,
     Cameras,
@@ -33,6 +32,7 @@ from pcfix.model import (
 )
 from pcfix.options.declare import File
 from pcfix.options.shared import WaterOptions
+from pcfix.points.labelling import Part
 from pcfix.water.surface import Field, FoundSurface, build_fields, surface_above
 
 if TYPE_CHECKING:

@@ -26,6 +26,7 @@ from pcfix.options.declare import File, taken
 from pcfix.options.steps import CompareRules, ViewerOptions
 from pcfix.refract.tally import COVERAGE_95
 from pcfix.report.page import new_figure, png_of
+from pcfix.report.styles import limits_of
 from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:
@@ -37,7 +38,8 @@ SHOWN = ("WaterDepth", "SigmaZ", *SHIFTS)
 LINE_COLOURS = {"water": (0.65, 0.82, 0.89), "cameras": (0.04, 0.37, 0.54)}
 GREY = 0.72
 """Of points without a value, such as land where depths are shown."""
-MOST_PERCENT = 98.0
+BEYOND_PERCENT = 2.0
+"""Share of the values at either end that has the last colour."""
 COLOURS = {
     "depth": (DEPTH, "Depth below the water (m)", "WaterDepth", 1.0,
               "Give --water, or a cloud from 'pcfix correct'."),
@@ -197,7 +199,7 @@ def _grid(surface: WaterSurface, low: FloatArray, high: FloatArray) -> FloatArra
 
 
 def _scale_of(what: str, values: FloatArray) -> ScalarMappable:
-    """Return the colour scale of values, NaN where unknown; it leaves out 2 % at the ends.
+    """Return the colour scale of values, NaN where unknown.
 
     Its ``to_rgba`` gives colours; those of NaN are grey.
     """
@@ -205,13 +207,11 @@ def _scale_of(what: str, values: FloatArray) -> ScalarMappable:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    known = values[np.isfinite(values)]
     if what == "error":
-        high = max(float(np.percentile(np.abs(known), MOST_PERCENT)), 1e-3)
+        _, high = limits_of(np.abs(values), what, BEYOND_PERCENT)
         low = -high
     else:
-        low = float(np.percentile(known, 100.0 - MOST_PERCENT)) if what == "height" else 0.0
-        high = max(float(np.percentile(known, MOST_PERCENT)), low + 1e-3)
+        low, high = limits_of(values, what, BEYOND_PERCENT)
     ramp = colormaps[COLOURS[what][0]].with_extremes(bad=(GREY, GREY, GREY))
     return ScalarMappable(Normalize(low, high), ramp)
 

@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 from pcfix.errors import SettingError
 from pcfix.options.declare import File, OptionSet, numbers, option
@@ -122,11 +122,6 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
     """Grid land and bed without noise, or only the bed (class 40)."""
     fill: float | None = option(None, above=0)
     """Fill holes up to this width; they get count 0. [m]"""
-
-    @property
-    def cell_m(self) -> float:
-        """The resolution, which must be known."""
-        return cast(float, self.resolution)
 
     def check(self) -> None:
         """Check the rules between the value, the surface and the width of holes."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from pcfix.errors import GeometryError
-from pcfix.grid.heights import cell_statistics
+from pcfix.grid.lattice import cell_statistics
 from pcfix.lens.imaging import project
 from pcfix.model import BoolArray, FloatArray
 from pcfix.photos.mapping import Ground, Photo

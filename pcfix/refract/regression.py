@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pcfix.errors import GeometryError
-from pcfix.label.labelling import Part
 from pcfix.model import NOISE_CLASSES, FloatArray
+from pcfix.points.labelling import Part
 from pcfix.water.fit import NearestPoints
 from pcfix.water.surface import is_submerged
 

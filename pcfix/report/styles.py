@@ -19,13 +19,15 @@ RAMPS = {"depth": DEPTH, "height": HEIGHT, "uncertainty": UNCERTAINTY}
 """By the contents of a raster."""
 
 
-def limits_of(values: FloatArray, what: str) -> tuple[float, float]:
-    """Return the values for the first and the last colour of a map; NaN does not count."""
+def limits_of(values: FloatArray, what: str, percent: float = 0.5) -> tuple[float, float]:
+    """Return the values for the first and the last colour of a map; NaN does not count.
+
+    This percentage at either end shares the last colour, so that outliers do not count.
+    """
     known = values[np.isfinite(values)]
     if not known.size:
         return 0.0, 1.0
-    # half a percent at either end shares the last colour, so that outliers do not count
-    low, high = (float(value) for value in np.percentile(known, (0.5, 99.5)))
+    low, high = (float(value) for value in np.percentile(known, (percent, 100.0 - percent)))
     low = low if what == "height" else 0.0
     return low, max(high, low + 1e-3)
 

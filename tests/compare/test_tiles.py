@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pcfix import running
-from pcfix.clean import neighbours
 from pcfix.compare import m3c2
 from pcfix.errors import InputError
 from pcfix.flow.compare import compare_clouds
+from pcfix.points import neighbours
 from pcfix.running import threads
 from tests.compare.test_files import py4dgeo, write_las
 from tests.utils.codes import refused

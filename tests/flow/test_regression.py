@@ -8,9 +8,9 @@ import pytest
 import pcfix
 from pcfix.errors import GeometryError
 from pcfix.flow.planning import fit_check_depths
-from pcfix.label.labelling import Part
 from pcfix.model import Outcome, WaterPlane
 from pcfix.options.correct import ScienceOptions
+from pcfix.points.labelling import Part
 from pcfix.refract.batch import Learned
 from pcfix.refract.methods import correct
 from pcfix.refract.regression import NEIGHBOURS, DepthRegression, apparent_depths, fit_depths

@@ -18,7 +18,8 @@ import shapely
 
 import pcfix
 from pcfix.errors import InputError
-from pcfix.flow.run_folder import STEPS, Record, RunFolder
+from pcfix.flow.run import Record
+from pcfix.flow.run_folder import STEPS, RunFolder
 from pcfix.io import vectors
 from pcfix.io.rasters import values_at
 from pcfix.options.correct import RunOptions

@@ -8,9 +8,9 @@ import pytest
 import shapely
 
 import pcfix
-from pcfix.flow.outputs import waterline
-from pcfix.grid import shoreline
-from pcfix.grid.shoreline import NearWater
+from pcfix.flow.run_folder import waterline
+from pcfix.grid import maps
+from pcfix.grid.maps import waterlines
 from pcfix.io.scenes import write_scene
 from pcfix.simulate.scene import ORIGIN_M
 from pcfix.simulate.settings import Terrain
@@ -82,11 +82,11 @@ def island_and_pool(count=60_000, noise_m=0.02):
 
 @pytest.mark.parametrize("most", [2_000_000, 20_000])
 def test_islands_and_pools(monkeypatch, most):
-    monkeypatch.setattr(shoreline, "MOST_POINTS", most)
-    points, near = island_and_pool(), NearWater()
-    for part in np.array_split(points, 7):
-        near += NearWater.of(part + np.array([4e5, 4e6, 0.0]), part[:, 2], np.zeros(len(part)))
-    lines = near.lines(lambda xy: np.full(len(xy), 0.01))
+    monkeypatch.setattr(maps, "MOST_POINTS", most)
+    points = island_and_pool()
+    moved, above = points + np.array([4e5, 4e6, 0.0]), points[:, 2]
+    columns = np.column_stack([moved, above, np.zeros(len(points))])
+    lines = waterlines(np.array_split(columns, 7), 0.01)
     expected = [60.0, 16.0 * math.pi, 12.0 * math.pi, 8.0 * math.pi]
     assert [one.length_m for one in lines] == pytest.approx(expected, rel=0.05)
     closed = [bool((one.xy[0] == one.xy[-1]).all()) for one in lines]
@@ -104,6 +104,6 @@ def test_flat_water():
     rng = np.random.default_rng(2)
     x, y = rng.uniform(0.0, 50.0, (2, 20_000))
     above = -0.05 + rng.normal(0.0, 0.03, 20_000)
-    near = NearWater.of(np.column_stack([x, y, above]), above, np.zeros(len(x)))
-    assert sum(one.length_m for one in near.lines(lambda xy: np.full(len(xy), 0.02))) < 10.0
-    assert NearWater().lines(lambda xy: np.zeros(len(xy))) == []
+    columns = np.column_stack([x, y, above, above, np.zeros(len(x))])
+    assert sum(one.length_m for one in waterlines([columns], 0.02)) < 10.0
+    assert waterlines([], 0.0) == []

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.flow.outputs import report_run
-from pcfix.flow.run_folder import RunFolder
+from pcfix.flow.run_folder import RunFolder, report_run
 from pcfix.grid.lattice import Lattice
 from pcfix.options.correct import RunOptions
 from pcfix.report.page import Layer, Report, Table, Tile, render

@@ -12,7 +12,7 @@ import pcfix
 from pcfix.flow.clean import clean_file
 from pcfix.io.las.source import read_xyz
 from pcfix.options.steps import CleanRules
-from tests.clean.scenes import reasons_of, spoilt_scene
+from tests.points.scenes import reasons_of, spoilt_scene
 from tests.utils.clouds import (
     WATER_M,
     RawLas,

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 import pcfix
-from pcfix.clean.points import Cloud, ReasonArray, flag_neighbours
 from pcfix.model import BoolArray, FloatArray, WaterPlane
 from pcfix.options.steps import CleanRules
+from pcfix.points.noise import Cloud, ReasonArray, flag_neighbours
 from pcfix.water.surface import surface_above
 
 POINTS, OUTLIERS = 60_000, 300

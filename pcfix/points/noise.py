@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.clean.neighbours import PIECE_ROWS, SLACK, Neighbours, make_tiles
 from pcfix.errors import bad_file
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.options.steps import LEAST_NEIGHBOURS, CleanRules
+from pcfix.points.neighbours import PIECE_ROWS, SLACK, Neighbours, make_tiles
 from pcfix.running import current, row_numbers, subset
 from pcfix.water.surface import SurfaceAbove, is_submerged
 

@@ -29,7 +29,7 @@ of a LAS file at the distance of neighbours."""
 class Neighbours:
     """Search neighbours among the points of tiles, in space (3 axes) or in plan (2 axes)."""
 
-    def __init__(self, tiles: Tiles, axes: int) -> None:
+    def __init__(self, tiles: PointTiles, axes: int) -> None:
         from scipy.spatial import cKDTree  # slow to import
 
         self.tiles, self.axes, points = tiles, axes, tiles.xyz
@@ -86,7 +86,7 @@ _CELLS_ACROSS = 256
 
 
 @dataclass(frozen=True, eq=False)
-class Tiles:
+class PointTiles:
     """The m points of a cloud, sorted by tile."""
 
     xyz: FloatArray  # (m, 3), metres, world frame
@@ -113,7 +113,7 @@ class Tiles:
         return np.asarray(places[np.argsort(self.row[places])])
 
 
-def make_tiles(xyz: FloatArray, points: int | None = None) -> Tiles:
+def make_tiles(xyz: FloatArray, points: int | None = None) -> PointTiles:
     """Sort points into square tiles of about `points`, by default `POINTS_PER_TILE`.
 
     The tiles cover all but the outermost hundredth of the points, so that no outlier stretches
@@ -147,7 +147,7 @@ def make_tiles(xyz: FloatArray, points: int | None = None) -> Tiles:
         boxes.append(bounds(places[a:b]))
         release()
     low, high = np.swapaxes(np.array(boxes), 0, 1)
-    return Tiles(places, row, start, low, high)
+    return PointTiles(places, row, start, low, high)
 
 
 def spacing_m(xyz: FloatArray, side_m: float) -> float:

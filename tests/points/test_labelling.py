@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from pcfix.label.labelling import Labelling, Part
 from pcfix.options.shared import LandRules
+from pcfix.points.labelling import Labelling, Part
 from pcfix.water.surface import SurfaceAbove
 from tests.utils.codes import refused
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from pcfix.clean.points import Reason
 from pcfix.options.steps import CleanRules
-from tests.clean.scenes import reasons_of, spoilt_scene
+from pcfix.points.noise import Reason
+from tests.points.scenes import reasons_of, spoilt_scene
 from tests.utils.codes import refused
 
 

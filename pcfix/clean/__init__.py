@@ -1,1 +1,0 @@
-"""Noise: which points of a cloud are none of the ground."""
