@@ -33,7 +33,7 @@ from pcfix.io.tiles import CloudFiles, Clouds, cloud_of, inputs_of, open_cloud
 from pcfix.model import BATHYMETRIC_POINT, NOISE_CLASSES, FloatArray
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules
-from pcfix.report.styles import raster_style
+from pcfix.report.page import raster_style
 from pcfix.running import bounds, empty, release
 from pcfix.sums import Figures
 from pcfix.version import __version__

@@ -14,8 +14,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pcfix.adjust.diagnosis import MOST_STATED_M
-from pcfix.compare.m3c2 import load_py4dgeo
-from pcfix.errors import InputError, PcfixError, SettingError, bad_file, plain, silently
+from pcfix.compare.statistics import load_py4dgeo
+from pcfix.errors import (
+    InputError,
+    PcfixError,
+    SettingError,
+    analysis_library,
+    bad_file,
+    plain,
+    silently,
+)
 from pcfix.flow import outputs as results
 from pcfix.flow.adjust import FOLDER, MODELS, SUMMARY, adjust_into
 from pcfix.flow.clean import clean_file
@@ -34,7 +42,6 @@ from pcfix.io.files import ENSEMBLE, read_json
 from pcfix.io.ground_control import read_gnss
 from pcfix.io.las.source import RasterBand
 from pcfix.io.tiles import Tiles
-from pcfix.libraries import analysis_library
 from pcfix.model import WaterDimension
 from pcfix.options.correct import AdjustOptions, CorrectOptions, RunOptions
 from pcfix.options.declare import File, taken

@@ -8,6 +8,7 @@ from pcfix.errors import SettingError
 from pcfix.options.declare import File, OptionSet, number_or, option, options_of, words
 from pcfix.options.shared import (
     BandOption,
+    BudgetOptions,
     CameraFileOptions,
     IndexOptions,
     InputOptions,
@@ -116,23 +117,6 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
     def chooses_maps(self) -> bool:
         """Whether the base image of a point is the one with which the neighbouring bed agrees."""
         return self.method == "consistent" and self.matcher in ("depth-maps", "single-map")
-
-
-class BudgetOptions(OptionSet, panel=Panel.BUDGET):
-    """Standard deviations of the inputs of a correction; see `pcfix.refract.uncertainty`."""
-
-    sigma_image: float = option(0.5, least=0)
-    """Standard deviation of an image coordinate. [px]"""
-    sigma_level: float | None = option(None, least=0)
-    """Standard deviation of the water level. [m] [default: that of its fit, else 0.02]"""
-    sigma_index: float = option(0.002, least=0)
-    """Standard deviation of the refractive index."""
-    sigma_waves: float = option(0.0, least=0)
-    """Standard deviation of the slope of waves, independent for each ray. [deg]"""
-    sigma_centre: float = option(0.0, least=0)
-    """Standard deviation of a projection centre, along each axis. [m]"""
-    sigma_attitude: float = option(0.0, least=0)
-    """Standard deviation of the attitude, about each axis. [deg]"""
 
 
 class RefractionOptions(BudgetOptions, MethodOptions, panel=Panel.OUTPUT):

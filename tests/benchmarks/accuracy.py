@@ -39,7 +39,7 @@ import pcfix
 from pcfix.flow.planning import fit_check_depths
 from pcfix.io.views import ViewMatch, read_views
 from pcfix.label.labelling import Part
-from pcfix.options.correct import BudgetOptions
+from pcfix.options.shared import BudgetOptions
 from pcfix.simulate.tracing import piercing_points_of_planes, project
 from pcfix.water.surface import surface_above
 from tests.utils.consistent_twin import least_squares_points

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pcfix.clean.neighbours import Neighbours, make_tiles
-from pcfix.libraries import load_open3d
+from pcfix.errors import load_open3d
 from pcfix.options.steps import CleanRules
 from tests.clean.scenes import reasons_of, spoilt_scene
 from tests.utils.nightly import mostly_nightly
