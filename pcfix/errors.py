@@ -105,10 +105,6 @@ def plain(value: Any) -> Any:
     return value if isinstance(value, str | int | float | None) else str(value)
 
 
-MOST_LETTERS = 800
-_LIST = re.compile(r"\n(?=  )")
-
-
 def printable(message: str) -> str:
     """Escape characters that a terminal cannot show, because messages quote the contents of files.
 
@@ -118,9 +114,9 @@ def printable(message: str) -> str:
 
     def one_line(text: str) -> str:
         text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-        return text if len(text) <= MOST_LETTERS else f"{text[:540]} ... {text[-240:]}"
+        return text if len(text) <= 800 else f"{text[:540]} ... {text[-240:]}"
 
-    return "\n".join(map(one_line, _LIST.split(message)))
+    return "\n".join(map(one_line, re.split(r"\n(?=  )", message)))
 
 
 _REFUSALS = {

@@ -62,7 +62,6 @@ MOST_CELLS = 2**24
 """Maximum number of cells, for the memory; a larger cloud has larger cells."""
 POINTS_A_CELL = 4.0
 """Minimum mean number of points per occupied cell."""
-FINEST_M = 2.0**-10
 
 Values = npt.NDArray[Any]
 
@@ -101,7 +100,7 @@ class Cells:
         self._low, self._high = np.full(2, np.inf), np.full(2, -np.inf)
         if np.isfinite([low, high]).all() and (low <= high).all():
             self._low, self._high = low, high
-        self.frame = CellFrame(FINEST_M, 0, 0)
+        self.frame = CellFrame(2.0**-10, 0, 0)
         self.values = [np.empty((*layer.empty.shape, 0, 0), layer.empty.dtype) for layer in layers]
 
     def cover(self, low: FloatArray, high: FloatArray) -> None:

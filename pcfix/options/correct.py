@@ -221,11 +221,6 @@ class RunOptions(
     there are GNSS positions or --gcps."""
 
 
-def _lens_names(text: str) -> tuple[str, ...]:
-    names = words(text)
-    return () if names == ("none",) else names
-
-
 class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
     """The unknowns and weights of an adjustment."""
 
@@ -240,7 +235,9 @@ class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
     """Estimate the tilt too, with this standard deviation of the given one. [deg]"""
     sigma_index: float | None = option(None, above=0)
     """Estimate the refractive index too, with this standard deviation of the given one."""
-    lens_unknowns: tuple[LensUnknown, ...] | None = option(None, parse=_lens_names, metavar="NAMES")
+    lens_unknowns: tuple[LensUnknown, ...] | None = option(
+        None, metavar="NAMES", parse=lambda text: () if text.strip() == "none" else words(text)
+    )
     """Unknowns of the lens: none, or any of f,cx,cy,k1...,p1,p2,b1,b2. [default: those that the
     block determines]"""
     poses: Literal["free", "fixed"] = option("free")

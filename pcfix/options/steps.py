@@ -30,11 +30,8 @@ from pcfix.options.shared import (
 LEAST_NEIGHBOURS, MOST_NEIGHBOURS = 6, 500
 MAX_HOLE_CELLS = 1000
 MIN_RESOLUTION_M = 1e-4
-LEAST_PLANE_POINTS, PLANE_POINTS = 6, 8
-"""Reference points of each plane of a comparison: the fewest allowed, and the default."""
 
 DsmMethod = Literal["mean", "median", "min", "max", "tin"]
-SurfaceChoice = Literal["all", "bed"]
 
 
 class CleanRules(OptionSet, panel=Panel.TESTS):
@@ -119,7 +116,7 @@ class DsmRules(OptionSet, panel=Panel.RASTER):
     bed, at 95 %)."""
     method: DsmMethod = option("mean", basic=True)
     """Gridding method."""
-    surface: SurfaceChoice = option("all", basic=True)
+    surface: Literal["all", "bed"] = option("all", basic=True)
     """Grid land and bed without noise, or only the bed (class 40)."""
     fill: float | None = option(None, above=0)
     """Fill holes up to this width; they get count 0. [m]"""
@@ -225,7 +222,7 @@ class CompareRules(DistanceOptions, panel=Panel.FIGURES):
     """Compare only points of class 40, or below --water."""
     c2c_only: bool = option(False)
     """Compute only distances to the nearest point, no signed differences."""
-    neighbours: int = option(PLANE_POINTS, least=LEAST_PLANE_POINTS)
+    neighbours: int = option(8, least=6)
     """Number of reference points in each fitted plane."""
     bin_width: float = option(1.0, above=0)
     """Bin width of the table by depth. [m]"""

@@ -275,9 +275,6 @@ def _packed(whole_steps: FloatArray) -> str:
 
 # Styles for QGIS
 
-RAMPS = {"depth": DEPTH, "height": HEIGHT, "uncertainty": UNCERTAINTY}
-"""By the contents of a raster."""
-
 
 def limits_of(values: FloatArray, what: str) -> tuple[float, float]:
     """Return the values for the first and the last colour of a map; NaN does not count."""
@@ -293,9 +290,10 @@ def limits_of(values: FloatArray, what: str) -> tuple[float, float]:
 def raster_style(path: Path, what: str) -> str:
     """Return the style of a raster of one band, by what it holds."""
     low, high = limits_of(preview(path)[0], what)
+    ramp = {"depth": DEPTH, "height": HEIGHT, "uncertainty": UNCERTAINTY}[what]
     stops = [
         (f"{value:.6g}", "".join(f"{part:02x}" for part in colour), f"{value:.2f}")
-        for share, colour in stops_of(RAMPS[what])
+        for share, colour in stops_of(ramp)
         for value in (low + share * (high - low),)
     ]
     values = {"stops": stops, "low": f"{low:.6g}", "high": f"{high:.6g}"}
