@@ -5,6 +5,7 @@ is wrong with the value, what to do), and the values that a program may want.
 """
 
 import errno
+import importlib
 import math
 import re
 import sys
@@ -12,6 +13,7 @@ import warnings
 from collections.abc import Iterable
 from dataclasses import asdict, is_dataclass
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -103,10 +105,6 @@ def plain(value: Any) -> Any:
     return value if isinstance(value, str | int | float | None) else str(value)
 
 
-MOST_LETTERS = 800
-_LIST = re.compile(r"\n(?=  )")
-
-
 def printable(message: str) -> str:
     """Escape characters that a terminal cannot show, because messages quote the contents of files.
 
@@ -116,9 +114,9 @@ def printable(message: str) -> str:
 
     def one_line(text: str) -> str:
         text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-        return text if len(text) <= MOST_LETTERS else f"{text[:540]} ... {text[-240:]}"
+        return text if len(text) <= 800 else f"{text[:540]} ... {text[-240:]}"
 
-    return "\n".join(map(one_line, _LIST.split(message)))
+    return "\n".join(map(one_line, re.split(r"\n(?=  )", message)))
 
 
 _REFUSALS = {
@@ -144,3 +142,45 @@ def show_warning(
     del where, more
     if issubclass(category, PcfixWarning):
         sys.stderr.write(f"pcfix: warning: {message}\n")
+
+
+# Libraries that may be missing: those of extras, and open3d, which needs libusb
+
+
+def optional_library(name: str, extra: str, who: str) -> Any:
+    """Import a library of an extra; the error names the command that installs it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        root = Path(__file__).parents[1]
+        is_checkout = (root / "pyproject.toml").is_file()
+        what = f"-e '{root}[{extra}]'" if is_checkout else f"'pcfix[{extra}]'"
+        sentence = f"{who} needs {name}, which is not installed. Run: {sys.executable} -m pip"
+        sentence += f" install {what}"
+        raise InputError("library.missing", sentence, library=name, extra=extra) from error
+
+
+analysis_library = partial(optional_library, extra="analysis", who="This")
+photo_library = partial(optional_library, extra="photos", who="Work on photographs")
+
+
+def load_open3d(part: str = "open3d") -> Any:
+    """Import open3d, or a part of it, with libusb-1.0.
+
+    The camera drivers in open3d link to libusb-1.0 of the system, which servers often lack. The one
+    in the package libusb-package works as well.
+    """
+    import ctypes  # slow to import
+
+    try:
+        try:
+            import libusb_package
+
+            ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+        except (ImportError, OSError):
+            pass  # the libusb of the system may do
+        return importlib.import_module(part)
+    except (ImportError, OSError) as error:
+        sentence = f"open3d cannot be loaded ({error}). On Debian and Ubuntu: apt-get install"
+        sentence += " libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6."
+        raise InputError("library.missing", sentence, library="open3d") from error

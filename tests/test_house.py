@@ -19,11 +19,10 @@ HOUSE = Path(__file__).parents[1] / "pcfix"
 FLOORS = (
     ("version", "errors", "qgis"),
     ("running",),
-    ("libraries",),
     ("kernels",),
     ("options",),
-    ("model", "sums"),
-    ("cells",),
+    ("model",),
+    ("sums",),
     ("lens",),
     ("water",),
     ("points",),

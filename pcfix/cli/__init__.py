@@ -51,7 +51,14 @@ def main(tokens: Sequence[str] | None = None) -> None:
         # among them, often and at the end, took a fifth of the start.
         gc.set_threshold(500_000, 20, 50)
         atexit.register(gc.freeze)
-        _run(arguments)
+        warnings.showwarning = show_warning
+        everything = "--help-all" in arguments
+        shown = ["--help" if one == "--help-all" else one for one in arguments]
+        app = app_for(shown, everything=everything)
+        if shown in ([], *([name] for name in COMMANDS if name != "demo")):
+            app([*shown, "--help"], result_action="return_value")
+            sys.exit(2)
+        app(shown, exit_on_error=False, print_error=False, result_action="return_value")
     except (CycloptsError, UsageError) as error:
         words = ["pcfix", *(one for one in arguments[:1] if one in COMMANDS), "--help"]
         _stop(f"{printable(str(error))}\nTry '{' '.join(words)}'.", 2)
@@ -71,17 +78,6 @@ def main(tokens: Sequence[str] | None = None) -> None:
         if error.filename is None:
             raise
         _stop(printable(f"{error.filename}: {refusal(error)}."), 1)
-
-
-def _run(arguments: list[str]) -> None:
-    warnings.showwarning = show_warning
-    everything = "--help-all" in arguments
-    arguments = ["--help" if one == "--help-all" else one for one in arguments]
-    app = app_for(arguments, everything=everything)
-    if arguments in ([], *([name] for name in COMMANDS if name != "demo")):
-        app([*arguments, "--help"], result_action="return_value")
-        sys.exit(2)
-    app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
 
 
 def _end_by_signals(ended: list[int]) -> None:

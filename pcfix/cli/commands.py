@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pcfix
-from pcfix.cli.flags import COMMANDS, command, progress_bar, say, status_line
+from pcfix.cli.flags import COMMANDS, command, plugin_table, progress_bar, say, status_line
 from pcfix.options.correct import (
     AdjustOptions,
     CamerasCheckOptions,
@@ -18,15 +18,17 @@ from pcfix.options.correct import (
     RunOptions,
     WaterCheckOptions,
 )
-from pcfix.options.scenes import DemoOptions, PlanOptions, SimulateOptions
 from pcfix.options.shared import OverwriteOption, TileOptions
 from pcfix.options.steps import (
     CalmOptions,
     CleanOptions,
     CompareOptions,
+    DemoOptions,
     DsmOptions,
     OrthoOptions,
     PhotosOptions,
+    PlanOptions,
+    SimulateOptions,
     ViewerOptions,
 )
 
@@ -231,10 +233,10 @@ def qgis_plugin(out: Path, /, *, options: OverwriteOption, quiet: bool) -> None:
 
     In QGIS: Plugins > Manage and Install Plugins > Install from ZIP.
     """
-    from pcfix.cli.plugin import plugin_zip
-    from pcfix.io.files import write_bytes
+    from pcfix.io.files import packed_plugin, write_bytes
 
-    write_bytes(out, plugin_zip(COMMANDS), overwrite=options.overwrite)
+    plugin = packed_plugin(plugin_table(COMMANDS), pcfix.__version__)
+    write_bytes(out, plugin, overwrite=options.overwrite)
     say(
         f"{out}: install it in QGIS, then set its environment to {Path(sys.prefix)} in"
         " Settings > Options > Processing > Providers > pcfix.", quiet,

@@ -1,4 +1,4 @@
-"""Options as flags of the command line; progress; the printed summary."""
+"""Options as flags of the command line and as forms of QGIS; progress; the printed summary."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import inspect
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_type_hints
@@ -15,6 +15,7 @@ from cyclopts import Group, Parameter
 
 from pcfix.options.declare import Option, OptionSet, options_of
 from pcfix.options.shared import Panel
+from pcfix.version import __version__
 
 MANY = 20
 """If a command has more options, `--help` shows the basic ones, and `--help-all` all."""
@@ -118,6 +119,76 @@ def _keyword(one: Option, is_shown: bool) -> inspect.Parameter:
         one.name, inspect.Parameter.KEYWORD_ONLY, default=one.default,
         annotation=Annotated[kind, parameter],
     )  # fmt: skip
+
+
+# Forms of the plugin of QGIS
+
+OFFERED = ("run", "correct", "label", "water", "compare", "photos")
+_PLACES = {
+    "output": "written", "out_dir": "folder written", "images": "folder", "reference": "file",
+    "spec": "text",
+}  # fmt: skip
+"""Kinds of the positional arguments; the others are clouds."""
+
+
+def plugin_table(commands: Mapping[str, Command]) -> str:
+    """Return the forms of the `OFFERED` commands as JSON."""
+    import json  # slow to import
+
+    forms = [_form(name, commands[name]) for name in OFFERED]
+    return json.dumps({"version": __version__, "commands": forms}, indent=1) + "\n"
+
+
+def _form(name: str, command: Command) -> dict[str, Any]:
+    options = options_of(command.kind)
+    names = [one.name for one in options]
+    return {
+        "name": name,
+        "help": inspect.getdoc(command.call),
+        "places": [
+            {
+                "name": name,
+                "kind": _PLACES.get(name, "cloud"),
+                "help": command.helps[name],
+                "unit": "",
+                "default": None,
+                "needed": True,
+            }
+            for name, one in inspect.signature(command.call).parameters.items()
+            if one.kind is inspect.Parameter.POSITIONAL_ONLY
+        ],
+        "options": [_field(one, replaced=one.instead in names) for one in options],
+    }
+
+
+def _field(one: Option, *, replaced: bool) -> dict[str, Any]:
+    """Return an option as a field of a form; `replaced` if another option can replace it."""
+    plain = [x.__name__ for x in (bool, int, float) if one.kinds == (x,) and one.parse is None]
+    kind, default = plain[0] if plain else "text", one.default
+    if one.writes:
+        kind = "folder written" if one.name == "out_dir" else "written"
+    elif one.is_path:
+        kind = "file"
+    elif one.choices and one.parse is None:
+        kind = "choice"
+    if kind not in ("bool", "int", "float", "choice"):
+        default = None  # an empty text is pcfix's own default
+    help, _, unit = one.help.partition(" [")
+    default_words = f" Default: {one.default_text}." if one.default_text else ""
+    return {
+        "name": one.name,
+        "flag": one.flag,
+        "kind": kind,
+        "choices": list(one.choices),
+        "unit": unit.removesuffix("]"),
+        "default": default,
+        "repeated": one.repeats,
+        "needed": one.needed == "needed" and not replaced,
+        "help": help + default_words,
+    }
+
+
+# Progress and summary
 
 
 def _announce_compiling() -> None:

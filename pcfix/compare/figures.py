@@ -10,9 +10,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.compare.m3c2 import m3c2_distances
 from pcfix.compare.match import Match, heights_at, mean_spacing_m
-from pcfix.compare.statistics import binned, distribution_of, fit_line, statistics_of, tvu_of
+from pcfix.compare.statistics import (
+    binned,
+    distribution_of,
+    fit_line,
+    m3c2_distances,
+    statistics_of,
+    tvu_of,
+)
 from pcfix.errors import GeometryError, PcfixWarning, SettingError, plain
 from pcfix.model import FloatArray
 from pcfix.points.neighbours import nearest_distance, spacing_m

@@ -14,13 +14,6 @@ from pcfix.options.steps import CompareRules
 from pcfix.points.neighbours import nearest_of
 from pcfix.running import blocks, bounds, distinct, empty, mapped, subset
 
-GAP_SPACINGS, MIN_GAP_M = 5.0, 1.0
-"""A point counts up to this distance outside the other cloud, unless the user sets it."""
-MIN_SHAPE = 1e-3
-"""Points are on a line if the determinant of their covariance over its squared trace is less."""
-MAX_REACH = 3.0
-"""Largest distance of a place from the neighbours' centre, in their standard deviations."""
-
 
 @dataclass(frozen=True, eq=False)
 class SurveyCloud:
@@ -185,8 +178,8 @@ def match(survey: SurveyCloud, target: Reference, settings: CompareRules, *, giv
 
 
 def gap_m(xyz: FloatArray) -> float:
-    """Return up to which distance outside a cloud, (n, 3), points count, metres."""
-    return max(GAP_SPACINGS * mean_spacing_m(xyz), MIN_GAP_M)
+    """Return up to which distance outside a cloud, (n, 3), points count by default, metres."""
+    return max(5.0 * mean_spacing_m(xyz), 1.0)
 
 
 def mean_spacing_m(xyz: FloatArray) -> float:
@@ -238,14 +231,14 @@ def heights_at(xy: FloatArray, surface: FloatArray, neighbours: int) -> FloatArr
         uu, uv, vv = (u * u).mean(axis=1), (u * v).mean(axis=1), (v * v).mean(axis=1)
         uz, vz = (u * z).mean(axis=1), (v * z).mean(axis=1)
         determinant, trace = uu * vv - uv * uv, uu + vv
-        flat = determinant > MIN_SHAPE * trace * trace
+        flat = determinant > 1e-3 * trace * trace  # else the points are on a line
         safe = np.where(flat, determinant, 1.0)
         # normal equations of z = a + slope_u u + slope_v v about the mean
         slope_u, slope_v = (vv * uz - uv * vz) / safe, (uu * vz - uv * uz) / safe
         mu, mv = middle[:, 0], middle[:, 1]
         # squared distance of the place from the mean, in standard deviations (Mahalanobis)
         reach = (vv * mu * mu - 2.0 * uv * mu * mv + uu * mv * mv) / safe
-        fitted = flat & (reach <= MAX_REACH**2)
+        fitted = flat & (reach <= 3.0**2)
         plane = middle[:, 2] - slope_u * mu - slope_v * mv
         height[rows] = np.where(fitted, plane, near[:, 0, 2])
     return height

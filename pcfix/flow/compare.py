@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from pcfix.compare.figures import Comparison, bins_table, figures_of, parse_line
-from pcfix.compare.m3c2 import load_py4dgeo
 from pcfix.compare.match import Match, SurveyCloud, match
+from pcfix.compare.statistics import load_py4dgeo
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
 from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of

@@ -13,7 +13,7 @@ from pcfix.io.las.source import read_xyz
 from pcfix.io.scenes import write_scene
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
-from pcfix.options.scenes import BlockKind
+from pcfix.options.steps import BlockKind
 from pcfix.simulate.scene import Scene, simulate_scene
 
 LEAST_DEPTH_M = 0.2  # shallower points have no refraction worth a percentage

@@ -39,7 +39,7 @@ from pcfix.model import BATHYMETRIC_POINT, FloatArray
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules
 from pcfix.points.neighbours import PointTiles, make_tiles, spacing_m
-from pcfix.report.styles import raster_style
+from pcfix.report.page import raster_style
 from pcfix.running import bounds, empty, release
 from pcfix.sums import Figures
 from pcfix.version import __version__

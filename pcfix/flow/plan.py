@@ -23,9 +23,10 @@ from pcfix.flow.poses import pose_errors
 from pcfix.flow.runner import check_summary, write_summary
 from pcfix.flow.surfaces import Points
 from pcfix.model import Correction, FloatArray, GnssPositions, TiePoints, Views, WaterPlane
-from pcfix.options.correct import BudgetOptions, RefractionOptions, ScienceOptions
+from pcfix.options.correct import RefractionOptions, ScienceOptions
 from pcfix.options.declare import options_of, taken
-from pcfix.options.scenes import PlanOptions
+from pcfix.options.shared import BudgetOptions
+from pcfix.options.steps import PlanOptions
 from pcfix.refract.batch import Survey
 from pcfix.refract.tally import COVERAGE_95, ORDERS, largest_tvu_m
 from pcfix.report.page import Table

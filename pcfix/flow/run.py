@@ -15,8 +15,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pcfix.adjust.diagnosis import MOST_STATED_M
-from pcfix.compare.m3c2 import load_py4dgeo
-from pcfix.errors import InputError, PcfixError, SettingError, bad_file, plain, silently
+from pcfix.compare.statistics import load_py4dgeo
+from pcfix.errors import (
+    InputError,
+    PcfixError,
+    SettingError,
+    analysis_library,
+    bad_file,
+    plain,
+    silently,
+)
 from pcfix.flow import run_folder as results
 from pcfix.flow.adjust import FOLDER, MODELS, SUMMARY, adjust_into
 from pcfix.flow.clean import clean_file
@@ -33,7 +41,6 @@ from pcfix.io.clouds import is_cloud
 from pcfix.io.files import ENSEMBLE, file_state, read_json, refusing, write_text
 from pcfix.io.ground_control import read_gnss
 from pcfix.io.tiles import Tiles
-from pcfix.libraries import analysis_library
 from pcfix.model import WaterDimension
 from pcfix.options.correct import AdjustOptions, CorrectOptions, RunOptions
 from pcfix.options.declare import File, taken

@@ -55,9 +55,8 @@ from pcfix.options.declare import File, options_of
 from pcfix.options.steps import DistanceOptions, DsmOptions
 from pcfix.report.adjustment import adjustment_sentence
 from pcfix.report.comparison import evaluation
-from pcfix.report.page import Table, render
+from pcfix.report.page import Symbol, Table, limits_of, render, vector_style
 from pcfix.report.run import RunMaps, run_report
-from pcfix.report.styles import Symbol, limits_of, vector_style
 from pcfix.report.text import Plain, Summary
 from pcfix.version import __version__
 from pcfix.water.surface import surface_above

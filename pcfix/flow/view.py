@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pcfix.compare.match import gap_m, heights_at, near_in_plan
-from pcfix.errors import InputError, SettingError
+from pcfix.errors import InputError, SettingError, load_open3d
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.surfaces import find_surface, view_of
 from pcfix.grid.maps import DEPTH, DIFFERENCE, HEIGHT, UNCERTAINTY
@@ -20,13 +20,11 @@ from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.files import check_input, check_output, write_bytes
 from pcfix.io.las.columns import SHIFTS
 from pcfix.io.las.source import LasSource, coordinates, metric_crs
-from pcfix.libraries import load_open3d
 from pcfix.model import FloatArray, WaterDimension, WaterSurface
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import CompareRules, ViewerOptions
 from pcfix.refract.tally import COVERAGE_95
-from pcfix.report.page import new_figure, png_of
-from pcfix.report.styles import limits_of
+from pcfix.report.page import limits_of, new_figure, png_of
 from pcfix.water.surface import surface_above
 
 if TYPE_CHECKING:

@@ -24,8 +24,6 @@ OUTCOME = "Outcome"
 """A dimension with `pcfix.Outcome`, if ``add_dimension`` adds it."""
 CLASS_FLAGS = "ClassFlags=uint8"
 """To be added for PDAL 2.2, where point formats 0 to 5 have no such dimension."""
-_PACKED_FLAGS = 64
-"""Classes from this number on are the key point and withheld flags of point formats 0 to 5."""
 _WITHHELD_FLAG = 4
 """Bit of ClassFlags, which older PDAL has in place of the dimension Withheld."""
 
@@ -44,9 +42,14 @@ class PdalCloud:
 
     def __init__(self, ins: Dimensions, metadata: Metadata | None) -> None:
         self.ins = ins
-        readers = _children(metadata, "readers.")
-        values = {name: {c["value"] for c in readers if c["name"] == name} for name in _READ}
-        scales, crs = [values[f"scale_{axis}"] for axis in "xyz"], values[_CRS]
+        stages = (metadata or {}).get("children", [])
+        readers = [one for one in stages if one["name"].startswith("readers.")]
+        facts = [fact for one in readers for fact in one.get("children", [])]
+
+        def values(name: str) -> set[Any]:
+            return {fact["value"] for fact in facts if fact["name"] == name}
+
+        scales, crs = [values(f"scale_{axis}") for axis in "xyz"], values("comp_spatialreference")
         is_one = all(len(found) == 1 for found in scales)
         self.scales = np.array([float(*found) for found in scales]) if is_one else None
         self.crs: str | None = (crs.pop() or None) if len(crs) == 1 else None
@@ -54,10 +57,11 @@ class PdalCloud:
             raise _missing("Classification", "uint8")
         self.classes = np.array(ins["Classification"], order="C")
         self._class_flags = np.array(ins["ClassFlags"]) if "ClassFlags" in ins else None
-        if "Withheld" not in ins and any(int(form) < 6 for form in values[_FORMAT]):
+        if "Withheld" not in ins and any(int(form) < 6 for form in values("dataformat_id")):
             if self._class_flags is None:
                 raise _missing(*CLASS_FLAGS.split("="))
-            if len(self.classes) and self.classes.max() >= _PACKED_FLAGS:
+            # classes from 64 on are the key point and withheld flags of point formats 0 to 5
+            if len(self.classes) and self.classes.max() >= 64:
                 words = "has flags in Classification, where PDAL before 2.5 leaves those of point"
                 words += " formats 0 to 5. Convert the cloud to format 6 first."
                 raise SettingError("cloud.packed", f"{NAME}: {words}")
@@ -108,17 +112,6 @@ class PdalCloud:
             with_bit = np.where(self.withheld, flags | _WITHHELD_FLAG, flags)
             out["ClassFlags"] = with_bit.astype(flags.dtype)
         return out
-
-
-_CRS, _FORMAT = "comp_spatialreference", "dataformat_id"
-_READ = ("scale_x", "scale_y", "scale_z", _CRS, _FORMAT)
-"""Metadata of a reader."""
-
-
-def _children(metadata: Metadata | None, kind: str) -> list[Metadata]:
-    """Return the metadata of the stages of a kind."""
-    stages = [one for one in (metadata or {}).get("children", []) if one["name"].startswith(kind)]
-    return [child for stage in stages for child in stage.get("children", [])]
 
 
 def _missing(dimension: str, kind: str) -> SettingError:

@@ -18,9 +18,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import SettingError, bad_file
+from pcfix.errors import SettingError, bad_file, photo_library
 from pcfix.io.files import check_output, refusing, temporary_output
-from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray
 from pcfix.options.declare import File
 

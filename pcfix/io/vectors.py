@@ -13,11 +13,10 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from pcfix.errors import bad_file, warn
+from pcfix.errors import bad_file, optional_library, warn
 from pcfix.io import tables
 from pcfix.io.crs import parse_crs, plan_unit, to_cloud_crs
 from pcfix.io.files import cannot_write, check_input, check_output, temporary_output
-from pcfix.libraries import optional_library
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
 

@@ -8,6 +8,7 @@ from pcfix.errors import SettingError
 from pcfix.options.declare import File, OptionSet, number_or, option, options_of, words
 from pcfix.options.shared import (
     BandOption,
+    BudgetOptions,
     CameraFileOptions,
     IndexOptions,
     InputOptions,
@@ -118,23 +119,6 @@ class MethodOptions(IndexOptions, panel=Panel.METHOD):
         return self.method == "consistent" and self.matcher in ("depth-maps", "single-map")
 
 
-class BudgetOptions(OptionSet, panel=Panel.BUDGET):
-    """Standard deviations of the inputs of a correction; see `pcfix.refract.uncertainty`."""
-
-    sigma_image: float = option(0.5, least=0)
-    """Standard deviation of an image coordinate. [px]"""
-    sigma_level: float | None = option(None, least=0)
-    """Standard deviation of the water level. [m] [default: that of its fit, else 0.02]"""
-    sigma_index: float = option(0.002, least=0)
-    """Standard deviation of the refractive index."""
-    sigma_waves: float = option(0.0, least=0)
-    """Standard deviation of the slope of waves, independent for each ray. [deg]"""
-    sigma_centre: float = option(0.0, least=0)
-    """Standard deviation of a projection centre, along each axis. [m]"""
-    sigma_attitude: float = option(0.0, least=0)
-    """Standard deviation of the attitude, about each axis. [deg]"""
-
-
 class RefractionOptions(BudgetOptions, MethodOptions, panel=Panel.OUTPUT):
     """All options that affect the correction of points."""
 
@@ -237,11 +221,6 @@ class RunOptions(
     there are GNSS positions or --gcps."""
 
 
-def _lens_names(text: str) -> tuple[str, ...]:
-    names = words(text)
-    return () if names == ("none",) else names
-
-
 class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
     """The unknowns and weights of an adjustment."""
 
@@ -256,7 +235,9 @@ class AdjustRules(IndexOptions, panel=Panel.UNKNOWNS):
     """Estimate the tilt too, with this standard deviation of the given one. [deg]"""
     sigma_index: float | None = option(None, above=0)
     """Estimate the refractive index too, with this standard deviation of the given one."""
-    lens_unknowns: tuple[LensUnknown, ...] | None = option(None, parse=_lens_names, metavar="NAMES")
+    lens_unknowns: tuple[LensUnknown, ...] | None = option(
+        None, metavar="NAMES", parse=lambda text: () if text.strip() == "none" else words(text)
+    )
     """Unknowns of the lens: none, or any of f,cx,cy,k1...,p1,p2,b1,b2. [default: those that the
     block determines]"""
     poses: Literal["free", "fixed"] = option("free")

@@ -170,6 +170,23 @@ class InputOptions(SurveyOptions, PortOptions):
     """Inputs of any correction: through a water surface, or the port of a housing."""
 
 
+class BudgetOptions(OptionSet, panel=Panel.BUDGET):
+    """Standard deviations of the inputs of a correction; see `pcfix.refract.uncertainty`."""
+
+    sigma_image: float = option(0.5, least=0)
+    """Standard deviation of an image coordinate. [px]"""
+    sigma_level: float | None = option(None, least=0)
+    """Standard deviation of the water level. [m] [default: that of its fit, else 0.02]"""
+    sigma_index: float = option(0.002, least=0)
+    """Standard deviation of the refractive index."""
+    sigma_waves: float = option(0.0, least=0)
+    """Standard deviation of the slope of waves, independent for each ray. [deg]"""
+    sigma_centre: float = option(0.0, least=0)
+    """Standard deviation of a projection centre, along each axis. [m]"""
+    sigma_attitude: float = option(0.0, least=0)
+    """Standard deviation of the attitude, about each axis. [deg]"""
+
+
 class BandOption(OptionSet, panel=Panel.INPUT):
     """The band of a raster that has the heights."""
 

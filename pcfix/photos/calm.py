@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.libraries import photo_library
+from pcfix.errors import photo_library
 from pcfix.model import BoolArray, FloatArray
 from pcfix.photos.mapping import by_bands
 

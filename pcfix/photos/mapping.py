@@ -25,9 +25,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import SettingError
+from pcfix.errors import SettingError, load_open3d, photo_library
 from pcfix.lens.imaging import project, unproject
-from pcfix.libraries import load_open3d, photo_library
 from pcfix.model import BoolArray, FloatArray, Lens, WaterMesh, WaterPlane, WaterRaster
 from pcfix.refract.tracing import trace
 from pcfix.water.surface import surface_above

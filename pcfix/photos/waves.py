@@ -40,9 +40,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.errors import GeometryError
+from pcfix.errors import GeometryError, photo_library
 from pcfix.grid.lattice import Lattice
-from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.photos.calm import grey8
 from pcfix.photos.mapping import Photo

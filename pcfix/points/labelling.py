@@ -14,11 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.cells import CellFrame, Cells, Layer
 from pcfix.errors import GeometryError
 from pcfix.model import BATHYMETRIC_POINT, BoolArray, FloatArray
 from pcfix.options.shared import LandRules
-from pcfix.sums import LEAST, Sums
+from pcfix.sums import LEAST, CellFrame, Cells, Layer, Sums
 from pcfix.water.surface import SurfaceAbove, is_submerged
 
 Classes = npt.NDArray[np.uint8]

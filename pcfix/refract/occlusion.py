@@ -20,10 +20,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from pcfix.cells import MOST_CELLS, Cells, Layer
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.model import NOISE_CLASSES, BoolArray, Cameras, FloatArray, IntArray, Views
 from pcfix.options.correct import ScienceOptions
+from pcfix.sums import MOST_CELLS, Cells, Layer
 
 Heights = npt.NDArray[np.float32]
 

@@ -170,7 +170,15 @@ def evaluation(
             f"Error against depth: mean and standard deviation of the vertical error in {len(bins)}"
             " classes, before and after the correction."
         )
-        figure = _depth_figure(bins)
+        figure, axes = new_figure()
+        axes.axhline(0.0, color="0.5", linewidth=0.8)
+        for when, name, colour in TIMES:
+            if known := [b for b in bins if b[when] is not None]:
+                middle = [(b["from_m"] + b["to_m"]) / 2.0 for b in known]
+                mean, sd = ([b[when][key] for b in known] for key in ("mean_m", "sd_m"))
+                axes.errorbar(middle, mean, sd, fmt="o-", color=colour, capsize=3, label=name)
+        axes.set(xlabel="Reference depth (m)", ylabel="Cloud minus reference, Z (m)")
+        axes.legend(loc="best")
         pictures.append(Picture("depth_bins", "Error against depth", alt, figure))
     pictures += [_section(number, one) for number, one in enumerate(sections, start=1)]
     return pictures, _tables(compared)
@@ -210,21 +218,6 @@ def _histograms(columns: list[list[Errors]], label: str, *, sharex: bool) -> Fig
         axes.set_title(words, fontsize="medium")
     for axes in panels[-1]:
         axes.set_xlabel(label)
-    return figure
-
-
-def _depth_figure(bins: list[Plain]) -> Figure:
-    """Draw the mean error of each class of depth, with its standard deviation."""
-    figure, axes = new_figure()
-    axes.axhline(0.0, color="0.5", linewidth=0.8)
-    for when, name, colour in TIMES:
-        known = [b for b in bins if b[when] is not None]
-        if known:
-            middle = [(b["from_m"] + b["to_m"]) / 2.0 for b in known]
-            mean, sd = ([b[when][key] for b in known] for key in ("mean_m", "sd_m"))
-            axes.errorbar(middle, mean, sd, fmt="o-", color=colour, capsize=3, label=name)
-    axes.set(xlabel="Reference depth (m)", ylabel="Cloud minus reference, Z (m)")
-    axes.legend(loc="best")
     return figure
 
 

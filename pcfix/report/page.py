@@ -1,4 +1,7 @@
-"""The report page for a client, one HTML file with everything inside, and what its figures share.
+"""The report page for a client, one HTML file with everything inside; what its figures share.
+
+Styles for QGIS (QML) have the same colours. QGIS reads the style of a raster from the ``.qml`` file
+of its name, and those of a GeoPackage from its table ``layer_styles``.
 
 Matplotlib is imported when a figure is drawn.
 """
@@ -10,17 +13,27 @@ import io
 import json
 import re
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from glob import has_magic
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from pcfix.grid.lattice import Lattice
-from pcfix.grid.maps import HEIGHT, contours, depth_interval, hillshade, smoothed, stops_of
+from pcfix.grid.maps import (
+    DEPTH,
+    HEIGHT,
+    UNCERTAINTY,
+    contours,
+    depth_interval,
+    hillshade,
+    smoothed,
+    stops_of,
+)
+from pcfix.io.rasters import preview
 from pcfix.model import FloatArray
 from pcfix.sums import nice_step
 
@@ -172,16 +185,20 @@ def _as_read(value: Any) -> Any:
 
 def render(report: Report) -> str:
     """Return the page; it uses no address outside itself, and works without scripts."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    template = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True, finalize=_as_read,
-    ).get_template("page.html.j2")  # fmt: skip
     data = None
     if report.lattice is not None and report.height_m is not None:
         data = map_json(report.lattice, report.height_m, report.layers)
-    return template.render(report=report, map_data=data)
+    return _filled("page.html.j2", {"report": report, "map_data": data}, _as_read)
+
+
+def _filled(template: str, values: dict[str, Any], shown: Callable[[Any], Any] | None) -> str:
+    """Fill a template of this folder; `shown` turns each value into the one to show."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    return Environment(
+        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True, finalize=shown,
+    ).get_template(template).render(values)  # fmt: skip
 
 
 _NO_DATA = -32768
@@ -254,3 +271,50 @@ def _packed(whole_steps: FloatArray) -> str:
     flat = whole_steps.astype("<i2").ravel()
     steps = np.diff(flat, prepend=np.zeros(1, "<i2")).astype("<i2")
     return base64.b64encode(zlib.compress(steps.tobytes(), 9)).decode()
+
+
+# Styles for QGIS
+
+
+def limits_of(values: FloatArray, what: str, percent: float = 0.5) -> tuple[float, float]:
+    """Return the values for the first and the last colour of a map; NaN does not count.
+
+    This percentage at either end shares the last colour, so that outliers do not count.
+    """
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return 0.0, 1.0
+    low, high = (float(value) for value in np.percentile(known, (percent, 100.0 - percent)))
+    low = low if what == "height" else 0.0
+    return low, max(high, low + 1e-3)
+
+
+def raster_style(path: Path, what: str) -> str:
+    """Return the style of a raster of one band, by what it holds."""
+    low, high = limits_of(preview(path)[0], what)
+    ramp = {"depth": DEPTH, "height": HEIGHT, "uncertainty": UNCERTAINTY}[what]
+    stops = [
+        (f"{value:.6g}", "".join(f"{part:02x}" for part in colour), f"{value:.2f}")
+        for share, colour in stops_of(ramp)
+        for value in (low + share * (high - low),)
+    ]
+    values = {"stops": stops, "low": f"{low:.6g}", "high": f"{high:.6g}"}
+    return _filled("style.qml.j2", values, None) + "\n"
+
+
+class Symbol(NamedTuple):
+    """How the features of a layer look: of points the `size`, of lines the width, millimetres."""
+
+    kind: str  # marker, line or fill
+    colour: tuple[int, ...]
+    size: float
+    shape: str = "circle"
+
+
+def vector_style(symbols: dict[str, Symbol], attribute: str = "", label: str = "") -> str:
+    """Return the style of a layer: one symbol, or one for each value of an attribute.
+
+    The label is an expression of QGIS.
+    """
+    values = {"stops": (), "symbols": symbols, "attribute": attribute, "label": label}
+    return _filled("style.qml.j2", values, None) + "\n"

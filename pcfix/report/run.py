@@ -33,12 +33,9 @@ from pcfix.report.text import Summary, formal_words, summary_rows
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Plain = dict[str, Any]
-FIRST_FIGURES = ("section_1", "depth_bins", "uncertainty", "cameras")
-"""They come before the others; the page shows four and folds the rest."""
 
 
 class RunMaps(NamedTuple):
@@ -100,7 +97,9 @@ def run_report(
     ]
     libraries = [[name, version(name)] for name in ("numpy", "scipy", "numba", "laspy", "lazrs")]
     versions = [["pcfix", __version__], ["Python", platform.python_version()], *libraries]
-    order = {name: place for place, name in enumerate(FIRST_FIGURES)}
+    # these come before the others, as the page shows four and folds the rest
+    first = "section_1", "depth_bins", "uncertainty", "cameras"
+    order = {name: place for place, name in enumerate(first)}
     pictures = [*_pictures(s, cameras, maps, compared), *pictures]
     return Report(
         title=project or Path(name_of(s.input)).stem,
@@ -167,7 +166,14 @@ def _pictures(s: Summary, cameras: Cameras, maps: RunMaps, compared: Plain) -> l
     if s.cameras:
         alt = f"Projection centres over the cloud; {s.cameras_used} of {s.cameras} were used."
         figure = map_figure(maps.depth_m, lattice, "Depth (m)", shade, cmap=DEPTH)
-        draw_cameras(figure.axes[0], cameras, s.cameras_unused)
+        used, plan = ~np.isin(np.array(cameras.labels), s.cameras_unused), figure.axes[0]
+        looks = (used, "o", AFTER, "used"), (~used, "x", BEFORE, "not used")
+        for chosen, mark, colour, name in looks:
+            if chosen.any():
+                x, y, _ = cameras.centres[chosen].T
+                plan.plot(x, y, mark, color=colour, label=name, markersize=4)
+        # above the axes, where it covers no camera
+        plan.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False)
         pictures.append(Picture("cameras", "Cameras", alt, figure))
     known = np.isfinite(maps.depth_m) & np.isfinite(maps.uncertainty_m)
     if s.uncertainty is not None and known.any():
@@ -181,17 +187,6 @@ def _pictures(s: Summary, cameras: Cameras, maps: RunMaps, compared: Plain) -> l
         figure = tvu_figure(maps.depth_m[known], maps.uncertainty_m[known], bins)
         pictures.append(Picture("uncertainty", "Vertical uncertainty", alt, figure))
     return pictures
-
-
-def draw_cameras(plan: Axes, cameras: Cameras, unused: Sequence[str]) -> None:
-    """Draw the projection centres on a map."""
-    used = ~np.isin(np.array(cameras.labels), unused)
-    for chosen, mark, colour, name in (used, "o", AFTER, "used"), (~used, "x", BEFORE, "not used"):
-        if chosen.any():
-            x, y, _ = cameras.centres[chosen].T
-            plan.plot(x, y, mark, color=colour, label=name, markersize=4)
-    # above the axes, where it covers no camera
-    plan.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False)
 
 
 def tvu_figure(depth_m: FloatArray, tvu_m: FloatArray, measured: Sequence[Plain]) -> Figure:

@@ -12,7 +12,7 @@ report page use the same rows.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from string import Formatter
 from textwrap import fill
 from typing import Any
@@ -211,23 +211,17 @@ def filled(table: RowTable, values: Plain) -> Rows:
     """Return labels and texts of the rows of a table whose values are known."""
     words, rows = _Words(values), Rows()
     for label, text, needs in table:
-        for one in _repeats(needs, words.known(needs.lstrip("*!"))):
-            rows.append((words.written(label, one), words.written(text, one)))
+        needed = words.known(needs.lstrip("*!"))
+        repeats: list[Plain]  # the further values of each time that the row is shown
+        if not needs.startswith("*"):
+            repeats = [{}] if needed is not None and bool(needed) != needs.startswith("!") else []
+        elif isinstance(needed, dict):
+            counts = {name.replace("_", " "): count for name, count in needed.items() if count}
+            repeats = [{"name": name, "count": count} for name, count in counts.items()]
+        else:
+            repeats = [one if isinstance(one, dict) else {"text": one} for one in needed or ()]
+        rows += [(words.written(label, one), words.written(text, one)) for one in repeats]
     return rows
-
-
-def _repeats(needs: str, needed: Any) -> Iterator[Plain]:
-    """Yield the further values of each time that a row is shown."""
-    if not needs.startswith("*"):
-        if needed is not None and bool(needed) != needs.startswith("!"):
-            yield {}
-    elif isinstance(needed, dict):
-        for name, count in needed.items():
-            if count:
-                yield {"name": name.replace("_", " "), "count": count}
-    else:
-        for one in needed or ():
-            yield one if isinstance(one, dict) else {"text": one}
 
 
 def aligned(head: str, rows: Iterable[tuple[str, str]], notes: Iterable[object] = ()) -> str:

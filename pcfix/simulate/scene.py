@@ -11,7 +11,7 @@ import numpy as np
 from pcfix.lens.rotations import from_yaw_pitch_roll
 from pcfix.model import Cameras, FloatArray, IntArray, Views, WaterPlane
 from pcfix.options.declare import taken
-from pcfix.options.scenes import SceneOptions
+from pcfix.options.steps import SceneOptions
 from pcfix.simulate.settings import Optics, SceneSettings, Terrain
 from pcfix.simulate.tracing import (
     anchors_and_normals,

@@ -15,7 +15,7 @@ from scipy.special import expit
 from pcfix.errors import SettingError
 from pcfix.lens.imaging import project, unproject
 from pcfix.model import FloatArray, Lens, WaterPlane
-from pcfix.options.scenes import BedKind, SceneOptions
+from pcfix.options.steps import BedKind, SceneOptions
 from pcfix.water.index import index_of
 
 

@@ -38,7 +38,7 @@ from scipy.ndimage import map_coordinates
 import pcfix
 from pcfix.flow.planning import fit_check_depths
 from pcfix.io.views import ViewMatch, read_views
-from pcfix.options.correct import BudgetOptions
+from pcfix.options.shared import BudgetOptions
 from pcfix.points.labelling import Part
 from pcfix.simulate.tracing import piercing_points_of_planes, project
 from pcfix.water.surface import surface_above

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pcfix import running
-from pcfix.compare import m3c2
+from pcfix.compare.statistics import m3c2_distances
 from pcfix.errors import InputError
 from pcfix.flow.compare import compare_clouds
 from pcfix.points import neighbours
@@ -103,7 +103,7 @@ def m3c2_twin(cloud, reference, core, normal_m, cylinder_m, reach_m):
 def test_m3c2():
     """Were the core point on the border of two pieces of the cylinder, one in two would be off."""
     cloud, reference = bed(1200, 1, 0.05), bed(900, 2)
-    found = m3c2.m3c2_distances(cloud, reference, 1.84)
+    found = m3c2_distances(cloud, reference, 1.84)
     radii = found.normal_radius_m, found.cylinder_radius_m, found.max_distance_m
     expected = m3c2_twin(cloud, reference, cloud, *radii)
     expected = expected[np.isfinite(expected)]

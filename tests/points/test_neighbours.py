@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pcfix.libraries import load_open3d
+from pcfix.errors import load_open3d
 from pcfix.options.steps import CleanRules
 from pcfix.points.neighbours import Neighbours, make_tiles
 from tests.points.scenes import reasons_of, spoilt_scene

@@ -15,7 +15,8 @@ import pytest
 
 import pcfix
 from pcfix.cli.commands import COMMANDS
-from pcfix.cli.plugin import OFFERED, plugin_zip
+from pcfix.cli.flags import OFFERED, plugin_table
+from pcfix.io.files import packed_plugin
 from pcfix.io.scenes import write_scene
 from pcfix.options.correct import RunOptions
 from pcfix.options.declare import options_of
@@ -26,7 +27,7 @@ QGIS = shutil.which("qgis_process.bin") or shutil.which("qgis_process")
 
 @pytest.fixture(scope="module")
 def packed():
-    return plugin_zip(COMMANDS)
+    return packed_plugin(plugin_table(COMMANDS), pcfix.__version__)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from pcfix.model import WaterPlane
-from pcfix.options.correct import LEVEL_M, BudgetOptions, ScienceOptions
+from pcfix.options.correct import LEVEL_M, ScienceOptions
+from pcfix.options.shared import BudgetOptions
 from pcfix.refract import uncertainty
 from pcfix.refract.batch import Learned
 from pcfix.refract.intersect import intersect

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pcfix.model import Cameras, FloatArray, Lens, Views
-from pcfix.options.correct import BudgetOptions
+from pcfix.options.shared import BudgetOptions
 from pcfix.simulate.tracing import project, triangulate
 from tests.utils.bed_rays import piercing_points
 
