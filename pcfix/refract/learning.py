@@ -135,7 +135,7 @@ def learn_of_sample(
     sample = replace(submerged_of(batch), survey=survey)
     of_type = sample if near is None else replace(near, survey=survey)
     survey, verdicts = _weighed(of_type, hint)
-    settings, learned = survey.settings, survey.learned._replace(land=None)
+    settings, learned = survey.settings, survey.learned
     if batch.original_model is not None:
         # land has the reconstruction type of the cloud, also where a formula corrects the bed
         land = on_land(survey)
