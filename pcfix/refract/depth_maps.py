@@ -56,8 +56,8 @@ from pcfix.refract.fusion import (
     room_for_maps,
     set_weights,
 )
-from pcfix.refract.likelihood import Candidates
-from pcfix.refract.matcher import LEAST_NEAR, NEAR, Matcher
+from pcfix.refract.matcher import LEAST_NEAR, NEAR, NEAR_WIDTH_M, Matcher
+from pcfix.refract.patches import Candidates
 from pcfix.refract.rays import light_near, refracted
 from pcfix.refract.tiling import TILE, are_same, put, slots, three
 
@@ -199,8 +199,12 @@ def _invert_all(
         raise ValueError("a model of the matcher is needed")
     listed = rays.kind == "depth-maps" and likely is None
     if software in SINGLE:
-        nearest = software == "nearest-map"
-        matcher = matcher.of_single_maps(1 if listed else least, nearest=nearest)
+        none = np.zeros((len(matcher.near), 0), np.int64)
+        matcher = matcher._replace(
+            matched=matcher.near, averaged=none, fused=none, tolerance_px2=np.inf,
+            width_m=NEAR_WIDTH_M, least=1 if listed else least,
+            is_nearest=software == "nearest-map",
+        )  # fmt: skip
     images, z = images_of(batch.original_model, survey.cameras), batch.xyz[:, 2]
     points, weight = batch.chosen(), np.zeros(0)
     if listed and rays.weight is not None:

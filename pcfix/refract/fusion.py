@@ -16,9 +16,17 @@ to the distance of P, and a bed that is higher by r at d_q + s_q r.
    points of a place come from a few groups, and each group has the bed at another apparent height:
    a metre apart under deep water, where there are obliques. Neighbouring points come from different
    groups, and only the true bed is among the likely ones of all. The bed of the surroundings
-   (`pcfix.refract.bed`) identifies the group of each point.
+   identifies the group of each point.
 
 A view list names the maps that were fused: the list is the only group, and all its depths count.
+
+The bed of the surroundings is the height that most points of a place can have come from. A point
+has a likely bed b for each group that may have made it, all equally probable. In a cell of a grid
+the bed is the height z with the largest
+
+    sum over its points of  log(OUTLIER + sum_b exp(-((b - z) / width)^2 / 2))
+
+It serves only to choose among the likely beds of a point; no point is put onto it.
 """
 
 from __future__ import annotations
@@ -27,7 +35,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pcfix.kernels import device
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.matcher import Matcher
 
@@ -39,6 +47,17 @@ AGREE = 0.01  # depths that differ by less, relative, are fused
 _ROUNDS, _ROUNDS_OF_LIST = 1, 2  # how often the maps are chosen again for the bed of a group
 
 ABSENT = -1
+
+POINTS_A_CELL, MOST_CELLS = 12.0, 4_000_000
+WIDTH_GSD = 2.0
+"""Standard deviation of the likely beds of one place: relief within a cell, and noise."""
+OUTLIER = 0.01
+"""Likelihood of a point none of whose likely beds is near, relative to one that has one there."""
+BINS, DEVIATIONS = 2.0, 3
+"""Bins for a standard deviation of the likely beds, and how many deviations count to both sides."""
+FAR_OFF_M, REACH = 0.4, 2
+"""A cell that is farther than this from the median of its neighbours, up to `REACH` cells to each
+side, gets that median."""
 
 
 class PointMaps(NamedTuple):
@@ -63,7 +82,7 @@ class PointMaps(NamedTuple):
 
 
 class Bed(NamedTuple):
-    """The bed of the surroundings as heights on a grid; see `pcfix.refract.bed`."""
+    """The bed of the surroundings as heights on a grid; see the docstring above."""
 
     height_m: FloatArray  # (rows, columns), world frame, southern row first; NaN if unknown
     left_m: float
@@ -88,6 +107,81 @@ class Bed(NamedTuple):
         )
         inside = np.isfinite(own) & (weight > 0.0)
         return np.where(inside, total / np.where(inside, weight, 1.0), np.nan)
+
+
+def bed_of(xy: FloatArray, likely_m: FloatArray, gsd_m: float) -> Bed:
+    """Return the bed of m places with the heights of h likely beds, shape (m, h)."""
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    cell = _cell_m(xy, low, high)
+    columns, rows = (int(n) + 1 for n in (high - low) / cell)
+    at = np.floor((xy - low) / cell).astype(np.int64)
+    key = at[:, 1] * columns + at[:, 0]
+    order = np.argsort(key, kind="stable")
+    filled, counts = np.unique(key, return_counts=True)
+    start = np.concatenate([[0], np.cumsum(counts)])
+    found, height = np.empty(len(filled)), np.full(rows * columns, np.nan)
+    in_tiles(_most_likely, len(found), order, start, likely_m, WIDTH_GSD * gsd_m, found)
+    height[filled] = found
+    grid = _without_outliers(height.reshape(rows, columns))
+    return Bed(grid, float(low[0]), float(low[1]), cell)
+
+
+def _cell_m(xy: FloatArray, low: FloatArray, high: FloatArray) -> float:
+    """Return the side of cells that hold `POINTS_A_CELL` points on average where there are any."""
+    area = np.prod(np.maximum(high - low, 1.0))
+    least = float(np.sqrt(area / MOST_CELLS))
+    side = max(float(np.sqrt(area * POINTS_A_CELL / len(xy))), least)
+    for _ in range(3):
+        at = np.floor((xy - low) / side).astype(np.int64)
+        filled = len(np.unique(at[:, 1] * (at[:, 0].max() + 1) + at[:, 0]))
+        side = max(side * float(np.sqrt(POINTS_A_CELL * filled / len(xy))), least)
+    return side
+
+
+def _without_outliers(height: FloatArray) -> FloatArray:
+    """Replace a cell far from the median of its surroundings by that median.
+
+    Where only one group of images sees the bed, several heights are equally likely.
+    """
+    row, column = np.nonzero(np.isfinite(height))
+    padded, smooth = np.pad(height, REACH, constant_values=np.nan), height.copy()
+    down, right = np.mgrid[: 2 * REACH + 1, : 2 * REACH + 1].reshape(2, -1)
+    middle = np.nanmedian(padded[row[:, None] + down, column[:, None] + right], axis=1)
+    far = np.abs(height[row, column] - middle) > FAR_OFF_M
+    smooth[row[far], column[far]] = middle[far]
+    return smooth
+
+
+@kernel(allocates=True)
+def _most_likely(
+    span: Span, order: IntArray, start: IntArray, likely: FloatArray, width_m: float,
+    found: FloatArray,
+) -> None:  # fmt: skip
+    """Find the most likely height of the bed in each cell, on a histogram; NaN without any."""
+    reach = int(DEVIATIONS * BINS)
+    for c in range(*span):
+        rows = order[start[c] : start[c + 1]]
+        # the range of likely beds in the cell; comparisons with NaN are false
+        low, high = np.inf, -np.inf
+        for i in rows:
+            for b in likely[i]:
+                low, high = b if b < low else low, b if b > high else high
+        found[c] = np.nan
+        if not high >= low:
+            continue
+        step = max(width_m / BINS, (high - low) / 2000.0)
+        total = np.zeros(int((high - low) / step) + 2)
+        own = np.empty(total.size)
+        for i in rows:
+            own[:] = OUTLIER
+            for b in likely[i]:
+                at = (b - low) / step
+                if at == at:
+                    for k in range(max(0, int(at) - reach), min(own.size, int(at) + reach + 2)):
+                        off = (k - at) / BINS
+                        own[k] += np.exp(-0.5 * off * off)
+            total += np.log(own)
+        found[c] = low + np.argmax(total) * step
 
 
 @device(allocates=True)

@@ -11,7 +11,7 @@ from pcfix.errors import SettingError
 from pcfix.model import Cameras, TiePoints, ViewKind
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import ALIKE, FLAT_DEG, Batch, Survey, require_orientation
-from pcfix.refract.methods import on_land
+from pcfix.refract.methods import bed_around, on_land
 from pcfix.refract.reconstructions import (
     IN_FRAME,
     LIMITS,
@@ -135,7 +135,7 @@ def learn_of_sample(
     sample = replace(submerged_of(batch), survey=survey)
     of_type = sample if near is None else replace(near, survey=survey)
     survey, verdicts = _weighed(of_type, hint)
-    settings, learned = survey.settings, survey.learned._replace(land=None)
+    settings, learned = survey.settings, survey.learned
     if batch.original_model is not None:
         # land has the reconstruction type of the cloud, also where a formula corrects the bed
         land = on_land(survey)
@@ -148,8 +148,6 @@ def learn_of_sample(
     if not settings.models_matcher:
         learned = learned._replace(matcher=None)
     elif settings.chooses_maps and len(sample):
-        from pcfix.refract.bed import bed_around
-
         learned = learned._replace(bed=bed_around(replace(sample, survey=survey)))
     return replace(survey, learned=learned), verdicts
 
@@ -222,8 +220,8 @@ def weigh_lists(batch: Batch, *, is_open: bool) -> Verdict | None:
 
     None if there are too few points, or nothing is to be decided.
     """
-    if is_open and batch.survey.settings.method == "consistent":
-        return weigh(batch, reconstructions_of(batch))
-    if not _wants_comparison(batch.survey):
+    detects = is_open and batch.survey.settings.method == "consistent"
+    if not (detects or _wants_comparison(batch.survey)):
         return None
-    return weigh(batch, reconstructions_of(batch), given=type_given(batch))
+    given = None if detects else type_given(batch)
+    return weigh(batch, reconstructions_of(batch), given=given)

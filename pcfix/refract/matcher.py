@@ -60,14 +60,6 @@ class Matcher(NamedTuple):
     least: int = 1  # images of `matched` that must show a place
     is_nearest: bool = False  # whether each point has the map of the image nearest in plan
 
-    def of_single_maps(self, least: int, *, nearest: bool) -> Matcher:
-        """Return the matcher of software that keeps one map at each place, and averages none."""
-        none = np.zeros((len(self.near), 0), np.int64)
-        return self._replace(
-            matched=self.near, averaged=none, fused=none, tolerance_px2=np.inf,
-            width_m=NEAR_WIDTH_M, least=least, is_nearest=nearest,
-        )  # fmt: skip
-
 
 class _Seen(NamedTuple):
     """Which images see which of p places: e entries, sorted by image and place."""

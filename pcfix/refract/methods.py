@@ -9,19 +9,25 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pcfix.model import FloatArray, IntArray, Outcome, WaterPlane
 from pcfix.refract.batch import Batch, Intersection, Survey
 from pcfix.refract.choice import chosen_views, has_varying_slopes, near_borders
+from pcfix.refract.patches import gsd_m
 from pcfix.refract.tiling import spatial_order
 from pcfix.refract.uncertainty import with_uncertainty
 from pcfix.water.surface import SurfaceAbove
 
+if TYPE_CHECKING:
+    from pcfix.refract.fusion import Bed
+
 POINTS_AT_ONCE = 100_000
 """Bounds the memory of the lists of cameras: some 50 MB at 40 rays per point."""
+BED_POINTS = 100_000
+"""Every second point of a larger sample is enough for the bed, which most of its time goes into."""
 
 METHODS = {
     "snell": "intersect.intersect",
@@ -37,8 +43,6 @@ METHODS = {
 entry."""
 _MAPS, _PAIRS = "depth_maps.invert_depth_maps", "stereo_pairs.invert_pairs"
 """What `consistent` is for dense clouds."""
-_IN_FRAME = (METHODS["snell"], METHODS["consistent"])
-"""Methods whose kernels choose among all cameras."""
 
 
 def correct(batch: Batch) -> Intersection:
@@ -47,7 +51,7 @@ def correct(batch: Batch) -> Intersection:
     found = [_without_limit(_corrected(part), part) for _, part in parts]
     if len(found) == 1:
         return found[0]
-    return joined(found, np.concatenate([rows for rows, _ in parts]), len(batch.survey.cameras))
+    return joined(found, np.concatenate([rows for rows, _ in parts]))
 
 
 def _without_limit(found: Intersection, batch: Batch) -> Intersection:
@@ -80,12 +84,15 @@ def _corrected(batch: Batch) -> Intersection:
     def solved(part: Batch) -> Intersection:
         return with_uncertainty(method(part), part)
 
-    if name in _IN_FRAME and _takes_all_in_frame(batch):
+    learned, chooses = batch.survey.learned, name in (METHODS["snell"], METHODS["consistent"])
+    takes_all = batch.views is None and learned.occluder is None and learned.matcher is None
+    if chooses and takes_all and not has_varying_slopes(batch.survey):
+        # the kernel chooses among all cameras
         found = solved(batch)
     else:
         order = spatial_order(batch.xyz)
         parts = [solved(with_rays(batch.take(rows))) for rows in batches(order)]
-        found = joined(parts, order, len(batch.survey.cameras))
+        found = joined(parts, order)
     if name != METHODS["consistent"] or batch.views is not None:
         return found
     # an image shows the true point, near its border sometimes without the apparent one
@@ -95,17 +102,6 @@ def _corrected(batch: Batch) -> Intersection:
         return found
     part = with_rays(batch.take(again), found.shift_m[again])
     return found.with_rows(again, solved(part))
-
-
-def _takes_all_in_frame(batch: Batch) -> bool:
-    """Whether all cameras whose frames hold a point count, under a plane, and no list is needed."""
-    survey = batch.survey
-    return (
-        batch.views is None
-        and survey.learned.occluder is None
-        and survey.learned.matcher is None
-        and not has_varying_slopes(survey)
-    )
 
 
 def shift_of_land(batch: Batch) -> FloatArray:
@@ -170,13 +166,29 @@ def with_rays(batch: Batch, shift_m: FloatArray | None = None) -> Batch:
     return replace(batch, views=views)
 
 
+def bed_around(batch: Batch) -> Bed | None:
+    """Return the most likely bed of a sample of fused points; None if no image sees a point."""
+    from pcfix.refract.depth_maps import likely_beds
+    from pcfix.refract.fusion import bed_of
+
+    # of single maps each point shows the bed less clearly: all of them are needed
+    many = len(batch) > BED_POINTS and batch.survey.settings.matcher == "depth-maps"
+    batch = batch.take(np.arange(0, len(batch), 2 if many else 1))
+    order = spatial_order(batch.xyz)
+    likely = [likely_beds(with_rays(batch.take(rows))).height_m for rows in batches(order)]
+    table = np.full((len(batch), max(part.shape[1] for part in likely)), np.nan)
+    for rows, part in zip(batches(order), likely, strict=True):
+        table[rows, : part.shape[1]] = part
+    return bed_of(batch.xyz[:, :2], table, gsd_m(batch)) if np.isfinite(table).any() else None
+
+
 def batches(order: IntArray) -> Iterator[IntArray]:
     """Yield the rows of points in batches, at least one."""
     for first in range(0, max(len(order), 1), POINTS_AT_ONCE):
         yield order[first : first + POINTS_AT_ONCE]
 
 
-def joined(parts: list[Intersection], order: IntArray, k: int) -> Intersection:
+def joined(parts: list[Intersection], order: IntArray) -> Intersection:
     """Join the results of batches, in the original order of the points."""
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
@@ -187,5 +199,5 @@ def joined(parts: list[Intersection], order: IntArray, k: int) -> Intersection:
         return np.concatenate([getattr(part, name) for part in parts]).take(place, axis=0)
 
     per_point = [name for name in Intersection._fields if name != "camera_used"]
-    used = np.any([part.camera_used for part in parts], axis=0) if k else np.zeros(0, np.bool_)
+    used = np.any([part.camera_used for part in parts], axis=0)
     return Intersection(**{name: back(name) for name in per_point}, camera_used=used)

@@ -8,7 +8,7 @@ better by
     (0.5 - beta) / sqrt(sigma^2 + SHARE_ERROR^2)
 
 standard errors or, in dense clouds, by the difference of log likelihoods over its standard error
-(`pcfix.refract.likelihood`). What is known of density and software is added. The best type is that
+(`pcfix.refract.patches`). What is known of density and software is added. The best type is that
 with the largest distance from its runner-up; the confidence is the product of the probabilities
 that it is better than each other type.
 """
@@ -29,9 +29,8 @@ from pcfix.model import FloatArray, IntArray, Outcome, ViewKind
 from pcfix.options.correct import Dimensions, ScienceOptions
 from pcfix.refract import patches
 from pcfix.refract.batch import FLAT_DEG, Batch, ModelUncertainty
-from pcfix.refract.likelihood import MODEL_ERROR, Candidates, log_likelihood, standard_errors
-from pcfix.refract.methods import correct, with_rays
-from pcfix.refract.patches import SMOOTH_GSD, scatter_m, shares
+from pcfix.refract.methods import bed_around, correct, with_rays
+from pcfix.refract.patches import MODEL_ERROR, SMOOTH_GSD, Candidates, scatter_m, shares
 
 SURE = 2.3264
 """Standard errors of a significant difference: 99 %."""
@@ -363,23 +362,16 @@ def _beds(
         # The maps of a point are chosen by a smooth bed: their likelihood allows for that, the
         # discontinuities do not. But neighbours in sparse clouds show little of their scatter.
         if by_images and place.shape[1] == patches.PATCH_POINTS[0]:
-            errors = _likelihood_errors(part, complete, types, z)
+            corrected = [*zip(types, z, strict=True)]
+            likely = in_threads(partial(_log_likelihood, part, complete), corrected)
+            for a, b in permutations(range(len(types)), 2):
+                pair = frozenset((types[a].words, types[b].words))
+                model_error = MODEL_ERRORS.get(pair, MODEL_ERROR)
+                errors[a, b] = patches.standard_errors(likely[a], likely[b], model_error)
         beds = _Beds(types, z, complete, len(complete), share, sigma, errors)
     np.fill_diagonal(beds.share, -np.inf)
     np.fill_diagonal(beds.errors, np.inf)
     return beds
-
-
-def _likelihood_errors(
-    part: Batch, place: IntArray, types: tuple[Reconstruction, ...], z: FloatArray
-) -> FloatArray:
-    """Return the standard errors by which each type is more likely than each other one, (h, h)."""
-    likely = in_threads(partial(_log_likelihood, part, place), [*zip(types, z, strict=True)])
-    errors = np.zeros((len(types), len(types)))
-    for a, b in permutations(range(len(types)), 2):
-        model_error = MODEL_ERRORS.get(frozenset((types[a].words, types[b].words)), MODEL_ERROR)
-        errors[a, b] = standard_errors(likely[a], likely[b], model_error)
-    return errors
 
 
 def _log_likelihood(
@@ -395,30 +387,26 @@ def _log_likelihood(
     each = Candidates(*(values[place] for values in candidates))
     terms = patches.smooth_surfaces(part.xyz[place])
     level = part.surface.height_m[place]
-    return log_likelihood(terms, part.xyz[place, 2], level, each, patches.gsd_m(part))
+    return patches.log_likelihood(terms, part.xyz[place, 2], level, each, patches.gsd_m(part))
 
 
 def _with_prior(beds: _Beds, is_dense: bool, hint: Hint | None) -> tuple[_Beds, str]:
     """Add what is known of the types by density and software; return what decided, if these did."""
-    prior = np.array([_prior(one, is_dense, hint) for one in beds.types])
+    expected, prior = () if hint is None else hint.words, np.zeros(len(beds.types))
+    for i, one in enumerate(beds.types):
+        prior[i] = PRIOR_SOFTWARE * (one.words in expected)
+        if one.words == _TRACKS:
+            prior[i] += PRIOR_TRACKS[0 if is_dense else 1]
+        if one.is_single and not is_dense:
+            prior[i] -= PRIOR_SPARSE
     known = beds._replace(errors=beds.errors + prior[:, None] - prior)
     every = list(range(len(prior)))
     best = known.rank(every)[0]
     if beds.patches and beds.rank(every)[0] == best:
         return known, ""
-    if hint is not None and beds.types[best].words in hint.words:
+    if hint is not None and beds.types[best].words in expected:
         return known, f"its software, {hint.source}"
     return known, "the spacing of its points"
-
-
-def _prior(one: Reconstruction, is_dense: bool, hint: Hint | None) -> float:
-    """Return by how many standard errors a type is likely before its points are looked at."""
-    prior = PRIOR_SOFTWARE if hint is not None and one.words in hint.words else 0.0
-    if one.words == _TRACKS:
-        prior += PRIOR_TRACKS[0 if is_dense else 1]
-    if one.is_single and not is_dense:
-        prior -= PRIOR_SPARSE
-    return prior
 
 
 def _remarks(part: Batch, place: IntArray) -> tuple[str, ...]:
@@ -492,8 +480,6 @@ def _heights(part: Batch, around: Batch, one: Reconstruction) -> FloatArray:
     part = _as(part, one)
     settings, learned = part.survey.settings, part.survey.learned
     if part.views is None and settings.chooses_maps and learned.matcher is not None:
-        from pcfix.refract.bed import bed_around
-
         # the bed identifies the images of a point: it must be that of other points, and not
         # interpolated, as a smooth bed would make any choice look smooth
         bed = bed_around(_as(around, one))

@@ -133,11 +133,16 @@ def invert_pairs(batch: Batch) -> Intersection:
     survey, matcher = batch.survey, batch.survey.learned.matcher
     if matcher is None:
         raise ValueError("a model of the matcher is needed")
+    # a pair that both images have counts for the first one
+    image, at = np.nonzero(matcher.matched >= 0)
+    partner, partners = matcher.matched[image, at], matcher.matched.copy()
+    again = (matcher.matched[partner] == image[:, None]).any(axis=1) & (partner < image)
+    partners[image[again], at[again]] = -1
     images, rule = images_of(batch.original_model, survey.cameras), rule_of(survey)
     search, derivative = np.zeros((len(batch), _WIDTH)), np.zeros((len(batch), 3, 3))
     given = PairInputs(
         batch.chosen(), images, rig_of(survey), rule._replace(least_cosine2=0.0), search,
-        derivative, _each_once(matcher.matched),
+        derivative, partners,
     )  # fmt: skip
     used, rows = np.zeros(len(batch.rays.camera), np.bool_), tiling.spatial_order(batch.xyz)
     for steps in range(0, MAX_STEPS, STEPS):
@@ -154,16 +159,6 @@ def invert_pairs(batch: Batch) -> Intersection:
     return replace(batch, views=in_pairs).result(
         search[:, _SHIFT:_DISTANCE], outcome=outcome, ray_miss_m=search[:, _DISTANCE]
     )
-
-
-def _each_once(matched: IntArray) -> IntArray:
-    """Return the images that each was matched with, -1 for a pair that the other one has too."""
-    image, at = np.nonzero(matched >= 0)
-    partner = matched[image, at]
-    again = (matched[partner] == image[:, None]).any(axis=1) & (partner < image)
-    once = matched.copy()
-    once[image[again], at[again]] = -1
-    return once
 
 
 @kernel(allocates=True)

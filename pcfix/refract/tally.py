@@ -95,35 +95,6 @@ class _Figures(Sums):
 
 
 @dataclass(frozen=True)
-class UncertaintyTally(Sums):
-    """Standard errors of Z of corrected points."""
-
-    sigma: _Figures
-    within: IntArray  # points within the TVU of each order
-
-    @classmethod
-    def of(cls, sigma_z_m: FloatArray, depth_m: FloatArray) -> UncertaintyTally:
-        """Return the tally of standard errors of Z and depths, metres, shape (m,)."""
-        within = within_orders(COVERAGE_95 * sigma_z_m, depth_m)
-        return cls(_Figures.of(sigma_z_m, 0.0, 10.0), within)
-
-    def as_dict(self) -> dict[str, Any] | None:
-        """Return the figures as plain values; None where no point has a standard error.
-
-        `sigma_z_m` holds mean, percentiles (to a millimetre) and largest; `tvu_95_m` is 1.96 times
-        these; `s44` the share of the points, 0 to 1, within the TVU of each order.
-        """
-        if not self.sigma.most_m > 0.0:
-            return None
-        names = "mean", "p5", "p50", "p95", "max"
-        return {
-            "sigma_z_m": self.sigma.by_name(*names),
-            "tvu_95_m": self.sigma.by_name(*names, times=COVERAGE_95),
-            "s44": share_of_orders(self.within, self.sigma.count),
-        }
-
-
-@dataclass(frozen=True)
 class Tally(Sums):
     """Counts, extremes, and histograms of the shift and the standard error of Z."""
 
@@ -133,7 +104,8 @@ class Tally(Sums):
     high: FloatArray = field(metadata=MOST)
     shift: _Figures
     depth: _Figures
-    errors: UncertaintyTally
+    sigma: _Figures
+    within: IntArray  # corrected points within the TVU of each order
     points: int = 0
     water_unknown: int = 0
     rays: int = 0
@@ -146,6 +118,7 @@ class Tally(Sums):
         apparent, moved = correction.apparent_xyz, correction.corrected
         # axis by axis: numpy is slow along the short one
         submerged, depth = apparent[correction.submerged].T, correction.depth_m[moved]
+        sigma = correction.sigma_z_m[moved]
         return cls(
             outcomes=np.bincount(correction.outcome, minlength=len(Outcome)),
             camera_used=correction.camera_used,
@@ -153,7 +126,8 @@ class Tally(Sums):
             high=np.array([values.max(initial=-np.inf) for values in submerged]),
             shift=_Figures.of(correction.shift_m[moved, 2], -100.0, 100.0),
             depth=_Figures.of(depth),
-            errors=UncertaintyTally.of(correction.sigma_z_m[moved], depth),
+            sigma=_Figures.of(sigma, 0.0, 10.0),
+            within=within_orders(COVERAGE_95 * sigma, depth),
             points=len(apparent),
             water_unknown=int((~correction.water_known).sum()),
             rays=int(correction.ray_count.sum()),
@@ -191,12 +165,21 @@ class Tally(Sums):
         }
 
     def uncertainty(self, detected: dict[str, Any] | None = None) -> dict[str, Any] | None:
-        """Return standard error of Z, TVU and orders; see `UncertaintyTally.as_dict`.
+        """Return standard errors of Z, TVU and orders; None where no point has a standard error.
 
-        `of_cloud` is the contribution of the cloud, if `detected`, the detected reconstruction
-        type, has an estimate of it.
+        `sigma_z_m` holds mean, percentiles (to a millimetre) and largest; `tvu_95_m` is 1.96 times
+        these; `s44` the share of the points, 0 to 1, within the TVU of each order. `of_cloud` is
+        the contribution of the cloud, if `detected`, the detected reconstruction type, has an
+        estimate of it.
         """
-        found = self.errors.as_dict()
-        if found is not None and detected is not None and "scatter_m" in detected:
+        if not self.sigma.most_m > 0.0:
+            return None
+        names = "mean", "p5", "p50", "p95", "max"
+        found: dict[str, Any] = {
+            "sigma_z_m": self.sigma.by_name(*names),
+            "tvu_95_m": self.sigma.by_name(*names, times=COVERAGE_95),
+            "s44": share_of_orders(self.within, self.sigma.count),
+        }
+        if detected is not None and "scatter_m" in detected:
             found["of_cloud"] = {name: detected[name] for name in ("scatter_m", "per_depth")}
         return found

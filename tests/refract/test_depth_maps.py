@@ -202,7 +202,7 @@ def test_block_without_list(name, most, monkeypatch):
     # 1.3 and 5.2: with fewer wild points the bias of the wrong groups shows
     assert abs(error.mean()) < 5.7
     assert rms(error) < 0.6 * rms(errors_gsd(name, method="snell", camera_set="all"))
-    monkeypatch.setattr("pcfix.refract.bed.bed_around", lambda *_: None)
+    monkeypatch.setattr("pcfix.refract.learning.bed_around", lambda *_: None)
     without_ties = errors_gsd(name, method="consistent", camera_set="mvs")
     # 3.5 and 42 GSD: the images of a group see the bed at heights that are a metre apart
     assert rms(error) < {"nadir": 0.9, "half oblique": 0.4}[name] * rms(without_ties)

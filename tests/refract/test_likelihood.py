@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import t as student
 
-from pcfix.refract.likelihood import (
+from pcfix.refract.patches import (
     FOLDS,
     FREEDOM,
     MODEL_ERROR,
@@ -13,9 +13,9 @@ from pcfix.refract.likelihood import (
     OUTLIER_GSD,
     Candidates,
     log_likelihood,
+    smooth_surfaces,
     standard_errors,
 )
-from pcfix.refract.patches import smooth_surfaces
 
 GSD_M, LEVEL_M, POINTS = 0.05, 0.0, 32
 

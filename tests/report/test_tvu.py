@@ -1,8 +1,6 @@
 """Standard errors in the terms of IHO S-44."""
 
 import json
-from functools import reduce
-from operator import add
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +8,8 @@ import pytest
 
 import pcfix
 from pcfix.compare.statistics import tvu_of
-from pcfix.refract.tally import UncertaintyTally
+from pcfix.model import Correction, Outcome
+from pcfix.refract.tally import Tally
 from pcfix.report.text import (
     FEWEST,
     Summary,
@@ -29,9 +28,22 @@ BY_HAND = {
 }
 
 
-def tally_of(sigma, depth, parts=1):
-    rows = np.array_split(np.arange(len(sigma)), parts)
-    return reduce(add, [UncertaintyTally.of(sigma[r], depth[r]) for r in rows]).as_dict()
+def tally_of(sigma, depth):
+    n = len(sigma)
+    corrected = Correction(
+        apparent_xyz=np.zeros((n, 3)),
+        shift_m=np.zeros((n, 3)),
+        outcome=np.full(n, Outcome.CORRECTED, np.uint8),
+        ray_count=np.full(n, 2, np.int32),
+        ray_miss_m=np.zeros(n),
+        depth_m=depth,
+        incidence_deg=np.zeros(n),
+        sigma_z_m=sigma,
+        camera_used=np.ones(2, np.bool_),
+        water_known=np.ones(n, np.bool_),
+        lowest_water_m=0.0,
+    )
+    return Tally.of(corrected).uncertainty()
 
 
 def test_shares_and_percentiles():
