@@ -142,7 +142,9 @@ def finish(plan: Plan, task: FileTask, tally: CloudTally) -> Summary:
     _check_outcomes(plan, tally.figures)
     fit, poses, absorbed = None, None, None
     if plan.inputs.port is None:  # neither has a model of a port
-        ties = quick_ties(plan.inputs, plan.view.crs) if len(plan.cameras) else None
+        # straight rays do not fit the tie points of cameras that were adjusted with refraction
+        is_straight = len(plan.cameras) and plan.inputs.adjusted_from is None
+        ties = quick_ties(plan.inputs, plan.view.crs) if is_straight else None
         fit = _check_fit(plan, tally, ties)
         poses, absorbed = diagnose_in_passing(plan, ties)
     notes = [

@@ -74,6 +74,9 @@ LIKELY, LEAST_DEPTH_M = 1.1, 0.005
 SHALLOW, DEEP = 0.3, 3.5
 """Range of the bed of the surroundings, in heights of the first bed; outliers have it elsewhere."""
 
+RISE, STEEP = 0.1, 0.3
+"""Relative height of another bed, and the largest relative difference of the change on the way."""
+
 LEAST_CHANGE, MOST_CHANGE = 0.35, 1.5
 """Range of the change of the apparent depth with that of the bed along a ray."""
 
@@ -249,7 +252,7 @@ def _invert_tiles(
         )  # fmt: skip
         for j in range(rows.size):
             tile.room[_BED * TILE + j] = given.first[rows[j]]
-        _look(tile, marks, given)
+        _look_with_slopes(tile, marks, given)
         _choose_maps(tile, result, likely, maps, given)
         if len(likely):
             continue
@@ -257,7 +260,7 @@ def _invert_tiles(
             # which depths agree depends on the bed, and the bed on which agree
             if not _move(tile, 0.0, FAR):
                 break
-            _look(tile, marks, given)
+            _look_with_slopes(tile, marks, given)
             _choose_maps(tile, result, likely, maps, given)
         for _ in range(MAX_STEPS):
             if not _move(tile, CLOSE_M, 0.0):
@@ -346,6 +349,34 @@ def _look(tile: MapTile, weights: FloatArray, given: MapInputs) -> None:
             shown[_DEPTH * TILE + j] = t * per_length
             found = t == t and seen >= matcher.least
             shown[_BY_HEIGHT * TILE + j] = -change * per_length if found else np.nan
+
+
+@device
+def _look_with_slopes(tile: MapTile, marks: FloatArray, given: MapInputs) -> None:
+    """Do as `_look`; of transferred points set how the depths change with the bed by differences.
+
+    The maps are those of the original model, in which lens and poses have changed the depths too.
+    """
+    bed, count = tile.room[_BED * TILE : _RAY * TILE], marks.shape[1]
+    if given.images.adjusted is not None:
+        for j in range(count):
+            tile.step[j] = min(RISE * bed[j], -LEAST_DEPTH_M)
+            bed[j] += tile.step[j]
+        _look(tile, marks, given)
+        for k in range(len(marks)):
+            for j in range(count):
+                tile.weights[k, j] = tile.shown[k, _DEPTH * TILE + j]
+        for j in range(count):
+            bed[j] -= tile.step[j]
+    _look(tile, marks, given)
+    if given.images.adjusted is not None:
+        for k in range(len(marks)):
+            for j in range(count):
+                change = (tile.weights[k, j] - tile.shown[k, _DEPTH * TILE + j]) / tile.step[j]
+                usual, tile.weights[k, j] = tile.shown[k, _BY_HEIGHT * TILE + j], 0.0
+                # a larger difference comes from other images that agree best at the other bed
+                if abs(change / usual - 1.0) < STEEP:
+                    tile.shown[k, _BY_HEIGHT * TILE + j] = change
 
 
 @device(forceinline=True)

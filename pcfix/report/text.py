@@ -282,7 +282,8 @@ def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
     detected, check = s.reconstruction, ""
     method = str(s.settings["method"])
     if detected is not None and detected.get("type", "") not in ("", method):
-        sure = f"detected, confidence {100.0 * detected['confidence']:.0f} %"
+        how = "detected" if method == "auto" else "set by the user"
+        sure = f"{how}, confidence {100.0 * detected['confidence']:.0f} %"
         method = f"{detected['method']}, {detected['type']} ({sure})"
     elif detected is not None and "type" not in detected:
         method = f"{detected['method']}. {detected['because']}"

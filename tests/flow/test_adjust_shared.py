@@ -49,9 +49,9 @@ def test_rendered_block(tmp_path, monkeypatch, ties, bed_gsd, land_gsd):
     assert land < land_gsd
 
 
-def errors_gsd(las):
+def errors_gsd(las, block=TRUE):
     """Return height errors against the true surface, bed and land apart, in GSD of 5 cm."""
-    with rasterio.open(TRUE / "truth_dsm.tif") as truth:
+    with rasterio.open(block / "truth_dsm.tif") as truth:
         heights, way = truth.read(1).astype(float), truth.transform
     rows = (np.arange(len(heights)) + 0.5, np.arange(heights.shape[1]) + 0.5)
     at = RegularGridInterpolator(rows, heights, bounds_error=False)
