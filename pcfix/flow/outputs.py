@@ -20,11 +20,12 @@ from pcfix.grid.lattice import Lattice, Window, round_resolution
 from pcfix.grid.maps import contours, depth_interval, hillshade, relief_colours
 from pcfix.grid.shoreline import NearWater
 from pcfix.io import rasters
+from pcfix.io.clouds import Tiles, open_cloud
 from pcfix.io.crs import crs_words
 from pcfix.io.files import read_json, sha256, write_bytes, write_text
-from pcfix.io.las.source import RasterBand, stated_crs
+from pcfix.io.las.source import stated_crs
+from pcfix.io.rasters import RasterBand, RasterSource
 from pcfix.io.tables import read_check_depths
-from pcfix.io.tiles import RasterSource, Tiles, open_cloud
 from pcfix.io.vectors import Layer, write_layers
 from pcfix.model import BATHYMETRIC_POINT, Cameras, FloatArray, WaterSurface
 from pcfix.options.correct import LEVEL_M

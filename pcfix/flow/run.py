@@ -29,11 +29,10 @@ from pcfix.flow.run_folder import RECORD, STEPS, SURFACE, Record, RunFolder, rea
 from pcfix.flow.runner import Bar, Progress, check_folder, no_bar
 from pcfix.flow.surfaces import view_of
 from pcfix.io import rasters, vectors
-from pcfix.io.clouds import is_cloud
+from pcfix.io.clouds import Tiles, is_cloud
 from pcfix.io.files import ENSEMBLE, read_json
 from pcfix.io.ground_control import read_gnss
-from pcfix.io.las.source import RasterBand
-from pcfix.io.tiles import Tiles
+from pcfix.io.rasters import RasterBand
 from pcfix.libraries import analysis_library
 from pcfix.model import WaterDimension
 from pcfix.options.correct import AdjustOptions, CorrectOptions, RunOptions

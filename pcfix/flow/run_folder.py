@@ -15,7 +15,18 @@ from pcfix.flow.adjust import FOLDER
 from pcfix.flow.inputs import Inputs, paths_in, read_blocks
 from pcfix.flow.runner import HOW, Bar, Progress, json_text, no_bar
 from pcfix.flow.surfaces import view_of
-from pcfix.io.clouds import is_cloud, own_water, reference_of
+from pcfix.io.clouds import (
+    CloudFiles,
+    Tiles,
+    band_of,
+    cloud_of,
+    inputs_of,
+    is_cloud,
+    open_cloud,
+    own_water,
+    reference_of,
+    tiles_from,
+)
 from pcfix.io.files import (
     belonging,
     check_input,
@@ -25,7 +36,6 @@ from pcfix.io.files import (
     refusing,
     write_text,
 )
-from pcfix.io.tiles import CloudFiles, Tiles, band_of, cloud_of, inputs_of, open_cloud, tiles_from
 from pcfix.model import Cameras, WaterSurface
 from pcfix.options.correct import RunOptions
 from pcfix.options.declare import options_of

@@ -32,11 +32,11 @@ from pcfix import version
 from pcfix.errors import InputError, PcfixError, SettingError, silently
 from pcfix.flow.raster import raster_outputs, raster_writer
 from pcfix.io import files
+from pcfix.io.clouds import Clouds, Tiles, band_of, inputs_of, open_cloud, tiles_of
 from pcfix.io.files import all_or_none, write_bytes, write_text
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import check_suffix, corrected_identity, las_writer
 from pcfix.io.rasters import check_tif
-from pcfix.io.tiles import Clouds, Tiles, band_of, inputs_of, open_cloud, tiles_of
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.libraries import optional_library
 from pcfix.options.declare import File, options_of

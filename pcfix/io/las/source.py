@@ -11,7 +11,6 @@ import os
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -66,23 +65,6 @@ CHUNK_BYTES = 500_000_000
 
 SMALL_BYTES = 250_000_000
 """Point records of a cloud that stay in memory until it is read again."""
-
-
-@dataclass(frozen=True)
-class RasterBand:
-    """A band of a raster that is read as a cloud; `pcfix.io.tiles.band_of` counts its points."""
-
-    path: Path
-    band: int | None = None
-    points: int = 0
-    # the lowest and highest coordinates, shape (3,), metres
-    mins: FloatArray = field(default_factory=lambda: np.zeros(3))
-    maxs: FloatArray = field(default_factory=lambda: np.zeros(3))
-
-    def __str__(self) -> str:
-        return str(self.path)
-
-    __fspath__ = __str__
 
 
 class Record(VLR):  # type: ignore[misc]  # laspy is untyped
