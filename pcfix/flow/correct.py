@@ -301,7 +301,7 @@ def correct_points(
         is given, else of `cameras`. Default: as the option `camera_set` says.
     level_offset_m : array, shape (k,), optional
         Height of the water above `water` when each image was taken; see
-        `pcfix.io.tides.level_offsets`. Each ray is refracted at its own surface; `water` decides
+        `pcfix.io.water.level_offsets`. Each ray is refracted at its own surface; `water` decides
         which points are submerged, and how deep. Default: zero.
     adjusted_from : Cameras, optional
         The original cameras, in the same frame, if `cameras` are the same images (matched by their

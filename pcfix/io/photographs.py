@@ -1,25 +1,34 @@
-"""Photographs (JPEG, TIFF, PNG), and sequences of frames.
+"""Photographs (JPEG, TIFF, PNG), sequences of frames, and times and flying heights of images.
 
 A JPEG or TIFF photograph that changes in part keeps its metadata and, in JPEG, its unchanged blocks
 of pixels, which are copied as they are stored.
+
+Times with a zone (or Z) are UTC moments. Times without one are the readings of one clock that
+images and a table of tides share. The two cannot be compared, so both must be of one kind.
+
+The heights above the take-off place are those that drones recorded in their images: DJI's XMP has
+``drone-dji:RelativeAltitude`` (metres, by the barometer).
 """
 
 from __future__ import annotations
 
+import re
 import shutil
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import SettingError, bad_file
-from pcfix.io.files import check_output, refusing, temporary_output
+from pcfix.io.files import check_input, check_output, refusing, temporary_output
+from pcfix.io.tables import match_labels, read_table
 from pcfix.libraries import photo_library
 from pcfix.model import BoolArray, FloatArray
 from pcfix.options.declare import File
@@ -241,3 +250,102 @@ def write_spread(target: Path, spread: FloatArray) -> None:
     tifffile = photo_library("tifffile")
     with temporary_output(target) as path:
         tifffile.imwrite(path, spread.astype(np.float32), compression="zlib", metadata=None)
+
+
+IMAGES = (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".webp", ".heic", ".dng")
+_EXIF_DATE = re.compile(r"^(\d{4}):(\d\d):(\d\d)\b")
+_DATE_TIME_ORIGINAL, _OFFSET_ORIGINAL, _SUBSECONDS, _EXIF = 0x9003, 0x9011, 0x9291, 0x8769
+
+
+class Times(NamedTuple):
+    """Times of k images, or of the rows of a tide table."""
+
+    time_s: FloatArray  # (k,), seconds since 1970, UTC if `zoned`, else of a local clock
+    zoned: bool
+    name: str  # of the source, for messages
+
+
+def read_image_times(path: File, labels: Sequence[str]) -> Times:
+    """Find out when images were taken.
+
+    Parameters
+    ----------
+    path : path
+        A table with the columns ``label`` and ``time`` (ISO 8601), or a folder with the images,
+        whose EXIF data has DateTimeOriginal, and OffsetTimeOriginal for the zone.
+    labels : sequence of str
+        Names of the k images; a folder or an extension may be missing on either side.
+    """
+    found = Path(path)
+    if not found.is_dir():
+        table = read_table(check_input(found), ("label", "time"))
+        rows, times = _rows(table.column("label"), labels, found), table.column("time")
+        where = [f"line {table.line[row]}" for row in rows]
+        return parse_times(found, where, [times[row] for row in rows])
+    from PIL import Image
+
+    files = sorted(p for p in found.rglob("*") if p.suffix.lower() in IMAGES)
+    chosen = [files[row] for row in _rows([str(p) for p in files], labels, found)]
+    texts = []
+    for file in chosen:
+        sentence = "is not a readable image ({})."
+        with refusing(file, "photos.unreadable", sentence), Image.open(file) as image:
+            tags = image.getexif().get_ifd(_EXIF)
+        codes = (_DATE_TIME_ORIGINAL, _SUBSECONDS, _OFFSET_ORIGINAL)
+        text, fraction, zone = (str(tags.get(code, "")).strip("\0 ") for code in codes)
+        if not text:
+            sentence = "its EXIF data has no DateTimeOriginal. Give a CSV table label,time instead."
+            raise bad_file(file, "image_times.missing", sentence)
+        texts.append(text + (f".{fraction}" if fraction.isdecimal() else "") + zone)
+    return parse_times(found, [f"image {file.name}" for file in chosen], texts)
+
+
+def _rows(names: Sequence[str], labels: Sequence[str], source: Path) -> list[int]:
+    """Return for each label the row of its name."""
+    rows: list[int] = match_labels(labels, names, one_to_one=False)[0].tolist()
+    missing = [label for label, row in zip(labels, rows, strict=True) if row < 0]
+    if missing:
+        sentence = f"{len(missing)} images are missing or have ambiguous names: {missing[0]}, ..."
+        raise bad_file(source, "image_times.missing", sentence, images=missing)
+    return rows
+
+
+def parse_times(source: Path, where: Sequence[str], texts: Sequence[str]) -> Times:
+    """Parse times; all must have zones, or none."""
+    moments = []
+    for at, text in zip(where, texts, strict=True):
+        iso = _EXIF_DATE.sub(r"\1-\2-\3", text.strip())
+        try:
+            moments.append(datetime.fromisoformat(iso if len(iso) > len("2026-05-01") else ""))
+        except ValueError:
+            sentence = f"{at}: '{text}' is not a date and time. Write 2026-05-01T12:00:00Z."
+            raise bad_file(source, "time.format", sentence, value=text) from None
+    zoned = [moment.tzinfo is not None for moment in moments]
+    if any(zoned) != all(zoned):
+        odd = zoned.index(not zoned[0])
+        sentence = f"{where[odd]}: only some times have a zone ('{texts[odd]}'). Write all alike."
+        raise bad_file(source, "time.zone", sentence, value=texts[odd])
+    utc = [moment if zoned[0] else moment.replace(tzinfo=UTC) for moment in moments]
+    return Times(np.array([moment.timestamp() for moment in utc]), zoned[0], str(source))
+
+
+MOST_IMAGES, HEAD_BYTES = 30, 2**17
+_ABOVE = re.compile(rb"RelativeAltitude(?:=[\"']|>)\s*([+-]?\d+(?:\.\d*)?)")
+
+
+def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
+    """Return how high each image was taken above the take-off place, shape (k,), metres.
+
+    NaN where it is not recorded. At most `MOST_IMAGES` images near the camera file are read.
+    """
+    path, found = Path(cameras), dict[str, float]()
+    root = path if path.is_dir() else path.parent
+    with suppress(OSError):  # no correction needs them
+        inside = [*sorted(root.glob("*")), *sorted(root.glob("images/*"))]
+        images = [one for one in inside if one.suffix.lower() in IMAGES and one.is_file()]
+        for image in images[:: 1 + len(images) // MOST_IMAGES]:
+            with image.open("rb") as stream:
+                if above := _ABOVE.search(stream.read(HEAD_BYTES)):
+                    found[image.name] = float(above[1])
+    altitudes = np.array([*found.values(), np.nan])
+    return np.asarray(altitudes[match_labels(labels, list(found))[0]])  # -1 for those without

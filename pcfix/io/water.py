@@ -1,4 +1,4 @@
-"""Read the water surface: a level, a plane, a dimension, a mesh or a raster; write rasters.
+"""Read the water surface: a level, a plane, a dimension, a mesh or a raster, and tide tables.
 
 Meshes are read here, not by open3d: it returns OBJ coordinates as 32-bit floats, half a metre
 apart at a northing of five million, and a damaged PLY ends the process.
@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,9 +20,10 @@ import numpy as np
 from pcfix.errors import GeometryError, SettingError, bad_file, warn
 from pcfix.io import crs as systems
 from pcfix.io.files import check_input
+from pcfix.io.photographs import Times, parse_times
 from pcfix.io.ply import positions, read_columns, read_header
 from pcfix.io.rasters import IMPOSSIBLE_M, open_raster, place_of, read_masked
-from pcfix.io.tables import METRES, match_labels, number
+from pcfix.io.tables import METRES, match_labels, number, read_table
 from pcfix.model import (
     FloatArray,
     IntArray,
@@ -263,3 +265,56 @@ def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:
     }  # fmt: skip
     with rasterio.open(path, "w", **profile) as target:
         target.write(water.height_m, 1)
+
+
+LONG_GAP_S = 3600.0
+"""Between rows. Half a tide lasts 6.2 h; with an amplitude A of 2 m the chord over one hour is up
+to A (2 pi 1 h / 12.4 h)^2 / 8 = 6 cm off, that over two hours 26 cm."""
+
+
+def read_tide(path: File) -> tuple[Times, FloatArray]:
+    """Read a table of increasing ``time`` (ISO 8601) and ``level_m``, above any datum."""
+    source = check_input(path)
+    table = read_table(source, ("time", "level_m"))
+    level = table.of(("level_m",))[:, 0]
+    times = parse_times(source, [f"line {line}" for line in table.line], table.column("time"))
+    late = np.flatnonzero(np.diff(times.time_s) <= 0.0)
+    if late.size:
+        line = table.line[late[0] + 1]
+        sentence = f"line {line}: the time is not later than the one before. Sort the rows by time."
+        raise bad_file(source, "tide.order", sentence, line=line)
+    if len(level) < 2:
+        raise bad_file(source, "tide.one_row", "has one row. Give at least two.")
+    return times, level
+
+
+def level_offsets(
+    tide: Times, level_m: FloatArray, times: Times, labels: Sequence[str]
+) -> FloatArray:
+    """Return how much higher than on average the water was at each of k images, metres.
+
+    The level is linear between the rows of the table. The average over the images is the level that
+    the user gives.
+    """
+    clock = tide.time_s
+    if tide.zoned != times.zoned:
+        without = times if tide.zoned else tide
+        sentence = "its times have no zone, those of the other file have. Add +02:00, or Z for UTC."
+        raise bad_file(without.name, "time.zone", sentence)
+    outside = np.flatnonzero((times.time_s < clock[0]) | (times.time_s > clock[-1]))
+    if outside.size:
+        image, at = labels[outside[0]], float(times.time_s[outside[0]])
+        taken = datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M:%S")
+        sentence = f"does not cover image {image}, taken at {taken} ({outside.size} of"
+        sentence += f" {len(labels)} images are outside). Add rows, or check the zones."
+        raise bad_file(
+            tide.name, "tide.not_covered", sentence, image=image, count=int(outside.size)
+        )
+    level = np.interp(times.time_s, clock, level_m)
+    row = np.clip(np.searchsorted(clock, times.time_s) - 1, 0, len(clock) - 2)
+    longest_s = float(np.diff(clock)[row].max())
+    if longest_s > LONG_GAP_S:
+        hours = longest_s / 3600.0
+        sentence = f"its rows are up to {hours:.1f} h apart; give one each hour."
+        warn(tide.name, "tide.sparse", sentence, hours=hours)
+    return np.asarray(level - level.mean())
