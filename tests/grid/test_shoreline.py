@@ -8,10 +8,10 @@ import pytest
 import shapely
 
 import pcfix
+from pcfix.flow.demo import write_scene
 from pcfix.flow.outputs import waterline
 from pcfix.grid import shoreline
 from pcfix.grid.shoreline import NearWater
-from pcfix.io.scenes import write_scene
 from pcfix.simulate.scene import ORIGIN_M
 from pcfix.simulate.settings import Terrain
 

@@ -16,7 +16,7 @@ import pytest
 import pcfix
 from pcfix.cli.commands import COMMANDS
 from pcfix.cli.plugin import OFFERED, plugin_zip
-from pcfix.io.scenes import write_scene
+from pcfix.flow.demo import write_scene
 from pcfix.options.correct import RunOptions
 from pcfix.options.declare import options_of
 from pcfix.qgis.command import CommandError, program_of, words_of
