@@ -210,8 +210,7 @@ def _to_cameras(
 ) -> FloatArray:
     """Return points in the CRS of the cameras; refuse points far from the block."""
     target = cameras.crs
-    forward = to_cloud_crs(source, target, xyz, str(table.path), heights=True)
-    moved = xyz if forward is None else forward(xyz)
+    moved = to_cloud_crs(source, target, xyz, str(table.path), heights=True)(xyz)
     lost = ~np.isfinite(moved).all(axis=1) & np.isfinite(xyz).all(axis=1)
     if lost.any():
         i = int(np.argmax(lost))
@@ -251,11 +250,7 @@ def _read(path: Path) -> tuple[Table, str | None]:
         sentence = "is neither a table of marks nor OpenDroneMap's gcp_list.txt. Line 1 must name"
         sentence += " the columns name, x, y, z, image, u, v, or be a CRS."
         raise bad_file(path, "gcps.format", sentence)
-    system, unknown = table_crs(table)
-    if unknown:
-        sentence = f"PROJ does not know its CRS '{table.crs}'. Give an EPSG code."
-        raise bad_file(path, "crs.unknown", sentence, crs=table.crs)
-    return table, system
+    return table, table_crs(table)[0] or table.crs  # one that PROJ does not know is refused later
 
 
 def _odm_table(path: Path, rows: list[tuple[int, list[str]]]) -> Table:

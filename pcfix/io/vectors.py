@@ -15,7 +15,7 @@ import shapely
 
 from pcfix.errors import bad_file, warn
 from pcfix.io import tables
-from pcfix.io.crs import parse_crs, plan_unit, to_cloud_crs
+from pcfix.io.crs import parse_crs, plan_unit, to_cloud_crs, unchanged
 from pcfix.io.files import cannot_write, check_input, check_output, temporary_output
 from pcfix.libraries import optional_library
 from pcfix.model import FloatArray
@@ -107,7 +107,7 @@ def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool
     heights = heights and bool(np.isfinite(at[:, 2]).any())
     at = np.nan_to_num(at)
     forward = to_cloud_crs(vectors.crs, cloud_crs, at, vectors.name, heights=heights)
-    if forward is None:
+    if forward is unchanged:
         return vectors
     geometries = vectors.geometries
 

@@ -194,7 +194,7 @@ def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRa
         heights = _heights(source, crs, name)
         middle = np.array([[*place_of(t, size[0] / 2, size[1] / 2), 0.0]])
         to_cloud = systems.to_cloud_crs(crs, cloud_crs, middle, name, heights=True)
-        if to_cloud is not None or not (t.b == t.d == 0.0 and t.a > 0.0 > t.e):
+        if to_cloud is not systems.unchanged or not (t.b == t.d == 0.0 and t.a > 0.0 > t.e):
             sentence = "is turned, or in another CRS than the cloud. Reproject it with 'gdalwarp"
             raise bad_file(name, "water.raster_place", f"{sentence} -t_srs CRS_OF_THE_CLOUD'.")
     if not np.isfinite(heights).any():
