@@ -190,36 +190,29 @@ class Burst:
 def read_frames(path: File, every: int = 1) -> Burst:
     """Return the frames of a folder or of a video, one in `every`."""
     place = Path(path)
-    found = _frames_of_video(place, every) if place.is_file() else _frames_of_folder(place, every)
-    if len(found.names) < LEAST_FRAMES:
-        sentence = f"gives {len(found.names)} frames, of {LEAST_FRAMES} at least. Give more, or"
-        raise bad_file(
-            place, "frames.too_few", f"{sentence} lower --every.", frames=len(found.names)
-        )
+    if place.is_file():
+        # headers of videos may state a wrong number of frames, so they are counted
+        shapes = [frame.shape for frame in _video_frames(place)][::every]
+        if not shapes:
+            sentence = "has no frames that OpenCV can read. Convert it to MP4, or give a folder."
+            raise bad_file(place, "video.unreadable", sentence)
+        cv2 = photo_library("cv2")
+        rate = float(cv2.VideoCapture(str(place)).get(cv2.CAP_PROP_FPS))
+        names = tuple(f"{place.stem}_{every * number:05d}" for number in range(len(shapes)))
+        interval_s = every / rate if 0.1 <= rate <= 10_000.0 else None
+        found = Burst(place, (), names, shapes[0][1], shapes[0][0], every, interval_s)
+    else:
+        paths = tuple(photographs_in(place)[::every])
+        sizes = [size_of(one) for one in paths]
+        for one, size in zip(paths, sizes, strict=True):
+            if size != sizes[0]:
+                sentence = f"has {size} pixels, {paths[0].name} {sizes[0]}. Give one size."
+                raise bad_file(one, "photos.size", sentence, size=size)
+        found = Burst(place, paths, tuple(one.stem for one in paths), *sizes[0])
+    if (count := len(found.names)) < LEAST_FRAMES:
+        sentence = f"gives {count} frames, of {LEAST_FRAMES} at least. Give more, or lower --every."
+        raise bad_file(place, "frames.too_few", sentence, frames=count)
     return found
-
-
-def _frames_of_folder(folder: Path, every: int) -> Burst:
-    paths = tuple(photographs_in(folder)[::every])
-    sizes = [size_of(one) for one in paths]
-    for one, size in zip(paths, sizes, strict=True):
-        if size != sizes[0]:
-            sentence = f"has {size} pixels, {paths[0].name} {sizes[0]}. Give one size."
-            raise bad_file(one, "photos.size", sentence, size=size)
-    return Burst(folder, paths, tuple(one.stem for one in paths), *sizes[0])
-
-
-def _frames_of_video(path: Path, every: int) -> Burst:
-    # headers of videos may state a wrong number of frames, so they are counted
-    shapes = [frame.shape for frame in _video_frames(path)][::every]
-    if not shapes:
-        sentence = "has no frames that OpenCV can read. Convert it to MP4, or give a folder."
-        raise bad_file(path, "video.unreadable", sentence)
-    cv2 = photo_library("cv2")
-    rate = float(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FPS))
-    names = tuple(f"{path.stem}_{every * number:05d}" for number in range(len(shapes)))
-    interval_s = every / rate if 0.1 <= rate <= 10_000.0 else None
-    return Burst(path, (), names, shapes[0][1], shapes[0][0], every, interval_s)
 
 
 def _video_frames(path: Path) -> Iterator[Pixels]:
@@ -253,8 +246,6 @@ def write_spread(target: Path, spread: FloatArray) -> None:
 
 
 IMAGES = (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".webp", ".heic", ".dng")
-_EXIF_DATE = re.compile(r"^(\d{4}):(\d\d):(\d\d)\b")
-_DATE_TIME_ORIGINAL, _OFFSET_ORIGINAL, _SUBSECONDS, _EXIF = 0x9003, 0x9011, 0x9291, 0x8769
 
 
 class Times(NamedTuple):
@@ -282,7 +273,7 @@ def read_image_times(path: File, labels: Sequence[str]) -> Times:
         rows, times = _rows(table.column("label"), labels, found), table.column("time")
         where = [f"line {table.line[row]}" for row in rows]
         return parse_times(found, where, [times[row] for row in rows])
-    from PIL import Image
+    from PIL import ExifTags, Image
 
     files = sorted(p for p in found.rglob("*") if p.suffix.lower() in IMAGES)
     chosen = [files[row] for row in _rows([str(p) for p in files], labels, found)]
@@ -290,8 +281,9 @@ def read_image_times(path: File, labels: Sequence[str]) -> Times:
     for file in chosen:
         sentence = "is not a readable image ({})."
         with refusing(file, "photos.unreadable", sentence), Image.open(file) as image:
-            tags = image.getexif().get_ifd(_EXIF)
-        codes = (_DATE_TIME_ORIGINAL, _SUBSECONDS, _OFFSET_ORIGINAL)
+            tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
+        own = ExifTags.Base
+        codes = (own.DateTimeOriginal, own.SubsecTimeOriginal, own.OffsetTimeOriginal)
         text, fraction, zone = (str(tags.get(code, "")).strip("\0 ") for code in codes)
         if not text:
             sentence = "its EXIF data has no DateTimeOriginal. Give a CSV table label,time instead."
@@ -314,7 +306,7 @@ def parse_times(source: Path, where: Sequence[str], texts: Sequence[str]) -> Tim
     """Parse times; all must have zones, or none."""
     moments = []
     for at, text in zip(where, texts, strict=True):
-        iso = _EXIF_DATE.sub(r"\1-\2-\3", text.strip())
+        iso = re.sub(r"^(\d{4}):(\d\d):(\d\d)\b", r"\1-\2-\3", text.strip())  # of EXIF data
         try:
             moments.append(datetime.fromisoformat(iso if len(iso) > len("2026-05-01") else ""))
         except ValueError:
@@ -329,8 +321,7 @@ def parse_times(source: Path, where: Sequence[str], texts: Sequence[str]) -> Tim
     return Times(np.array([moment.timestamp() for moment in utc]), zoned[0], str(source))
 
 
-MOST_IMAGES, HEAD_BYTES = 30, 2**17
-_ABOVE = re.compile(rb"RelativeAltitude(?:=[\"']|>)\s*([+-]?\d+(?:\.\d*)?)")
+MOST_IMAGES = 30
 
 
 def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
@@ -340,12 +331,13 @@ def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
     """
     path, found = Path(cameras), dict[str, float]()
     root = path if path.is_dir() else path.parent
+    above = re.compile(rb"RelativeAltitude(?:=[\"']|>)\s*([+-]?\d+(?:\.\d*)?)")
     with suppress(OSError):  # no correction needs them
         inside = [*sorted(root.glob("*")), *sorted(root.glob("images/*"))]
         images = [one for one in inside if one.suffix.lower() in IMAGES and one.is_file()]
         for image in images[:: 1 + len(images) // MOST_IMAGES]:
             with image.open("rb") as stream:
-                if above := _ABOVE.search(stream.read(HEAD_BYTES)):
-                    found[image.name] = float(above[1])
+                if stated := above.search(stream.read(2**17)):
+                    found[image.name] = float(stated[1])
     altitudes = np.array([*found.values(), np.nan])
     return np.asarray(altitudes[match_labels(labels, list(found))[0]])  # -1 for those without

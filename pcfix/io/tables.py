@@ -127,12 +127,6 @@ class Table:
 
 
 CRS_COMMENT = re.compile(r"^\s*#\s*(?:coordinatesystem|crs)\s*[:=]\s*(.+)$", re.IGNORECASE)
-_LONGEST_NAME = 80
-
-
-def stated_crs(lines: Iterable[str]) -> str | None:
-    """Return the CRS that a comment states."""
-    return next((found[1].strip() for one in lines if (found := CRS_COMMENT.match(one))), None)
 
 
 def number(text: str) -> float:
@@ -210,7 +204,7 @@ def _split_unit(text: str, plain: set[str]) -> tuple[str, str]:
     The name of X/Longitude is longitude.
     """
     name, unit = text.strip("# \t\"'").lower(), ""
-    if name not in plain and len(name) < _LONGEST_NAME:  # long names take the expression long
+    if name not in plain and len(name) < 80:  # long names take the expression long
         match = re.match(r"^(.*?)[ _]*[\[(]([^\])]*)[\])]$|^(.*)_(m|cm|mm|ft|deg|gon|rad)$", name)
         name, unit = (match[1] or match[3], match[2] or match[4]) if match else (name, "")
         name, unit = (name or "").strip().replace(" ", "_"), (unit or "").strip()
@@ -277,7 +271,9 @@ def read_table(path: Path, *needed: Sequence[str], spellings: Spellings | None =
         raise bad_file(path, "table.not_csv", sentence) from error
     if not rows:
         raise bad_file(path, "table.empty", "has a header but no rows.")
-    return Table(path, header, rows, numbers, place, units, is_comment, stated_crs(lines[:at]))
+    stated = filter(None, map(CRS_COMMENT.match, lines[:at]))
+    system = next((found[1].strip() for found in stated), None)
+    return Table(path, header, rows, numbers, place, units, is_comment, system)
 
 
 def match_labels(
