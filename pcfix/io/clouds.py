@@ -46,9 +46,6 @@ if TYPE_CHECKING:
 Clouds: TypeAlias = "File | Iterable[File] | Tiles"
 
 SUFFIXES = (".las", ".laz")
-LISTS = (".txt", ".lst", ".list")
-OVERLAP = 0.01
-"""A fraction of a tile's side: neighbours may reach so far into each other, by rounding."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +179,7 @@ def _listed(path: Path) -> list[Path] | None:
         with refusing(path, "cloud.index", sentence):
             assets = [one["assets"] for one in read_json(path)["features"]]
             names = [next(iter(one.values()))["href"].removeprefix("file://") for one in assets]
-    elif suffix in LISTS and path.is_file():
+    elif suffix in (".txt", ".lst", ".list") and path.is_file():
         lines = [one.strip() for one in path.read_text("utf-8", errors="replace").splitlines()]
         names = [line for line in lines if line and not line.startswith("#")]
     else:
@@ -215,8 +212,9 @@ def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
                 raise bad_file(name, "cloud.mixed_tiles", sentence, paths=[first, path])
     import shapely  # slow to import
 
-    # Warn of tiles that reach into each other by more than rounding, as points may be double
-    margin = OVERLAP / 2.0 * (tiles.highs - tiles.lows)[:, :2]
+    # Warn of tiles that reach into each other by more than 1 % of a side, which may be rounding:
+    # points may be double
+    margin = 0.005 * (tiles.highs - tiles.lows)[:, :2]
     boxes = shapely.box(*(tiles.lows[:, :2] + margin).T, *(tiles.highs[:, :2] - margin).T)
     pairs = shapely.STRtree(boxes).query(boxes, predicate="intersects").T.tolist()
     found = [(tiles.paths[i].name, tiles.paths[j].name) for i, j in pairs if i < j]
@@ -274,22 +272,17 @@ class CloudView:
         return (*self.low.tolist(), *self.high.tolist())
 
 
-RGB = ("red", "green", "blue")
-
-
 def points_of(
     chunk: Any, source: LasSource, water: WaterSurface | None, names: Iterable[str] = ()
 ) -> Points:
     """Return the n points of a chunk, with the dimensions of some names."""
-    heights = None
-    if isinstance(water, WaterDimension):
-        heights = source.dimension(chunk, water.name)
-    has_colours = "red" in (chunk.array.dtype.names or ())
+    known = chunk.array.dtype.names
+    colours = [chunk.array[one] for one in ("red", "green", "blue") if one in known]
     return Points(
         coordinates(chunk),
-        heights,
+        source.dimension(chunk, water.name) if isinstance(water, WaterDimension) else None,
         np.asarray(chunk["classification"]),
-        np.column_stack([chunk.array[one] for one in RGB]) if has_colours else None,
+        np.column_stack(colours) if colours else None,
         np.asarray(chunk["withheld"]).astype(np.bool_),
         dimensions={name: source.dimension(chunk, name) for name in names},
     )
@@ -361,8 +354,6 @@ def own_water(source: LasSource) -> WaterSurface | None:
         return None if plane is None else WaterPlane(*map(float, plane))
 
 
-WATER_CLASSES = (9, 41, 42, 45)
-"""ASPRS classes of water and of its surface and column: not the bed."""
 TABLES = (".csv", ".txt")
 KINDS = "a cloud (.las, .laz), check points (.csv, .txt) or a grid (.tif, .tiff)"
 
@@ -389,7 +380,8 @@ def read_reference(reference: Clouds) -> Reference:
     """
     found = reference_of(reference)
     if isinstance(found, Tiles) or is_cloud(check_input(found)):
-        cloud = read_cloud(found, skip_classes=NOISE_CLASSES + WATER_CLASSES)
+        water = 9, 41, 42, 45  # ASPRS classes of water, its surface and column: not the bed
+        cloud = read_cloud(found, skip_classes=NOISE_CLASSES + water)
         return Reference(cloud.name, cloud.xyz, cloud.crs, cloud.excluded)
     suffix = found.suffix.lower()
     if suffix in TABLES:
@@ -400,7 +392,7 @@ def read_reference(reference: Clouds) -> Reference:
     from pyproj import CRS
 
     with open_raster(found) as grid:  # the centres of the cells of its first band
-        height = read_masked(grid) * grid.scales[0] + grid.offsets[0]
+        height = read_masked(grid)
         transform, crs = grid.transform, CRS(grid.crs.to_wkt()) if grid.crs else None
     if transform.is_identity:
         sentence = "has no georeference. Give a georeferenced GeoTIFF."

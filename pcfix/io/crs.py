@@ -172,7 +172,6 @@ def shortened(text: str) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-GEOGRAPHIC_WGS84 = "EPSG:4979"
 LOCAL = "local"
 
 
@@ -222,10 +221,6 @@ class Topocentric:
 
     def to_degrees(self, enu: FloatArray) -> FloatArray:
         """Return longitudes, latitudes and ellipsoidal heights (EPSG:4979) of points (n, 3)."""
-        return self.from_degrees(enu, "INVERSE")
-
-    def from_degrees(self, xyz: FloatArray, direction: str = "FORWARD") -> FloatArray:
-        """Return the coordinates here of longitudes, latitudes and heights, shape (n, 3)."""
         from pyproj import Transformer
 
         at = f"+lat_0={self.latitude_deg!r} +lon_0={self.longitude_deg!r} +h_0={self.height_m!r}"
@@ -233,8 +228,8 @@ class Topocentric:
         step = Transformer.from_pipeline(
             f"+proj=pipeline {geocentric} +step +proj=topocentric +ellps=WGS84 {at}"
         )
-        x, y, z = xyz.T
-        return np.column_stack(step.transform(x, y, z, direction=direction))
+        x, y, z = enu.T
+        return np.column_stack(step.transform(x, y, z, direction="INVERSE"))
 
 
 Move = Callable[[FloatArray], FloatArray]
@@ -247,10 +242,6 @@ def unchanged(xyz: FloatArray) -> FloatArray:
 
 
 Notes = tuple[PcfixWarning, ...]
-
-SILENT_ACCURACY_M = 1.0
-"""A transformation that is worse than this gets a note."""
-_AREA_MARGIN_DEG = np.array([-0.01, -0.01, 0.01, 0.01])  # west, south, east, north
 
 
 class HeightsError(InputError):
@@ -282,7 +273,8 @@ def transformation(
             warnings.simplefilter("ignore")  # a missing grid is named in the error or note
             to_degrees = Transformer.from_crs(parts(source)[0], "EPSG:4326", always_xy=True)
             corners = *at[:, :2].min(axis=0), *at[:, :2].max(axis=0)
-            degrees = np.array(to_degrees.transform_bounds(*corners)) + _AREA_MARGIN_DEG
+            degrees = np.array(to_degrees.transform_bounds(*corners))
+            degrees += [-0.01, -0.01, 0.01, 0.01]  # a margin west, south, east and north
             area = AreaOfInterest(*degrees) if np.isfinite(degrees).all() else None
             group = TransformerGroup(source, target, always_xy=True, area_of_interest=area)
     except (ProjError, IndexError) as error:  # the latter if PROJ finds no operation at all
@@ -316,7 +308,7 @@ def transformation(
             raise bad_file(name, "crs.grid_missing", sentence, grids=grids)
         sentence = f"{name}: PROJ knows no transformation {names}; their datums are treated as one."
         notes = (PcfixWarning("crs.datum", sentence),)
-    elif step.accuracy > SILENT_ACCURACY_M:
+    elif step.accuracy > 1.0:
         sentence = f"{name}: positions {names} are accurate to about {step.accuracy:g} m."
         sentence += f" {why}." if grids else ""
         notes = (PcfixWarning("crs.accuracy", sentence, accuracy_m=step.accuracy, grids=grids),)

@@ -99,8 +99,9 @@ def transform_of(lattice: Lattice) -> Affine:
 
 
 def read_masked(raster: Any, band: int = 1, **how: Any) -> FloatArray:
-    """Return a band as float64, NaN for no value; `how` goes to rasterio."""
-    return np.asarray(raster.read(band, masked=True, **how).astype(np.float64).filled(np.nan))
+    """Return a band as float64, scaled as it states, NaN for no value; `how` goes to rasterio."""
+    stored = raster.read(band, masked=True, **how).astype(np.float64).filled(np.nan)
+    return np.asarray(stored * raster.scales[band - 1] + raster.offsets[band - 1])
 
 
 def read_onto(path: Path, lattice: Lattice) -> FloatArray:
@@ -285,20 +286,9 @@ def values_at(path: Path, xy: FloatArray) -> FloatArray:
         return np.ravel([cell.astype(np.float64).filled(np.nan) for cell in cells])
 
 
-RASTERS = (".tif", ".tiff", ".vrt", ".png", ".jpg", ".jpeg")
-"""Of rasters; the last three only to say that pictures have no heights."""
-READ_CELLS = 256
-"""Side of the windows that are read, whose points are corrected at once."""
-CACHE_BYTES = 64_000_000
-"""Of GDAL, whose default is 5 % of the memory of the machine."""
-STEPS_A_CELL = 1000.0
-"""Coordinates of points are multiples of a power of ten, at least this much finer than a cell."""
-_COLOURS = ("red", "green", "blue", "palette")
-
-
 def is_raster(path: object) -> bool:
-    """Whether a path is that of a raster by its name."""
-    return str(path).lower().endswith(RASTERS)
+    """Whether a path is that of a raster by its name; pictures count, to say what they lack."""
+    return str(path).lower().endswith((".tif", ".tiff", ".vrt", ".png", ".jpg", ".jpeg"))
 
 
 @dataclass(frozen=True)
@@ -334,8 +324,9 @@ class RasterSource(LasSource):
 
         self.path = part.path
         with ExitStack() as stack:
-            # GeoTIFF 1.0 states the vertical datum too, which GDAL ignores by default
-            settings = rasterio.Env(GTIFF_REPORT_COMPD_CS=True, GDAL_CACHEMAX=CACHE_BYTES)
+            # GeoTIFF 1.0 states the vertical datum too, which GDAL ignores by default; its default
+            # cache is 5 % of the memory of the machine
+            settings = rasterio.Env(GTIFF_REPORT_COMPD_CS=True, GDAL_CACHEMAX=64_000_000)
             stack.enter_context(settings)
             self.raster = raster = stack.enter_context(open_raster(part.path))
             self.band = band = _height_band(raster, part)
@@ -351,7 +342,8 @@ class RasterSource(LasSource):
             self.nodata = float(missing if raster.nodata is None else raster.nodata)
             # what a LAS file has: a header, and the record of a correction
             header = laspy.LasHeader(version="1.4", point_format=6)
-            step = 10.0 ** np.floor(np.log10(self.cell_m / STEPS_A_CELL))
+            # coordinates are multiples of a power of ten, at least 1000 times finer than a cell
+            step = 10.0 ** np.floor(np.log10(self.cell_m / 1000.0))
             header.scales = np.array([step, step, min(step, 0.0001)])
             box = np.array([[*raster.bounds[:2], 0.0], [*raster.bounds[2:], 0.0]])
             header.offsets = np.floor(box.mean(axis=0))
@@ -373,17 +365,16 @@ class RasterSource(LasSource):
     def read(self, window: Window) -> FloatArray:
         """Return the heights of a window, shape (rows, columns), metres; NaN without one."""
         with raster_errors(self.path):
-            stored = read_masked(self.raster, self.band, window=slices(window))
+            height = read_masked(self.raster, self.band, window=slices(window))
             for number, kind in enumerate(self.raster.colorinterp, start=1):
                 if kind.name == "alpha":  # GDAL ignores it next to a band of floating point
-                    stored[self.raster.read(number, window=slices(window)) == 0] = np.nan
-        height = stored * self.scale + self.offset
+                    height[self.raster.read(number, window=slices(window)) == 0] = np.nan
         height[~(np.abs(height) <= IMPOSSIBLE_M)] = np.nan
         return height
 
     def chunks(self) -> Iterator[laspy.ScaleAwarePointRecord]:
         """Yield the points of each window with any, row by row."""
-        for window in self.window.parts(READ_CELLS):
+        for window in self.window.parts(TILE):  # its points are corrected at once
             height = self.read(window)
             row, column = np.nonzero(np.isfinite(height))
             if len(row) == 0:
@@ -407,7 +398,8 @@ def _height_band(raster: DatasetReader, part: RasterBand) -> int:
         sentence = f"has no band {band} of heights; it has {len(known)}. Give another --band."
         raise bad_file(path, "raster.band", sentence, band=band)
     asked = known if band is None else [band]
-    if any(kinds[one - 1] in _COLOURS or raster.dtypes[one - 1] == "uint8" for one in asked):
+    colours = "red", "green", "blue", "palette"
+    if any(kinds[one - 1] in colours or raster.dtypes[one - 1] == "uint8" for one in asked):
         sentence = "is a picture (colours or a hillshade), not heights. Give the DSM."
         raise bad_file(path, "raster.picture", sentence)
     if len(asked) != 1:

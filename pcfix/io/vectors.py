@@ -31,7 +31,7 @@ TABLES = (".csv", ".txt")
 GDAL_SUFFIXES = (".gpkg", ".shp", ".geojson", ".json", ".kml", ".gpx")
 KINDS = "GeoPackage (.gpkg), Shapefile (.shp), GeoJSON, KML, GPX or a table of points (.csv)"
 LAYER_MARK = "|"
-WGS84, WGS84_3D = "EPSG:4326", "EPSG:4979"
+WGS84 = "EPSG:4326"
 SPACING_M = 1.0
 """Along lines without heights, which get these from the cloud."""
 SHORE_RADIUS_M = 1.0
@@ -148,8 +148,8 @@ def _read_gdal(path: Path, layer: str) -> tuple[Geometries, str | None, str]:
         raise bad_file(path, "vector.layer", sentence, layer=layer or None, layers=names)
     name = str(path) if layer == path.stem else f"{path}, layer {layer}"
     crs = meta["crs"]
-    if suffix in (".geojson", ".json") and crs == WGS84:
-        crs = WGS84_3D if shapely.has_z(geometries).any() else WGS84
+    if suffix in (".geojson", ".json") and crs == WGS84 and shapely.has_z(geometries).any():
+        crs = "EPSG:4979"  # with heights above the ellipsoid
     return geometries, crs, name
 
 
@@ -269,10 +269,6 @@ def read_water_polygons(path: File, cloud_crs: str | CRS | None = None) -> Vecto
     return replace(vectors, geometries=np.array([area]))
 
 
-STYLES = "layer_styles"
-"""The table in which QGIS looks for styles, and keeps its own."""
-
-
 class Layer(NamedTuple):
     """Geometries of one kind (LineString, Point Z ...), by name a value of each, and a style (QML).
 
@@ -314,8 +310,10 @@ def write_layers(
                     geometry_type=one.kind, append=number > 0,
                 )  # fmt: skip
             if styled:
+                # the table in which QGIS looks for styles, and keeps its own
                 write(
-                    temporary, None, [*columns.values()], [*columns], layer=STYLES, driver="GPKG",
+                    temporary, None, [*columns.values()], [*columns], layer="layer_styles",
+                    driver="GPKG",
                     append=True, crs=None, geometry_type=None,
                 )  # fmt: skip
         except RuntimeError as error:

@@ -43,12 +43,9 @@ if TYPE_CHECKING:
 KINDS = (
     "a level such as 0.37, plane:a,b,c, dim:NAME, a mesh (.obj, .ply) or a raster of heights (.tif)"
 )
-_NOT_RASTERS = (".csv", ".txt", ".json", ".geojson", ".gpkg", ".shp", ".las", ".laz")
-"""GDAL would try some of these as rasters all the same."""
 MOST_OVERLAP = 0.01
 """Of the plan area; the triangulation of a shoreline may fold at its rim by less."""
 _CORNERS = "vertex_indices", "vertex_index"
-_MOST_VERTICES = 2**31
 
 
 def read_water(spec: float | File, cloud_crs: str | CRS | None = None) -> WaterSurface:
@@ -91,7 +88,8 @@ def read_water(spec: float | File, cloud_crs: str | CRS | None = None) -> WaterS
     found = check_input(text)
     if suffix in (".obj", ".ply"):
         return _mesh(found)
-    if suffix in _NOT_RASTERS:
+    # GDAL would try some of these as rasters all the same
+    if suffix in (".csv", ".txt", ".json", ".geojson", ".gpkg", ".shp", ".las", ".laz"):
         raise bad_file(text, "water.format", f"is not a water surface. Give {KINDS}.")
     return read_water_raster(text, cloud_crs)
 
@@ -135,7 +133,7 @@ def _read_obj(path: Path) -> tuple[FloatArray, IntArray]:
             elif key == "f":
                 # a corner such as 7, 7/1/3 or, counted from the end, -1
                 rows = [int(field.split("/")[0]) for field in fields]
-                if max(map(abs, rows), default=0) > _MOST_VERTICES:
+                if max(map(abs, rows), default=0) > 2**31:
                     raise ValueError(f"there is no vertex {max(rows, key=abs)}")
                 corners = [row - 1 if row > 0 else len(vertices) + row for row in rows]
                 triangles += [[corners[0], *corners[i : i + 2]] for i in range(1, len(corners) - 1)]
@@ -222,7 +220,7 @@ def _heights(source: DatasetReader, crs: CRS | None, name: str) -> FloatArray:
         stated = unit or f"the unit of {'' if crs is None else crs.name}"
         sentence = f"its heights are in {stated}. Convert them to metres."
         raise bad_file(name, "water.raster_unit", sentence, value=unit)
-    heights = read_masked(source) * source.scales[0] + source.offsets[0]
+    heights = read_masked(source)
     if source.nodata is None:
         heights[~(np.abs(heights) <= IMPOSSIBLE_M)] = np.nan
         unknown = int(np.isnan(heights).sum())

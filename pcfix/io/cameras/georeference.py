@@ -61,7 +61,7 @@ def frame_of(text: str, name: str) -> Frame:
     """Return the frame that a text names: a CRS, or ``ENU:latitude,longitude,height``."""
     if systems.is_topocentric(text):
         place = systems.Topocentric.from_text(text, name)
-        crs = systems.parse_crs(systems.GEOGRAPHIC_WGS84, name)
+        crs = systems.parse_crs("EPSG:4979", name)
         return Frame(crs, place.to_degrees, topocentric=True)
     crs = systems.parse_crs(text, name)
     if crs.is_geocentric:
