@@ -252,10 +252,7 @@ def write_dod(dsm: Path, reference: Path, output: Path) -> None:
                 raise GeometryError("raster.no_overlap", sentence, dsm=dsm, reference=reference)
 
 
-PREVIEW_CELLS = 360_000
-
-
-def preview(path: Path, cells: int = PREVIEW_CELLS) -> tuple[FloatArray, Affine]:
+def preview(path: Path, cells: int = 360_000) -> tuple[FloatArray, Affine]:
     """Return a raster of at most `cells`, NaN for no data, and its geotransform."""
     from rasterio.transform import from_bounds
 

@@ -20,10 +20,6 @@ from pcfix.io.files import check_input
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
 
-TOO_LARGE = 1e15
-"""No coordinate, in whatever unit, and no time is as large; its square is still a number."""
-
-
 METRES = dict.fromkeys(("", "m", "metre", "metres", "meter", "meters"), 1.0)
 DEGREES = dict.fromkeys(("", "deg", "degree", "degrees", "°"), 1.0)
 ANGLES = {
@@ -43,7 +39,6 @@ UNITS = {
 Spellings: TypeAlias = Mapping[str, Sequence[str]]
 """What columns are called, by their roles."""
 EXIF = ("gpslongitude", "gpslatitude", "gpsaltitude")
-UNKNOWN = ("", "nan", "na", "null", "none")
 
 
 @dataclass(frozen=True)
@@ -112,8 +107,9 @@ class Table:
             return np.full(len(self.rows), np.nan)
         name, texts = self.name(role), self.column(role)
         values = np.array([(exif_number if name in EXIF else number)(text) for text in texts])
-        for i in np.flatnonzero(~(np.abs(values) < TOO_LARGE)):
-            if needed or texts[i].lower() not in UNKNOWN:
+        # no coordinate, in whatever unit, and no time is as large; its square is still a number
+        for i in np.flatnonzero(~(np.abs(values) < 1e15)):
+            if needed or texts[i].lower() not in ("", "nan", "na", "null", "none"):
                 why = "too large" if math.isfinite(values[i]) else "not a finite number"
                 sentence = f"column {name}: '{texts[i]}' is {why}. Correct it."
                 where = {"line": self.line[i], "column": name, "value": texts[i]}

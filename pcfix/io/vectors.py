@@ -36,8 +36,6 @@ SPACING_M = 1.0
 """Along lines without heights, which get these from the cloud."""
 SHORE_RADIUS_M = 1.0
 """About shoreline points without a height, which get it from the cloud."""
-MOST_POINTS = 1_000_000
-FEW = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +207,7 @@ def read_shoreline(
     lines = np.concatenate([lines, shapely.get_rings(parts[kind == kinds.POLYGON])])
     measured, drawn = lines[shapely.has_z(lines)], lines[~shapely.has_z(lines)]
     count = float(shapely.length(drawn).sum()) / SPACING_M
-    if count > MOST_POINTS:
+    if count > 1_000_000:
         sentence = f"would give {count:.3g} points. Check its CRS and unit, or thin it out."
         raise bad_file(vectors.name, "water.shoreline_too_long", sentence, count=count)
     found = [_vertices(np.concatenate([points, measured]))]
@@ -222,7 +220,7 @@ def read_shoreline(
         counts.append(np.full(total, min(1.0, min(worth, independent) / total)))
     xyz = np.vstack(found)
     known = xyz[np.isfinite(xyz[:, 2]), 2]
-    if len(known) >= FEW and not known.any():  # a flat drawing
+    if len(known) >= 3 and not known.any():  # a flat drawing
         xyz[:, 2] = np.nan
         sentence = f"all {len(known)} heights are exactly 0; they are ignored."
         warn(vectors.name, "water.zero_heights", sentence, count=len(known))

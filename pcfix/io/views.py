@@ -365,7 +365,7 @@ class ViewReport(Sums):
             sentence = f"{self.source}: has none of the cloud's {points:,} points. Give the"
             sentence += " list of this cloud, or the offset of its coordinates (--cameras-offset)."
             raise InputError("views.no_match", sentence, points=points, listed=self.list_points)
-        found: dict[str, str] = {}
+        found = dict[str, str]()
         if self.unmatched > 0.1 * points:
             found["views.unmatched"] = f"lacks {self.unmatched:,} of the cloud's {points:,} points."
         if self.share_seen is None and self.entries:

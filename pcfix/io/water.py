@@ -43,8 +43,6 @@ if TYPE_CHECKING:
 KINDS = (
     "a level such as 0.37, plane:a,b,c, dim:NAME, a mesh (.obj, .ply) or a raster of heights (.tif)"
 )
-MOST_OVERLAP = 0.01
-"""Of the plan area; the triangulation of a shoreline may fold at its rim by less."""
 _CORNERS = "vertex_indices", "vertex_index"
 
 
@@ -114,7 +112,7 @@ def _mesh(path: Path) -> WaterMesh:
     # holes, edges of three facets and facets that overlap at one height do not matter
     double, area_m2 = in_two_sheets(tin)
     share = float(area_m2[double].sum() / area_m2.sum())
-    if share > MOST_OVERLAP:
+    if share > 0.01:  # the triangulation of a shoreline may fold at its rim by less
         sentence = f"{100.0 * share:.0f} % of the mesh is above another part. Export one surface."
         raise bad_file(path, "water.mesh_overlap", sentence, share=share)
     return mesh
@@ -160,8 +158,6 @@ def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
 
 MOST_CELLS = 10_000_000
 """Cells that are read, for the memory."""
-ROUGH_DEG = 3.0
-"""A slope by noise alone that moves a point by more than one percent of its depth."""
 
 
 def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRaster:
@@ -202,11 +198,10 @@ def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRa
     noise = np.abs(heights[1:-1, 1:-1] - around)
     noise_m = 1.48 * float(np.nanmedian(noise)) if np.isfinite(noise).any() else 0.0
     slope_deg = math.degrees(math.atan(noise_m / math.sqrt(abs(t.determinant))))
-    if slope_deg > ROUGH_DEG:
-        sentence = (
-            f"the water surface is rough ({noise_m:.2f} m, slopes of {slope_deg:.0f} degrees)."
-        )
-        warn(name, "water.rough", f"{sentence} Smooth it, or fit a level to it.", noise_m=noise_m)
+    if slope_deg > 3.0:  # by noise alone, a point moves by more than one percent of its depth
+        sentence = f"the water surface is rough ({noise_m:.2f} m, slopes of {slope_deg:.0f}"
+        sentence += " degrees). Smooth it, or fit a level to it."
+        warn(name, "water.rough", sentence, noise_m=noise_m)
     short = name.replace("\\", "/").rpartition("/")[2]
     return WaterRaster(heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), short)
 
@@ -265,11 +260,6 @@ def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:
         target.write(water.height_m, 1)
 
 
-LONG_GAP_S = 3600.0
-"""Between rows. Half a tide lasts 6.2 h; with an amplitude A of 2 m the chord over one hour is up
-to A (2 pi 1 h / 12.4 h)^2 / 8 = 6 cm off, that over two hours 26 cm."""
-
-
 def read_tide(path: File) -> tuple[Times, FloatArray]:
     """Read a table of increasing ``time`` (ISO 8601) and ``level_m``, above any datum."""
     source = check_input(path)
@@ -310,9 +300,10 @@ def level_offsets(
         )
     level = np.interp(times.time_s, clock, level_m)
     row = np.clip(np.searchsorted(clock, times.time_s) - 1, 0, len(clock) - 2)
-    longest_s = float(np.diff(clock)[row].max())
-    if longest_s > LONG_GAP_S:
-        hours = longest_s / 3600.0
+    hours = float(np.diff(clock)[row].max()) / 3600.0
+    # Half a tide lasts 6.2 h; with an amplitude A of 2 m the chord over one hour is up to
+    # A (2 pi 1 h / 12.4 h)^2 / 8 = 6 cm off, that over two hours 26 cm
+    if hours > 1.0:
         sentence = f"its rows are up to {hours:.1f} h apart; give one each hour."
         warn(tide.name, "tide.sparse", sentence, hours=hours)
     return np.asarray(level - level.mean())

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 
-WAVEFORM_PACKETS = ("LASF_Spec", 65535)
 _VLR, _EVLR = "<2x16sHH32s", "<2x16sHQ32s"
 IDENTITY_PLACE = 26
 """Where the header names system, software and date (LAS 1.4 R15, table 3)."""
@@ -48,12 +47,6 @@ MOST_SCALE_M = 1000.0
 
 CHUNK_POINTS = 400_000
 """Points that are worked on at a time, which bounds the memory."""
-
-CHUNK_BYTES = 500_000_000
-"""The same where records are so long that fewer points are as much."""
-
-SMALL_BYTES = 250_000_000
-"""Point records of a cloud that stay in memory until it is read again."""
 
 
 class Record(VLR):  # type: ignore[misc]  # laspy is untyped
@@ -134,7 +127,7 @@ def append_evlrs(stream: BinaryIO, records: Sequence[Record], minor_version: int
         stream.seek(235)
         stream.write(struct.pack("<QI", start, len(records)))
     for record in records:
-        if (record.user_id, record.record_id) == WAVEFORM_PACKETS:
+        if (record.user_id, record.record_id) == ("LASF_Spec", 65535):  # waveform packets
             stream.seek(227)
             stream.write(struct.pack("<Q", start))
         stream.seek(start)
@@ -262,9 +255,10 @@ class LasSource:
         if clouds is not None and self.path in clouds:
             yield from clouds[self.path]
             return
-        is_small = len(self) * self.header.point_format.size <= SMALL_BYTES
+        size = self.header.point_format.size
+        is_small = len(self) * size <= 250_000_000  # then it stays in memory until it is read again
         read, chunks = 0, list[laspy.ScaleAwarePointRecord]()
-        most = max(1, min(CHUNK_POINTS, CHUNK_BYTES // self.header.point_format.size))
+        most = max(1, min(CHUNK_POINTS, 500_000_000 // size))  # fewer points if records are long
         while read < len(self):
             with las_errors(self.path):
                 points = self._reader.read_points(most)
