@@ -20,10 +20,8 @@ from pcfix.options.scenes import BlockKind
 from pcfix.simulate.scene import Scene, simulate_scene
 from pcfix.version import __version__
 
-GROUND = 2
 CLOUDS = ("cloud.laz", "truth.laz", "lidar.laz")
 """The apparent cloud, the true position of each of its points, a reference with noise."""
-_FINE_GSD_M = 0.005  # clouds of finer images get steps of 0.1 mm
 
 
 def write_scene(scene: Scene, out_dir: File, *, overwrite: bool) -> None:
@@ -60,11 +58,11 @@ def write_scene(scene: Scene, out_dir: File, *, overwrite: bool) -> None:
     for name in (*CLOUDS, *contents):
         check_output(folder / name, overwrite=overwrite)
     wet = scene.depth_m(scene.lidar_xyz) > 0.0
-    classes = np.where(wet, BATHYMETRIC_POINT, GROUND).astype(np.uint8)
+    classes = np.where(wet, BATHYMETRIC_POINT, 2).astype(np.uint8)  # 2 is ground
     depth = np.clip(scene.depth_m(scene.apparent_xyz) / 10.0, 0.0, 1.0)[:, None]
     sand, sea = np.array([[214, 196, 150]]), np.array([[22, 66, 110]])
     colours = np.asarray(np.rint(sand + depth * (sea - sand)) * 257.0)  # 16 bit, bluer with depth
-    place = (scene.epsg, 0.001 if scene.gsd_m >= _FINE_GSD_M else 0.0001)
+    place = (scene.epsg, 0.001 if scene.gsd_m >= 0.005 else 0.0001)  # with steps in metres
     write_points(folder / "cloud.laz", scene.apparent_xyz, place, colours)
     write_points(folder / "truth.laz", scene.true_xyz, place)
     write_points(folder / "lidar.laz", scene.lidar_xyz, place, classes=classes)

@@ -246,6 +246,7 @@ def write_spread(target: Path, spread: FloatArray) -> None:
 
 
 IMAGES = (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".webp", ".heic", ".dng")
+"""Files that may state when and how high they were taken."""
 
 
 class Times(NamedTuple):
@@ -321,13 +322,10 @@ def parse_times(source: Path, where: Sequence[str], texts: Sequence[str]) -> Tim
     return Times(np.array([moment.timestamp() for moment in utc]), zoned[0], str(source))
 
 
-MOST_IMAGES = 30
-
-
 def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
     """Return how high each image was taken above the take-off place, shape (k,), metres.
 
-    NaN where it is not recorded. At most `MOST_IMAGES` images near the camera file are read.
+    NaN where it is not recorded. At most 30 images near the camera file are read.
     """
     path, found = Path(cameras), dict[str, float]()
     root = path if path.is_dir() else path.parent
@@ -335,7 +333,7 @@ def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
     with suppress(OSError):  # no correction needs them
         inside = [*sorted(root.glob("*")), *sorted(root.glob("images/*"))]
         images = [one for one in inside if one.suffix.lower() in IMAGES and one.is_file()]
-        for image in images[:: 1 + len(images) // MOST_IMAGES]:
+        for image in images[:: 1 + len(images) // 30]:
             with image.open("rb") as stream:
                 if stated := above.search(stream.read(2**17)):
                     found[image.name] = float(stated[1])

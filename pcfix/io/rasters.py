@@ -280,7 +280,8 @@ def values_at(path: Path, xy: FloatArray) -> FloatArray:
     """Return the cells of the first band at places (n, 2); NaN for no value."""
     with open_raster(path) as source:
         cells = source.sample(xy, 1, masked=True)
-        return np.ravel([cell.astype(np.float64).filled(np.nan) for cell in cells])
+        stored = np.ravel([cell.astype(np.float64).filled(np.nan) for cell in cells])
+        return np.asarray(stored * source.scales[0] + source.offsets[0])
 
 
 def is_raster(path: object) -> bool:
