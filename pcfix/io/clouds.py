@@ -91,8 +91,8 @@ def open_cloud(cloud: CloudFiles, jobs: int | None = None) -> LasSource:
     """Return the points of a file, or of many; see `LasSource`. Those of a raster are its cells."""
     if isinstance(cloud, Tiles):
         return TiledSource(cloud, jobs)
-    if isinstance(cloud, RasterBand) or is_raster(cloud):
-        return RasterSource(cloud if isinstance(cloud, RasterBand) else band_of(cloud))
+    if is_raster(cloud):
+        return RasterSource(band_of(cloud))
     return LasSource(cloud, jobs)
 
 

@@ -216,11 +216,14 @@ def record_errors(path: Path) -> AbstractContextManager[None]:
 
 
 def check_cloud(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
-    """Return the path of a cloud that may be written; see `check_output`."""
-    target = check_output(path, overwrite=overwrite, inputs=inputs, suffixes=(".las", ".laz"))
+    """Return the path of a cloud that may be written, by `check_output` and its suffix."""
+    target = check_output(path, overwrite=overwrite, inputs=inputs)
     if target.name.lower().endswith(".copc.laz"):
         sentence = f"{path}: pcfix does not write COPC. Write .laz, and convert it with untwine."
         raise SettingError("output.copc", sentence, path=target)
+    if target.suffix.lower() not in (".las", ".laz"):
+        sentence = f"{path}: give an output name that ends in .las or .laz."
+        raise SettingError("output.suffix", sentence, path=target)
     return target
 
 
