@@ -209,7 +209,7 @@ def restore(input: str, output: Path, /, *, options: TileOptions, quiet: bool) -
 @command("pcfix simulate scene --points 20000", out_dir="Folder for the scene.")
 def simulate(out_dir: Path, /, *, options: SimulateOptions, quiet: bool) -> None:
     """Simulate a scene with known truth: cloud, cameras, truth, LiDAR."""
-    from pcfix.io.scenes import write_scene
+    from pcfix.flow.demo import write_scene
 
     with progress_bar("Simulating", quiet) as progress:
         scene = pcfix.simulate_scene(options=options, progress=progress)

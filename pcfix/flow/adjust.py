@@ -35,10 +35,10 @@ from pcfix.flow.runner import check_folder
 from pcfix.flow.surfaces import CloudView, sample_of, view_of
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.io.cameras.table import read_sensor, write_table
+from pcfix.io.clouds import Clouds, cloud_of
 from pcfix.io.crs import is_topocentric, parse_crs
 from pcfix.io.files import temporary_output, write_members, write_text
 from pcfix.io.ground_control import gnss_in_frame_of, read_gnss, read_ground_control
-from pcfix.io.tiles import Clouds, cloud_of
 from pcfix.io.water import write_water_raster
 from pcfix.model import (
     Cameras,

@@ -12,11 +12,11 @@ import numpy as np
 from pcfix.errors import bad_file
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
 from pcfix.flow.surfaces import CloudView, find_surface, view_of
+from pcfix.io.clouds import Clouds, open_cloud
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header, own_settings
-from pcfix.io.tiles import Clouds, open_cloud
 from pcfix.model import LOW_NOISE, BoolArray
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import WaterOptions

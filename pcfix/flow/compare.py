@@ -13,9 +13,17 @@ from pcfix.compare.match import Match, SurveyCloud, match
 from pcfix.compare.statistics import load_py4dgeo
 from pcfix.errors import SettingError
 from pcfix.flow.runner import check_summary, json_text, write_summary
-from pcfix.io.clouds import check_same_crs, read_cloud, read_reference, reference_of
+from pcfix.io.clouds import (
+    Clouds,
+    band_of,
+    check_same_crs,
+    cloud_of,
+    inputs_of,
+    read_cloud,
+    read_reference,
+    reference_of,
+)
 from pcfix.io.files import all_or_none, check_output, scratch_arrays, write_bytes, write_text
-from pcfix.io.tiles import Clouds, band_of, cloud_of, inputs_of
 from pcfix.options.declare import taken
 from pcfix.options.shared import WaterOptions
 from pcfix.options.steps import CompareOptions, CompareRules
@@ -34,7 +42,7 @@ def compare_clouds(
     Parameters
     ----------
     cloud : path, or list of paths
-        LAS or LAZ, or many as `pcfix.io.tiles.tiles_of` has them; or a GeoTIFF of heights.
+        LAS or LAZ, or many as `pcfix.io.clouds.tiles_of` has them; or a GeoTIFF of heights.
         If `correct_file` wrote it with all its dimensions, the apparent points are compared too.
     reference : path, or list of paths
         LAS or LAZ, or many; CSV check points (x, y, z); or a GeoTIFF of heights. At check points

@@ -29,10 +29,11 @@ from pcfix.flow.poses import diagnose_in_passing, quick_ties
 from pcfix.flow.raster import check_heights
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
 from pcfix.flow.surfaces import CloudView, Points, corners, points_of, view_of
+from pcfix.io.clouds import Clouds
 from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header
-from pcfix.io.tiles import Clouds, is_raster
+from pcfix.io.rasters import is_raster
 from pcfix.lens.frames import count_visible_cameras
 from pcfix.model import (
     BATHYMETRIC_POINT,
@@ -74,7 +75,7 @@ def correct_file(
     input, output : path
         The names end in ``.las`` or ``.laz``; the output is LAS 1.4, point format 6, 7 or 8 (9
         or 10 for inputs with waveforms). For many files (a list of paths; see
-        `pcfix.io.tiles.tiles_of`) the output is a folder, and every point is corrected as in one
+        `pcfix.io.clouds.tiles_of`) the output is a folder, and every point is corrected as in one
         file of all points. A GeoTIFF of heights is corrected as the cloud of the centres of its
         cells; an output that ends in ``.tif`` has the same grid, see `pcfix.flow.raster`.
     options : CorrectOptions, optional
@@ -299,7 +300,7 @@ def correct_points(
         is given, else of `cameras`. Default: as the option `camera_set` says.
     level_offset_m : array, shape (k,), optional
         Height of the water above `water` when each image was taken; see
-        `pcfix.io.tides.level_offsets`. Each ray is refracted at its own surface; `water` decides
+        `pcfix.io.water.level_offsets`. Each ray is refracted at its own surface; `water` decides
         which points are submerged, and how deep. Default: zero.
     adjusted_from : Cameras, optional
         The original cameras, in the same frame, if `cameras` are the same images (matched by their

@@ -28,13 +28,12 @@ from pcfix.grid.lattice import (
     round_resolution,
 )
 from pcfix.io import rasters
-from pcfix.io.clouds import points_of
+from pcfix.io.clouds import CloudFiles, Clouds, cloud_of, inputs_of, open_cloud, points_of
 from pcfix.io.crs import crs_words, parts
 from pcfix.io.files import all_or_none, check_output, scratch_arrays, write_text
 from pcfix.io.las.source import LasSource, metric_crs
 from pcfix.io.las.writing import is_ours
 from pcfix.io.rasters import METRE, TO_95
-from pcfix.io.tiles import CloudFiles, Clouds, cloud_of, inputs_of, open_cloud
 from pcfix.model import BATHYMETRIC_POINT, FloatArray
 from pcfix.options.declare import File, taken
 from pcfix.options.steps import MIN_RESOLUTION_M, DsmOptions, DsmRules
@@ -77,7 +76,7 @@ def grid_dsm(
     Parameters
     ----------
     input : path, or list of paths
-        LAS or LAZ, in metres; many, as `pcfix.io.tiles.tiles_of` has them, make one raster.
+        LAS or LAZ, in metres; many, as `pcfix.io.clouds.tiles_of` has them, make one raster.
     output : path
         The name ends in ``.tif`` or ``.tiff``.
     options, progress

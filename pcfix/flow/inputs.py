@@ -22,10 +22,11 @@ from pcfix.flow.surfaces import CloudView, find_surface
 from pcfix.io.cameras import read_cameras, read_tie_points, takes_sensor
 from pcfix.io.cameras.georeference import Georeference, georeference
 from pcfix.io.crs import LOCAL
+from pcfix.io.photographs import read_image_times
 from pcfix.io.tables import match_labels
-from pcfix.io.tides import level_offsets, read_image_times, read_tide
 from pcfix.io.vectors import LAYER_MARK, read_water_polygons
 from pcfix.io.views import ViewList, ViewMatch, read_views, track_views
+from pcfix.io.water import level_offsets, read_tide
 from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints, Views
 from pcfix.options.declare import File, OptionSet, options_of
 from pcfix.options.shared import InputOptions, LandRules, MaskOption

@@ -12,10 +12,10 @@ from pcfix.errors import PcfixWarning
 from pcfix.flow.inputs import labelling_of, paths_in
 from pcfix.flow.runner import Chunk, FileTask, FileWork, Progress, run_command
 from pcfix.flow.surfaces import CloudView, Points, find_surface, parts_of, points_of, view_of
+from pcfix.io.clouds import Clouds
 from pcfix.io.las.columns import convert
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header
-from pcfix.io.tiles import Clouds
 from pcfix.model import WaterPlane, WaterSurface
 from pcfix.options.correct import LabelOptions
 from pcfix.options.declare import File, taken

@@ -18,7 +18,7 @@ from pcfix.errors import InputError, PcfixWarning
 from pcfix.flow.surfaces import Points
 from pcfix.io.cameras.georeference import adjusted_minus_gnss, frame_of, is_tied
 from pcfix.io.crs import heights_of
-from pcfix.io.tides import read_altitudes
+from pcfix.io.photographs import read_altitudes
 from pcfix.lens.frames import count_visible_cameras
 from pcfix.lens.imaging import straight_images
 from pcfix.model import Cameras, FloatArray, TiePoints

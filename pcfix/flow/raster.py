@@ -24,10 +24,9 @@ from pcfix.io import rasters
 from pcfix.io.crs import parts
 from pcfix.io.files import scratch_arrays
 from pcfix.io.las.columns import OUTCOME, SHIFTS
-from pcfix.io.las.source import RasterBand, coordinates
+from pcfix.io.las.source import coordinates
 from pcfix.io.las.writing import own_settings
-from pcfix.io.rasters import METRE, TO_95
-from pcfix.io.tiles import RasterSource, is_raster
+from pcfix.io.rasters import METRE, TO_95, RasterBand, RasterSource, is_raster
 from pcfix.model import BoolArray, FloatArray, Outcome, WaterPlane, WaterSurface
 from pcfix.running import current
 

@@ -9,10 +9,11 @@ import numpy as np
 
 from pcfix.errors import bad_file
 from pcfix.flow.runner import Chunk, FileWork, run_command
+from pcfix.io.clouds import Clouds
 from pcfix.io.las.columns import SHIFTS, columns_for, convert, move
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import read_settings, record_errors, restored_header
-from pcfix.io.tiles import Clouds, is_raster
+from pcfix.io.rasters import is_raster
 from pcfix.options.declare import File, taken
 from pcfix.options.shared import TileOptions
 

@@ -37,10 +37,9 @@ from pcfix.flow.run_folder import DIFFERENCE, PAGE, RECORD, STEPS, SURFACE, RunF
 from pcfix.flow.runner import Bar, Progress, check_folder, json_text, no_bar
 from pcfix.flow.surfaces import view_of
 from pcfix.io import rasters, vectors
-from pcfix.io.clouds import is_cloud
+from pcfix.io.clouds import Tiles, is_cloud
 from pcfix.io.files import ENSEMBLE, file_state, read_json, refusing, write_text
 from pcfix.io.ground_control import read_gnss
-from pcfix.io.tiles import Tiles
 from pcfix.model import WaterDimension
 from pcfix.options.correct import AdjustOptions, CorrectOptions, RunOptions
 from pcfix.options.declare import File, taken

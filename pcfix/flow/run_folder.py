@@ -24,7 +24,18 @@ from pcfix.flow.surfaces import Points, file_points, view_of
 from pcfix.grid.lattice import Lattice, Window, round_resolution
 from pcfix.grid.maps import contours, depth_interval, hillshade, relief_colours, waterlines
 from pcfix.io import rasters
-from pcfix.io.clouds import is_cloud, own_water, reference_of
+from pcfix.io.clouds import (
+    CloudFiles,
+    Tiles,
+    band_of,
+    cloud_of,
+    inputs_of,
+    is_cloud,
+    open_cloud,
+    own_water,
+    reference_of,
+    tiles_from,
+)
 from pcfix.io.crs import crs_words
 from pcfix.io.files import (
     belonging,
@@ -36,18 +47,9 @@ from pcfix.io.files import (
     write_bytes,
     write_text,
 )
-from pcfix.io.las.source import RasterBand, stated_crs
+from pcfix.io.las.source import stated_crs
+from pcfix.io.rasters import RasterBand, RasterSource
 from pcfix.io.tables import read_check_depths
-from pcfix.io.tiles import (
-    CloudFiles,
-    RasterSource,
-    Tiles,
-    band_of,
-    cloud_of,
-    inputs_of,
-    open_cloud,
-    tiles_from,
-)
 from pcfix.io.vectors import Layer, write_layers
 from pcfix.model import BATHYMETRIC_POINT, Cameras, FloatArray, WaterSurface
 from pcfix.options.correct import LEVEL_M, RunOptions

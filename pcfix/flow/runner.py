@@ -32,11 +32,11 @@ from pcfix import version
 from pcfix.errors import InputError, PcfixError, SettingError, optional_library, silently
 from pcfix.flow.raster import raster_outputs, raster_writer
 from pcfix.io import files
+from pcfix.io.clouds import Clouds, Tiles, band_of, inputs_of, open_cloud, tiles_of
 from pcfix.io.files import all_or_none, write_bytes, write_text
 from pcfix.io.las.source import LasSource
-from pcfix.io.las.writing import check_suffix, corrected_identity, las_writer
+from pcfix.io.las.writing import check_cloud, corrected_identity, las_writer
 from pcfix.io.rasters import check_tif
-from pcfix.io.tiles import Clouds, Tiles, band_of, inputs_of, open_cloud, tiles_of
 from pcfix.io.vectors import LAYER_MARK
 from pcfix.options.declare import File, options_of
 from pcfix.running import current, running, threads
@@ -398,13 +398,6 @@ def write_summary(options: Any, summary: Any) -> None:
     if path is not None:
         values = summary if isinstance(summary, dict) else summary.as_dict()
         write_text(path, json_text(values), overwrite=options.overwrite)
-
-
-def check_cloud(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
-    """Return the path of a cloud that may be written, by its suffix and `check_output`."""
-    target = files.check_output(path, overwrite=overwrite, inputs=inputs)
-    check_suffix(target)
-    return target
 
 
 def check_folder(

@@ -12,11 +12,11 @@ import numpy as np
 
 from pcfix.errors import InputError, PcfixWarning, SettingError
 from pcfix.flow.runner import read_ahead
+from pcfix.io.clouds import CloudFiles, open_cloud
 from pcfix.io.clouds import CloudView as CloudView
 from pcfix.io.clouds import Points as Points
 from pcfix.io.clouds import points_of as points_of
 from pcfix.io.las.source import metric_crs, stated_crs
-from pcfix.io.tiles import CloudFiles, open_cloud
 from pcfix.io.vectors import SHORE_RADIUS_M, is_vector_file, read_shoreline
 from pcfix.io.water import rasters_of_images, read_water, read_water_raster
 from pcfix.model import (

@@ -172,7 +172,6 @@ def shortened(text: str) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-GEOGRAPHIC_WGS84 = "EPSG:4979"
 LOCAL = "local"
 
 
@@ -222,10 +221,6 @@ class Topocentric:
 
     def to_degrees(self, enu: FloatArray) -> FloatArray:
         """Return longitudes, latitudes and ellipsoidal heights (EPSG:4979) of points (n, 3)."""
-        return self.from_degrees(enu, "INVERSE")
-
-    def from_degrees(self, xyz: FloatArray, direction: str = "FORWARD") -> FloatArray:
-        """Return the coordinates here of longitudes, latitudes and heights, shape (n, 3)."""
         from pyproj import Transformer
 
         at = f"+lat_0={self.latitude_deg!r} +lon_0={self.longitude_deg!r} +h_0={self.height_m!r}"
@@ -233,17 +228,20 @@ class Topocentric:
         step = Transformer.from_pipeline(
             f"+proj=pipeline {geocentric} +step +proj=topocentric +ellps=WGS84 {at}"
         )
-        x, y, z = xyz.T
-        return np.column_stack(step.transform(x, y, z, direction=direction))
+        x, y, z = enu.T
+        return np.column_stack(step.transform(x, y, z, direction="INVERSE"))
 
 
 Move = Callable[[FloatArray], FloatArray]
 """Takes points, shape (n, 3), from one CRS to another."""
-Notes = tuple[PcfixWarning, ...]
 
-SILENT_ACCURACY_M = 1.0
-"""A transformation that is worse than this gets a note."""
-_AREA_MARGIN_DEG = np.array([-0.01, -0.01, 0.01, 0.01])  # west, south, east, north
+
+def unchanged(xyz: FloatArray) -> FloatArray:
+    """Return points as they are: the transformation between CRS with the same numbers."""
+    return xyz
+
+
+Notes = tuple[PcfixWarning, ...]
 
 
 class HeightsError(InputError):
@@ -255,11 +253,11 @@ def transformation(
 ) -> tuple[Move, Notes]:
     """Return PROJ's best transformation that is not a ballpark where that matters, and notes.
 
-    With `heights` it transforms these too; else it is one in plan, and heights only change their
-    unit, and neither CRS may be geocentric. It takes points (n, 3), x east or longitude first;
-    numbers that it returns are not finite where there is no such place. It is needed at places
-    (n, 3) of `source`. A `HeightsError`, with the remedy `instead`, if heights cannot be
-    transformed.
+    It is `unchanged` if points have the same numbers in both CRS. With `heights` it transforms
+    these too; else it is one in plan, and heights only change their unit, and neither CRS may be
+    geocentric. It takes points (n, 3), x east or longitude first; numbers that it returns are not
+    finite where there is no such place. It is needed at places (n, 3) of `source`. A
+    `HeightsError`, with the remedy `instead`, if heights cannot be transformed.
     """
     from pyproj import Transformer
     from pyproj.exceptions import ProjError
@@ -269,13 +267,14 @@ def transformation(
     if not heights:
         source, target = parts(source)[0], parts(target)[0]
         if is_same(source, target):
-            return lambda xyz: xyz * [1.0, 1.0, factor], ()
+            return unchanged if factor == 1.0 else lambda xyz: xyz * [1.0, 1.0, factor], ()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a missing grid is named in the error or note
             to_degrees = Transformer.from_crs(parts(source)[0], "EPSG:4326", always_xy=True)
             corners = *at[:, :2].min(axis=0), *at[:, :2].max(axis=0)
-            degrees = np.array(to_degrees.transform_bounds(*corners)) + _AREA_MARGIN_DEG
+            degrees = np.array(to_degrees.transform_bounds(*corners))
+            degrees += [-0.01, -0.01, 0.01, 0.01]  # a margin west, south, east and north
             area = AreaOfInterest(*degrees) if np.isfinite(degrees).all() else None
             group = TransformerGroup(source, target, always_xy=True, area_of_interest=area)
     except (ProjError, IndexError) as error:  # the latter if PROJ finds no operation at all
@@ -309,7 +308,7 @@ def transformation(
             raise bad_file(name, "crs.grid_missing", sentence, grids=grids)
         sentence = f"{name}: PROJ knows no transformation {names}; their datums are treated as one."
         notes = (PcfixWarning("crs.datum", sentence),)
-    elif step.accuracy > SILENT_ACCURACY_M:
+    elif step.accuracy > 1.0:
         sentence = f"{name}: positions {names} are accurate to about {step.accuracy:g} m."
         sentence += f" {why}." if grids else ""
         notes = (PcfixWarning("crs.accuracy", sentence, accuracy_m=step.accuracy, grids=grids),)
@@ -335,26 +334,31 @@ def heights_agree(source: CRS, target: CRS) -> bool:
     return kinds[0] == kinds[1] and is_same(plan, other_plan)
 
 
-def is_same_numbers(source: CRS, target: CRS, *, heights: bool = True) -> bool:
-    """Whether points have the same numbers in both, given that the heights agree."""
-    same = is_same(parts(source)[0], parts(target)[0])
-    return same and not (heights and metres_up(source) != metres_up(target))
+def assumed_heights(source: CRS, target: CRS) -> str:
+    """Return in words what is assumed if one of two CRS names no vertical datum, else nothing."""
+    kinds = heights_of(source), heights_of(target)
+    if kinds[0] == "unstated" != kinds[1]:
+        return f"names no vertical datum; that of the cloud is assumed ({target.name})."
+    if kinds == ("ellipsoidal", "unstated"):
+        return f"the cloud's CRS ({target.name}) names no vertical datum; ellipsoidal is assumed."
+    return ""
 
 
 def to_cloud_crs(
     crs: str | CRS | None, cloud_crs: str | CRS | None, at: FloatArray, name: str, *, heights: bool
-) -> Move | None:
-    """Return the transformation from a file's CRS to the cloud's, None for none; warn of guesses.
+) -> Move:
+    """Return the transformation from a file's CRS to the cloud's, and warn of guesses.
 
-    A CRS that is None is not stated; that of the file is ``local`` to use its numbers unchanged.
-    The cloud's is projected, in metres. With `heights` z matters.
+    It is `unchanged` if the numbers do not change. A CRS that is None is not stated; that of the
+    file is ``local`` to use its numbers as they are. The cloud's is projected, in metres. With
+    `heights` z matters.
     """
     cloud = None if cloud_crs is None else parse_crs(cloud_crs, "the cloud")
     if isinstance(crs, str) and crs.strip().lower() == LOCAL:
-        return None
+        return unchanged
     source = None if crs is None else parse_crs(crs, name)
     if all(one is None or is_local(one) for one in (source, cloud)):
-        return None
+        return unchanged
     known = cloud or source
     if source is None or cloud is None:
         unit, size = ("", 1.0) if source is None else plan_unit(source)
@@ -363,7 +367,7 @@ def to_cloud_crs(
             raise bad_file(name, "crs.cloud_missing", sentence, unit=unit)
         who = "the file" if source is None else "the cloud"
         warn(name, "crs.assumed", f"{who} names no CRS; {known.name if known else ''} is assumed.")
-        return None
+        return unchanged
     if is_local(cloud) or is_local(source):
         sentence = f"is in {source.name}, the cloud in {cloud.name}, of which one is local. Use one"
         raise bad_file(name, "crs.local", f"{sentence} CRS, or give that of the file as 'local'.")
@@ -371,19 +375,12 @@ def to_cloud_crs(
     if not (source.is_projected or source.is_geographic):
         sentence = f"{source.name} is neither a map projection nor in degrees."
         raise bad_file(name, "crs.not_projected", sentence, crs=source.name)
-    agree = not heights or heights_agree(source, cloud)
-    kinds = heights_of(source), heights_of(cloud)
-    missing = "the file" if kinds[0] == "unstated" != kinds[1] else ""
-    if kinds == ("ellipsoidal", "unstated"):
-        missing = f"the cloud's CRS ({cloud.name})"
-    if heights and missing:
-        sentence = f"{missing} names no vertical datum; that of the other is assumed."
+    if heights and (sentence := assumed_heights(source, cloud)):
         warn(name, "crs.heights_assumed", sentence)
-    if agree and is_same_numbers(source, cloud, heights=heights):
-        return None
+    heights = heights and not heights_agree(source, cloud)
     plan = shortened(crs_text(parts(source)[0]))
     instead = f"or, if the heights agree with the cloud's, give the file's CRS as {plan}"
-    forward, notes = transformation(source, cloud, at, name, heights=not agree, instead=instead)
+    forward, notes = transformation(source, cloud, at, name, heights=heights, instead=instead)
     for note in notes:
         warnings.warn(note, stacklevel=3)
     return forward

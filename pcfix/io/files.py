@@ -61,18 +61,13 @@ def check_input(path: File) -> Path:
             head = stream.read(64).lstrip().lower()
     except OSError as error:
         raise bad_file(found, "input.unreadable", f"{refusal(error)}.") from error
-    for start, sentence in _NOT_THE_FILE.items():
-        if head.startswith(start):
-            raise bad_file(found, "input.not_the_file", sentence)
+    if head.startswith(b"version https://git-lfs"):
+        sentence = "is a Git LFS pointer, not the file. Run 'git lfs pull'."
+        raise bad_file(found, "input.not_the_file", sentence)
+    if head.startswith((b"<!doctype html", b"<html")):
+        sentence = "is a web page, not the file. Download it again."
+        raise bad_file(found, "input.not_the_file", sentence)
     return found
-
-
-_NOT_THE_FILE = {
-    b"version https://git-lfs": "is a Git LFS pointer, not the file. Run 'git lfs pull'.",
-    b"<!doctype html": "is a web page, not the file. Download it again.",
-    b"<html": "is a web page, not the file. Download it again.",
-}
-"""First bytes of what people have in place of a file."""
 
 
 def is_same(one: File, other: File) -> bool:
@@ -91,10 +86,6 @@ def files_in(path: File) -> list[Path]:
     return [check_input(found)]
 
 
-PROJECTS = {".psx": ".files", ".p4d": ""}
-"""What the folder of a project ends with, by the suffix of its file."""
-
-
 def belonging(path: File) -> list[Path]:
     """Return what may be read where a file or folder is named.
 
@@ -104,7 +95,9 @@ def belonging(path: File) -> list[Path]:
     found = Path(path)
     folder, chosen = found, set[Path]()
     if not found.is_dir():
-        folder = found.with_suffix(PROJECTS.get(found.suffix.lower(), found.suffix))
+        # the folder of a project of Metashape or Pix4D has the name of its file
+        ends = {".psx": ".files", ".p4d": ""}
+        folder = found.with_suffix(ends.get(found.suffix.lower(), found.suffix))
         alike = found.parent.glob(f"{glob.escape(found.stem)}.*")
         chosen = {check_input(found), found.with_name("sensor.csv")}
         chosen |= {one for one in alike if one.is_file()}
@@ -146,9 +139,6 @@ def check_output(
 
 
 # Outputs that appear when they are complete
-
-LEAST_FREE_BYTES = 65_536
-"""With less free space than this, a library that fails without a reason found the disk full."""
 
 _group: ContextVar[tuple[ExitStack, dict[Path, Path]] | None] = ContextVar("_group", default=None)
 """What `all_or_none` tidies up, and the temporary file of each target."""
@@ -237,8 +227,8 @@ def is_full_disk(folder: Path, error: Exception) -> bool:
         return error.errno in (errno.ENOSPC, errno.EDQUOT)
     if any(words in str(error) for words in ("No space left", "disk is full")):
         return True
-    with suppress(OSError):
-        return shutil.disk_usage(folder).free < LEAST_FREE_BYTES
+    with suppress(OSError):  # with less free space, it is why a library fails without a reason
+        return shutil.disk_usage(folder).free < 65_536
     return False
 
 

@@ -96,7 +96,7 @@ def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None)
     crs : str, optional
         Of the points, instead of that in the file; ``local`` uses the numbers unchanged.
     """
-    table, stated_crs = _read(check_input(path))
+    table = _read(check_input(path))
     names, roles, wet = table.column("point"), _words(table, "role"), _words(table, "under_water")
     surfaces = ["on:water" if text in WATERLINE else text for text in roles]
     on = [text.removeprefix(ON) if text.startswith(ON) else "" for text in surfaces]
@@ -131,7 +131,8 @@ def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None)
     posed = np.flatnonzero(camera >= 0)
     own = np.array([row_of[name] for name in names])
     rows = np.unique(own[posed])  # the first mark of each point that is used
-    moved = _to_cameras(table, xyz[rows], rows, cameras, crs or stated_crs)
+    source = crs or table_crs(table)[0] or table.crs  # an unknown one is refused there
+    moved = _to_cameras(table, xyz[rows], rows, cameras, source)
     has_surfaces = any(on)
     sigma_px = np.sqrt((sigma[posed, 3:5] ** 2).mean(axis=1))
     sigma = np.nan_to_num(sigma[rows], nan=SIGMA_M)
@@ -210,8 +211,7 @@ def _to_cameras(
 ) -> FloatArray:
     """Return points in the CRS of the cameras; refuse points far from the block."""
     target = cameras.crs
-    forward = to_cloud_crs(source, target, xyz, str(table.path), heights=True)
-    moved = xyz if forward is None else forward(xyz)
+    moved = to_cloud_crs(source, target, xyz, str(table.path), heights=True)(xyz)
     lost = ~np.isfinite(moved).all(axis=1) & np.isfinite(xyz).all(axis=1)
     if lost.any():
         i = int(np.argmax(lost))
@@ -234,8 +234,8 @@ def _to_cameras(
 # Formats
 
 
-def _read(path: Path) -> tuple[Table, str | None]:
-    """Return the marks of a file as a table, and the CRS that it states."""
+def _read(path: Path) -> Table:
+    """Return the marks of a file as a table."""
     if recognises(metashape, Source(path)):
         return _metashape_table(path)
     lines = read_lines(path)
@@ -243,19 +243,13 @@ def _read(path: Path) -> tuple[Table, str | None]:
     rows = [(i, fields) for i, fields in numbered[1:] if not fields[0].startswith("#")]
     first = [number(field) for field in rows[0][1][:5]] if rows else []
     if len(first) == 5 and not np.isnan([*first[:2], *first[3:]]).any():  # z may be NaN
-        table = _odm_table(path, rows)
-    elif has_header(lines):
+        return _odm_table(path, rows)
+    if has_header(lines):
         kinds = [("point", *three, "label", "u", "v") for three in AXES]
-        table = read_table(path, *kinds, spellings=SPELLINGS)
-    else:
-        sentence = "is neither a table of marks nor OpenDroneMap's gcp_list.txt. Line 1 must name"
-        sentence += " the columns name, x, y, z, image, u, v, or be a CRS."
-        raise bad_file(path, "gcps.format", sentence)
-    system, unknown = table_crs(table)
-    if unknown:
-        sentence = f"PROJ does not know its CRS '{table.crs}'. Give an EPSG code."
-        raise bad_file(path, "crs.unknown", sentence, crs=table.crs)
-    return table, system
+        return read_table(path, *kinds, spellings=SPELLINGS)
+    sentence = "is neither a table of marks nor OpenDroneMap's gcp_list.txt. Line 1 must name"
+    sentence += " the columns name, x, y, z, image, u, v, or be a CRS."
+    raise bad_file(path, "gcps.format", sentence)
 
 
 def _odm_table(path: Path, rows: list[tuple[int, list[str]]]) -> Table:
@@ -272,13 +266,7 @@ def _odm_table(path: Path, rows: list[tuple[int, list[str]]]) -> Table:
     return Table(path, [*ODM], texts, lines, place, crs=named_crs(path))
 
 
-METASHAPE = (
-    *("point", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z", "role"),
-    *("label", "u", "v", "sigma_u", "sigma_v"),
-)
-
-
-def _metashape_table(path: Path) -> tuple[Table, str]:
+def _metashape_table(path: Path) -> Table:
     """Return the markers that have surveyed coordinates, where they were measured in the images."""
     chunk = metashape.open_chunk(path)
     settings = chunk.properties("settings")
@@ -309,9 +297,11 @@ def _metashape_table(path: Path) -> tuple[Table, str]:
         raise bad_file(path, "gcps.none", sentence)
     own = (chunk.root.findtext("marker_reference") or "").strip()
     crs = own or (chunk.root.findtext("reference") or "").strip() or LOCAL
-    columns, lines = {role: i for i, role in enumerate(METASHAPE)}, [*range(1, len(rows) + 1)]
-    table = Table(path, [*METASHAPE], rows, lines, columns)
-    return table, LOCAL if is_local(parse_crs(crs, str(chunk.path))) else crs
+    roles = ["point", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z", "role"]
+    roles += ["label", "u", "v", "sigma_u", "sigma_v"]
+    columns, lines = {role: i for i, role in enumerate(roles)}, [*range(1, len(rows) + 1)]
+    crs = LOCAL if is_local(parse_crs(crs, str(chunk.path))) else crs
+    return Table(path, roles, rows, lines, columns, crs=crs)
 
 
 def _positive(sigma: float) -> str:
@@ -320,10 +310,6 @@ def _positive(sigma: float) -> str:
 
 
 # GNSS positions
-
-SIGMAS = {role: SPELLINGS[role] for role in ("sigma_x", "sigma_y", "sigma_z")}
-"""Further names of columns with standard deviations, unambiguous in a list of positions."""
-_WITHOUT_NAMES = {".mrk": "a list of DJI's exposure times", ".pos": "a solution of RTKLIB"}
 
 
 def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Cameras:
@@ -342,7 +328,8 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
     source = Path(path) if Path(path).is_dir() else check_input(path)
     if crs is not None:
         parse_crs(crs, str(source))
-    if (kind := _WITHOUT_NAMES.get(source.suffix.lower())) is not None:
+    without_names = {".mrk": "a list of DJI's exposure times", ".pos": "a solution of RTKLIB"}
+    if (kind := without_names.get(source.suffix.lower())) is not None:
         sentence = f"is {kind}, which names no images. Make a table with the columns image,"
         sentence += " longitude, latitude, height from it."
         raise bad_file(source, "gnss.no_names", sentence)
@@ -351,7 +338,9 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
         names, listed = list(read.labels), read.gnss
     else:
         columns = open_table(source)
-        place = places(columns.header, SIGMAS) | dict(columns.place)
+        # names of standard deviations that are not ambiguous in a list of positions
+        sigmas = {role: SPELLINGS[role] for role in ("sigma_x", "sigma_y", "sigma_z")}
+        place = places(columns.header, sigmas) | dict(columns.place)
         names, listed = columns.labels, gnss_positions(replace(columns, place=place))
     if listed is None:
         sentence = "has no measured positions. Give a table with the columns image, x, y, z."

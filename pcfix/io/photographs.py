@@ -1,25 +1,34 @@
-"""Photographs (JPEG, TIFF, PNG), and sequences of frames.
+"""Photographs (JPEG, TIFF, PNG), sequences of frames, and times and flying heights of images.
 
 A JPEG or TIFF photograph that changes in part keeps its metadata and, in JPEG, its unchanged blocks
 of pixels, which are copied as they are stored.
+
+Times with a zone (or Z) are UTC moments. Times without one are the readings of one clock that
+images and a table of tides share. The two cannot be compared, so both must be of one kind.
+
+The heights above the take-off place are those that drones recorded in their images: DJI's XMP has
+``drone-dji:RelativeAltitude`` (metres, by the barometer).
 """
 
 from __future__ import annotations
 
+import re
 import shutil
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from pcfix.errors import SettingError, bad_file, photo_library
-from pcfix.io.files import check_output, refusing, temporary_output
+from pcfix.io.files import check_input, check_output, refusing, temporary_output
+from pcfix.io.tables import match_labels, read_table
 from pcfix.model import BoolArray, FloatArray
 from pcfix.options.declare import File
 
@@ -180,36 +189,29 @@ class Burst:
 def read_frames(path: File, every: int = 1) -> Burst:
     """Return the frames of a folder or of a video, one in `every`."""
     place = Path(path)
-    found = _frames_of_video(place, every) if place.is_file() else _frames_of_folder(place, every)
-    if len(found.names) < LEAST_FRAMES:
-        sentence = f"gives {len(found.names)} frames, of {LEAST_FRAMES} at least. Give more, or"
-        raise bad_file(
-            place, "frames.too_few", f"{sentence} lower --every.", frames=len(found.names)
-        )
+    if place.is_file():
+        # headers of videos may state a wrong number of frames, so they are counted
+        shapes = [frame.shape for frame in _video_frames(place)][::every]
+        if not shapes:
+            sentence = "has no frames that OpenCV can read. Convert it to MP4, or give a folder."
+            raise bad_file(place, "video.unreadable", sentence)
+        cv2 = photo_library("cv2")
+        rate = float(cv2.VideoCapture(str(place)).get(cv2.CAP_PROP_FPS))
+        names = tuple(f"{place.stem}_{every * number:05d}" for number in range(len(shapes)))
+        interval_s = every / rate if 0.1 <= rate <= 10_000.0 else None
+        found = Burst(place, (), names, shapes[0][1], shapes[0][0], every, interval_s)
+    else:
+        paths = tuple(photographs_in(place)[::every])
+        sizes = [size_of(one) for one in paths]
+        for one, size in zip(paths, sizes, strict=True):
+            if size != sizes[0]:
+                sentence = f"has {size} pixels, {paths[0].name} {sizes[0]}. Give one size."
+                raise bad_file(one, "photos.size", sentence, size=size)
+        found = Burst(place, paths, tuple(one.stem for one in paths), *sizes[0])
+    if (count := len(found.names)) < LEAST_FRAMES:
+        sentence = f"gives {count} frames, of {LEAST_FRAMES} at least. Give more, or lower --every."
+        raise bad_file(place, "frames.too_few", sentence, frames=count)
     return found
-
-
-def _frames_of_folder(folder: Path, every: int) -> Burst:
-    paths = tuple(photographs_in(folder)[::every])
-    sizes = [size_of(one) for one in paths]
-    for one, size in zip(paths, sizes, strict=True):
-        if size != sizes[0]:
-            sentence = f"has {size} pixels, {paths[0].name} {sizes[0]}. Give one size."
-            raise bad_file(one, "photos.size", sentence, size=size)
-    return Burst(folder, paths, tuple(one.stem for one in paths), *sizes[0])
-
-
-def _frames_of_video(path: Path, every: int) -> Burst:
-    # headers of videos may state a wrong number of frames, so they are counted
-    shapes = [frame.shape for frame in _video_frames(path)][::every]
-    if not shapes:
-        sentence = "has no frames that OpenCV can read. Convert it to MP4, or give a folder."
-        raise bad_file(path, "video.unreadable", sentence)
-    cv2 = photo_library("cv2")
-    rate = float(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FPS))
-    names = tuple(f"{path.stem}_{every * number:05d}" for number in range(len(shapes)))
-    interval_s = every / rate if 0.1 <= rate <= 10_000.0 else None
-    return Burst(path, (), names, shapes[0][1], shapes[0][0], every, interval_s)
 
 
 def _video_frames(path: Path) -> Iterator[Pixels]:
@@ -240,3 +242,99 @@ def write_spread(target: Path, spread: FloatArray) -> None:
     tifffile = photo_library("tifffile")
     with temporary_output(target) as path:
         tifffile.imwrite(path, spread.astype(np.float32), compression="zlib", metadata=None)
+
+
+IMAGES = (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".webp", ".heic", ".dng")
+"""Files that may state when and how high they were taken."""
+
+
+class Times(NamedTuple):
+    """Times of k images, or of the rows of a tide table."""
+
+    time_s: FloatArray  # (k,), seconds since 1970, UTC if `zoned`, else of a local clock
+    zoned: bool
+    name: str  # of the source, for messages
+
+
+def read_image_times(path: File, labels: Sequence[str]) -> Times:
+    """Find out when images were taken.
+
+    Parameters
+    ----------
+    path : path
+        A table with the columns ``label`` and ``time`` (ISO 8601), or a folder with the images,
+        whose EXIF data has DateTimeOriginal, and OffsetTimeOriginal for the zone.
+    labels : sequence of str
+        Names of the k images; a folder or an extension may be missing on either side.
+    """
+    found = Path(path)
+    if not found.is_dir():
+        table = read_table(check_input(found), ("label", "time"))
+        rows, times = _rows(table.column("label"), labels, found), table.column("time")
+        where = [f"line {table.line[row]}" for row in rows]
+        return parse_times(found, where, [times[row] for row in rows])
+    from PIL import ExifTags, Image
+
+    files = sorted(p for p in found.rglob("*") if p.suffix.lower() in IMAGES)
+    chosen = [files[row] for row in _rows([str(p) for p in files], labels, found)]
+    texts = []
+    for file in chosen:
+        sentence = "is not a readable image ({})."
+        with refusing(file, "photos.unreadable", sentence), Image.open(file) as image:
+            tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
+        own = ExifTags.Base
+        codes = (own.DateTimeOriginal, own.SubsecTimeOriginal, own.OffsetTimeOriginal)
+        text, fraction, zone = (str(tags.get(code, "")).strip("\0 ") for code in codes)
+        if not text:
+            sentence = "its EXIF data has no DateTimeOriginal. Give a CSV table label,time instead."
+            raise bad_file(file, "image_times.missing", sentence)
+        texts.append(text + (f".{fraction}" if fraction.isdecimal() else "") + zone)
+    return parse_times(found, [f"image {file.name}" for file in chosen], texts)
+
+
+def _rows(names: Sequence[str], labels: Sequence[str], source: Path) -> list[int]:
+    """Return for each label the row of its name."""
+    rows: list[int] = match_labels(labels, names, one_to_one=False)[0].tolist()
+    missing = [label for label, row in zip(labels, rows, strict=True) if row < 0]
+    if missing:
+        sentence = f"{len(missing)} images are missing or have ambiguous names: {missing[0]}, ..."
+        raise bad_file(source, "image_times.missing", sentence, images=missing)
+    return rows
+
+
+def parse_times(source: Path, where: Sequence[str], texts: Sequence[str]) -> Times:
+    """Parse times; all must have zones, or none."""
+    moments = []
+    for at, text in zip(where, texts, strict=True):
+        iso = re.sub(r"^(\d{4}):(\d\d):(\d\d)\b", r"\1-\2-\3", text.strip())  # of EXIF data
+        try:
+            moments.append(datetime.fromisoformat(iso if len(iso) > len("2026-05-01") else ""))
+        except ValueError:
+            sentence = f"{at}: '{text}' is not a date and time. Write 2026-05-01T12:00:00Z."
+            raise bad_file(source, "time.format", sentence, value=text) from None
+    zoned = [moment.tzinfo is not None for moment in moments]
+    if any(zoned) != all(zoned):
+        odd = zoned.index(not zoned[0])
+        sentence = f"{where[odd]}: only some times have a zone ('{texts[odd]}'). Write all alike."
+        raise bad_file(source, "time.zone", sentence, value=texts[odd])
+    utc = [moment if zoned[0] else moment.replace(tzinfo=UTC) for moment in moments]
+    return Times(np.array([moment.timestamp() for moment in utc]), zoned[0], str(source))
+
+
+def read_altitudes(cameras: File, labels: Sequence[str]) -> FloatArray:
+    """Return how high each image was taken above the take-off place, shape (k,), metres.
+
+    NaN where it is not recorded. At most 30 images near the camera file are read.
+    """
+    path, found = Path(cameras), dict[str, float]()
+    root = path if path.is_dir() else path.parent
+    above = re.compile(rb"RelativeAltitude(?:=[\"']|>)\s*([+-]?\d+(?:\.\d*)?)")
+    with suppress(OSError):  # no correction needs them
+        inside = [*sorted(root.glob("*")), *sorted(root.glob("images/*"))]
+        images = [one for one in inside if one.suffix.lower() in IMAGES and one.is_file()]
+        for image in images[:: 1 + len(images) // 30]:
+            with image.open("rb") as stream:
+                if stated := above.search(stream.read(2**17)):
+                    found[image.name] = float(stated[1])
+    altitudes = np.array([*found.values(), np.nan])
+    return np.asarray(altitudes[match_labels(labels, list(found))[0]])  # -1 for those without

@@ -20,10 +20,6 @@ from pcfix.io.files import check_input
 from pcfix.model import FloatArray, IntArray
 from pcfix.options.declare import File
 
-TOO_LARGE = 1e15
-"""No coordinate, in whatever unit, and no time is as large; its square is still a number."""
-
-
 METRES = dict.fromkeys(("", "m", "metre", "metres", "meter", "meters"), 1.0)
 DEGREES = dict.fromkeys(("", "deg", "degree", "degrees", "°"), 1.0)
 ANGLES = {
@@ -43,7 +39,6 @@ UNITS = {
 Spellings: TypeAlias = Mapping[str, Sequence[str]]
 """What columns are called, by their roles."""
 EXIF = ("gpslongitude", "gpslatitude", "gpsaltitude")
-UNKNOWN = ("", "nan", "na", "null", "none")
 
 
 @dataclass(frozen=True)
@@ -112,8 +107,9 @@ class Table:
             return np.full(len(self.rows), np.nan)
         name, texts = self.name(role), self.column(role)
         values = np.array([(exif_number if name in EXIF else number)(text) for text in texts])
-        for i in np.flatnonzero(~(np.abs(values) < TOO_LARGE)):
-            if needed or texts[i].lower() not in UNKNOWN:
+        # no coordinate, in whatever unit, and no time is as large; its square is still a number
+        for i in np.flatnonzero(~(np.abs(values) < 1e15)):
+            if needed or texts[i].lower() not in ("", "nan", "na", "null", "none"):
                 why = "too large" if math.isfinite(values[i]) else "not a finite number"
                 sentence = f"column {name}: '{texts[i]}' is {why}. Correct it."
                 where = {"line": self.line[i], "column": name, "value": texts[i]}
@@ -127,12 +123,6 @@ class Table:
 
 
 CRS_COMMENT = re.compile(r"^\s*#\s*(?:coordinatesystem|crs)\s*[:=]\s*(.+)$", re.IGNORECASE)
-_LONGEST_NAME = 80
-
-
-def stated_crs(lines: Iterable[str]) -> str | None:
-    """Return the CRS that a comment states."""
-    return next((found[1].strip() for one in lines if (found := CRS_COMMENT.match(one))), None)
 
 
 def number(text: str) -> float:
@@ -210,7 +200,7 @@ def _split_unit(text: str, plain: set[str]) -> tuple[str, str]:
     The name of X/Longitude is longitude.
     """
     name, unit = text.strip("# \t\"'").lower(), ""
-    if name not in plain and len(name) < _LONGEST_NAME:  # long names take the expression long
+    if name not in plain and len(name) < 80:  # long names take the expression long
         match = re.match(r"^(.*?)[ _]*[\[(]([^\])]*)[\])]$|^(.*)_(m|cm|mm|ft|deg|gon|rad)$", name)
         name, unit = (match[1] or match[3], match[2] or match[4]) if match else (name, "")
         name, unit = (name or "").strip().replace(" ", "_"), (unit or "").strip()
@@ -277,7 +267,9 @@ def read_table(path: Path, *needed: Sequence[str], spellings: Spellings | None =
         raise bad_file(path, "table.not_csv", sentence) from error
     if not rows:
         raise bad_file(path, "table.empty", "has a header but no rows.")
-    return Table(path, header, rows, numbers, place, units, is_comment, stated_crs(lines[:at]))
+    stated = filter(None, map(CRS_COMMENT.match, lines[:at]))
+    system = next((found[1].strip() for found in stated), None)
+    return Table(path, header, rows, numbers, place, units, is_comment, system)
 
 
 def match_labels(

@@ -15,7 +15,7 @@ import shapely
 
 from pcfix.errors import bad_file, optional_library, warn
 from pcfix.io import tables
-from pcfix.io.crs import parse_crs, plan_unit, to_cloud_crs
+from pcfix.io.crs import parse_crs, plan_unit, to_cloud_crs, unchanged
 from pcfix.io.files import cannot_write, check_input, check_output, temporary_output
 from pcfix.model import FloatArray
 from pcfix.options.declare import File
@@ -30,13 +30,11 @@ TABLES = (".csv", ".txt")
 GDAL_SUFFIXES = (".gpkg", ".shp", ".geojson", ".json", ".kml", ".gpx")
 KINDS = "GeoPackage (.gpkg), Shapefile (.shp), GeoJSON, KML, GPX or a table of points (.csv)"
 LAYER_MARK = "|"
-WGS84, WGS84_3D = "EPSG:4326", "EPSG:4979"
+WGS84 = "EPSG:4326"
 SPACING_M = 1.0
 """Along lines without heights, which get these from the cloud."""
 SHORE_RADIUS_M = 1.0
 """About shoreline points without a height, which get it from the cloud."""
-MOST_POINTS = 1_000_000
-FEW = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +104,7 @@ def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool
     heights = heights and bool(np.isfinite(at[:, 2]).any())
     at = np.nan_to_num(at)
     forward = to_cloud_crs(vectors.crs, cloud_crs, at, vectors.name, heights=heights)
-    if forward is None:
+    if forward is unchanged:
         return vectors
     geometries = vectors.geometries
 
@@ -147,8 +145,8 @@ def _read_gdal(path: Path, layer: str) -> tuple[Geometries, str | None, str]:
         raise bad_file(path, "vector.layer", sentence, layer=layer or None, layers=names)
     name = str(path) if layer == path.stem else f"{path}, layer {layer}"
     crs = meta["crs"]
-    if suffix in (".geojson", ".json") and crs == WGS84:
-        crs = WGS84_3D if shapely.has_z(geometries).any() else WGS84
+    if suffix in (".geojson", ".json") and crs == WGS84 and shapely.has_z(geometries).any():
+        crs = "EPSG:4979"  # with heights above the ellipsoid
     return geometries, crs, name
 
 
@@ -208,7 +206,7 @@ def read_shoreline(
     lines = np.concatenate([lines, shapely.get_rings(parts[kind == kinds.POLYGON])])
     measured, drawn = lines[shapely.has_z(lines)], lines[~shapely.has_z(lines)]
     count = float(shapely.length(drawn).sum()) / SPACING_M
-    if count > MOST_POINTS:
+    if count > 1_000_000:
         sentence = f"would give {count:.3g} points. Check its CRS and unit, or thin it out."
         raise bad_file(vectors.name, "water.shoreline_too_long", sentence, count=count)
     found = [_vertices(np.concatenate([points, measured]))]
@@ -221,7 +219,7 @@ def read_shoreline(
         counts.append(np.full(total, min(1.0, min(worth, independent) / total)))
     xyz = np.vstack(found)
     known = xyz[np.isfinite(xyz[:, 2]), 2]
-    if len(known) >= FEW and not known.any():  # a flat drawing
+    if len(known) >= 3 and not known.any():  # a flat drawing
         xyz[:, 2] = np.nan
         sentence = f"all {len(known)} heights are exactly 0; they are ignored."
         warn(vectors.name, "water.zero_heights", sentence, count=len(known))
@@ -268,10 +266,6 @@ def read_water_polygons(path: File, cloud_crs: str | CRS | None = None) -> Vecto
     return replace(vectors, geometries=np.array([area]))
 
 
-STYLES = "layer_styles"
-"""The table in which QGIS looks for styles, and keeps its own."""
-
-
 class Layer(NamedTuple):
     """Geometries of one kind (LineString, Point Z ...), by name a value of each, and a style (QML).
 
@@ -313,8 +307,10 @@ def write_layers(
                     geometry_type=one.kind, append=number > 0,
                 )  # fmt: skip
             if styled:
+                # the table in which QGIS looks for styles, and keeps its own
                 write(
-                    temporary, None, [*columns.values()], [*columns], layer=STYLES, driver="GPKG",
+                    temporary, None, [*columns.values()], [*columns], layer="layer_styles",
+                    driver="GPKG",
                     append=True, crs=None, geometry_type=None,
                 )  # fmt: skip
         except RuntimeError as error:

@@ -54,14 +54,6 @@ numbers off by one, 0.4 in a random order."""
 MARGIN = 0.02
 """Of the frame's sides: other lens models or adjustments move an edge by less."""
 SAMPLE_POINTS = 20_000
-_PLACES = (".", "sparse", "sparse/0")
-_SAME = 0.05
-"""A fraction of the spacing within which two positions are those of one point."""
-_ROUNDING = 1.01 * np.sqrt(3.0)
-"""Of three coordinates that are each off by half a step, relative to that half step."""
-_MANY = 0.1
-"""A share of points without a list from which on the user is warned."""
-_NEIGHBOURS = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +84,9 @@ class ViewList:
         if self.xyz is None or len(self.xyz) < 2:
             return 0.0
         away = np.abs(self.xyz[:, :2] - self.xyz[len(self.xyz) // 2, :2]).max(axis=1)
-        near = min(_NEIGHBOURS, len(self.xyz) - 1)
+        near = min(SAMPLE_POINTS, len(self.xyz) - 1)
         box = self.xyz[away <= np.partition(away, near)[near]]
-        distance = np.asarray(cKDTree(box).query(box[:_NEIGHBOURS], k=2)[0])
+        distance = np.asarray(cKDTree(box).query(box[:SAMPLE_POINTS], k=2)[0])
         return float(np.median(distance[:, 1]))
 
 
@@ -215,7 +207,8 @@ def _listed(path: Path, column: Column) -> Views:
 def image_orders(raw: ViewList, cameras: Cameras) -> tuple[IntArray, ...]:
     """Return the orders that the image numbers may follow, the most likely first."""
     orders, folder = list[IntArray](), raw.path.parent
-    models = [folder / place / name for place in _PLACES for name in ("images.bin", "images.txt")]
+    places, names = (".", "sparse", "sparse/0"), ("images.bin", "images.txt")
+    models = [folder / place / name for place in places for name in names]
     for model in filter(Path.is_file, models):
         with suppress(InputError):  # a damaged model is skipped
             images = read_images(model, points=False)
@@ -292,7 +285,9 @@ class ViewMatch:
 
     def _reach(self, spacings: float) -> float:
         """Return a share of the spacing, metres, or more where the cloud is rounded coarsely."""
-        return float(max(_ROUNDING * self.step_m / 2.0, spacings * self.view_list.spacing_m))
+        # three coordinates that are each off by half a step
+        rounding_m = 1.01 * np.sqrt(3.0) * self.step_m / 2.0
+        return float(max(rounding_m, spacings * self.view_list.spacing_m))
 
     @cached_property
     def _tree(self) -> Any:
@@ -336,7 +331,8 @@ class ViewMatch:
     def _rows(self, xyz: FloatArray, own_row: IntArray, listed: FloatArray) -> IntArray:
         """Return the list's row of points at some rows of the cloud, -1 for those without one."""
         row = np.where(own_row < len(listed), own_row, -1)
-        row[np.linalg.norm(listed[row] - xyz, axis=1) > self._reach(_SAME)] = -1
+        # of one point, two positions are closer than 5 % of the spacing
+        row[np.linalg.norm(listed[row] - xyz, axis=1) > self._reach(0.05)] = -1
         rest = np.flatnonzero(row < 0)
         if len(rest):
             reach = float(np.nextafter(self.tolerance_m or 0.0, np.inf))
@@ -369,8 +365,8 @@ class ViewReport(Sums):
             sentence = f"{self.source}: has none of the cloud's {points:,} points. Give the"
             sentence += " list of this cloud, or the offset of its coordinates (--cameras-offset)."
             raise InputError("views.no_match", sentence, points=points, listed=self.list_points)
-        found: dict[str, str] = {}
-        if self.unmatched > _MANY * points:
+        found = dict[str, str]()
+        if self.unmatched > 0.1 * points:
             found["views.unmatched"] = f"lacks {self.unmatched:,} of the cloud's {points:,} points."
         if self.share_seen is None and self.entries:
             found["views.order_untested"] = "the order of its images is untested: no camera frames."

@@ -1,4 +1,4 @@
-"""Read the water surface: a level, a plane, a dimension, a mesh or a raster; write rasters.
+"""Read the water surface: a level, a plane, a dimension, a mesh or a raster, and tide tables.
 
 Meshes are read here, not by open3d: it returns OBJ coordinates as 32-bit floats, half a metre
 apart at a northing of five million, and a damaged PLY ends the process.
@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,9 +20,10 @@ import numpy as np
 from pcfix.errors import GeometryError, SettingError, bad_file, warn
 from pcfix.io import crs as systems
 from pcfix.io.files import check_input
+from pcfix.io.photographs import Times, parse_times
 from pcfix.io.ply import positions, read_columns, read_header
 from pcfix.io.rasters import IMPOSSIBLE_M, open_raster, place_of, read_masked
-from pcfix.io.tables import METRES, match_labels, number
+from pcfix.io.tables import METRES, match_labels, number, read_table
 from pcfix.model import (
     FloatArray,
     IntArray,
@@ -41,12 +43,7 @@ if TYPE_CHECKING:
 KINDS = (
     "a level such as 0.37, plane:a,b,c, dim:NAME, a mesh (.obj, .ply) or a raster of heights (.tif)"
 )
-_NOT_RASTERS = (".csv", ".txt", ".json", ".geojson", ".gpkg", ".shp", ".las", ".laz")
-"""GDAL would try some of these as rasters all the same."""
-MOST_OVERLAP = 0.01
-"""Of the plan area; the triangulation of a shoreline may fold at its rim by less."""
 _CORNERS = "vertex_indices", "vertex_index"
-_MOST_VERTICES = 2**31
 
 
 def read_water(spec: float | File, cloud_crs: str | CRS | None = None) -> WaterSurface:
@@ -89,7 +86,8 @@ def read_water(spec: float | File, cloud_crs: str | CRS | None = None) -> WaterS
     found = check_input(text)
     if suffix in (".obj", ".ply"):
         return _mesh(found)
-    if suffix in _NOT_RASTERS:
+    # GDAL would try some of these as rasters all the same
+    if suffix in (".csv", ".txt", ".json", ".geojson", ".gpkg", ".shp", ".las", ".laz"):
         raise bad_file(text, "water.format", f"is not a water surface. Give {KINDS}.")
     return read_water_raster(text, cloud_crs)
 
@@ -114,7 +112,7 @@ def _mesh(path: Path) -> WaterMesh:
     # holes, edges of three facets and facets that overlap at one height do not matter
     double, area_m2 = in_two_sheets(tin)
     share = float(area_m2[double].sum() / area_m2.sum())
-    if share > MOST_OVERLAP:
+    if share > 0.01:  # the triangulation of a shoreline may fold at its rim by less
         sentence = f"{100.0 * share:.0f} % of the mesh is above another part. Export one surface."
         raise bad_file(path, "water.mesh_overlap", sentence, share=share)
     return mesh
@@ -133,7 +131,7 @@ def _read_obj(path: Path) -> tuple[FloatArray, IntArray]:
             elif key == "f":
                 # a corner such as 7, 7/1/3 or, counted from the end, -1
                 rows = [int(field.split("/")[0]) for field in fields]
-                if max(map(abs, rows), default=0) > _MOST_VERTICES:
+                if max(map(abs, rows), default=0) > 2**31:
                     raise ValueError(f"there is no vertex {max(rows, key=abs)}")
                 corners = [row - 1 if row > 0 else len(vertices) + row for row in rows]
                 triangles += [[corners[0], *corners[i : i + 2]] for i in range(1, len(corners) - 1)]
@@ -160,8 +158,6 @@ def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
 
 MOST_CELLS = 10_000_000
 """Cells that are read, for the memory."""
-ROUGH_DEG = 3.0
-"""A slope by noise alone that moves a point by more than one percent of its depth."""
 
 
 def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRaster:
@@ -192,7 +188,7 @@ def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRa
         heights = _heights(source, crs, name)
         middle = np.array([[*place_of(t, size[0] / 2, size[1] / 2), 0.0]])
         to_cloud = systems.to_cloud_crs(crs, cloud_crs, middle, name, heights=True)
-        if to_cloud is not None or not (t.b == t.d == 0.0 and t.a > 0.0 > t.e):
+        if to_cloud is not systems.unchanged or not (t.b == t.d == 0.0 and t.a > 0.0 > t.e):
             sentence = "is turned, or in another CRS than the cloud. Reproject it with 'gdalwarp"
             raise bad_file(name, "water.raster_place", f"{sentence} -t_srs CRS_OF_THE_CLOUD'.")
     if not np.isfinite(heights).any():
@@ -202,11 +198,10 @@ def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRa
     noise = np.abs(heights[1:-1, 1:-1] - around)
     noise_m = 1.48 * float(np.nanmedian(noise)) if np.isfinite(noise).any() else 0.0
     slope_deg = math.degrees(math.atan(noise_m / math.sqrt(abs(t.determinant))))
-    if slope_deg > ROUGH_DEG:
-        sentence = (
-            f"the water surface is rough ({noise_m:.2f} m, slopes of {slope_deg:.0f} degrees)."
-        )
-        warn(name, "water.rough", f"{sentence} Smooth it, or fit a level to it.", noise_m=noise_m)
+    if slope_deg > 3.0:  # by noise alone, a point moves by more than one percent of its depth
+        sentence = f"the water surface is rough ({noise_m:.2f} m, slopes of {slope_deg:.0f}"
+        sentence += " degrees). Smooth it, or fit a level to it."
+        warn(name, "water.rough", sentence, noise_m=noise_m)
     short = name.replace("\\", "/").rpartition("/")[2]
     return WaterRaster(heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), short)
 
@@ -220,7 +215,7 @@ def _heights(source: DatasetReader, crs: CRS | None, name: str) -> FloatArray:
         stated = unit or f"the unit of {'' if crs is None else crs.name}"
         sentence = f"its heights are in {stated}. Convert them to metres."
         raise bad_file(name, "water.raster_unit", sentence, value=unit)
-    heights = read_masked(source) * source.scales[0] + source.offsets[0]
+    heights = read_masked(source)
     if source.nodata is None:
         heights[~(np.abs(heights) <= IMPOSSIBLE_M)] = np.nan
         unknown = int(np.isnan(heights).sum())
@@ -263,3 +258,52 @@ def write_water_raster(path: Path, water: WaterRaster, crs: str | None) -> None:
     }  # fmt: skip
     with rasterio.open(path, "w", **profile) as target:
         target.write(water.height_m, 1)
+
+
+def read_tide(path: File) -> tuple[Times, FloatArray]:
+    """Read a table of increasing ``time`` (ISO 8601) and ``level_m``, above any datum."""
+    source = check_input(path)
+    table = read_table(source, ("time", "level_m"))
+    level = table.of(("level_m",))[:, 0]
+    times = parse_times(source, [f"line {line}" for line in table.line], table.column("time"))
+    late = np.flatnonzero(np.diff(times.time_s) <= 0.0)
+    if late.size:
+        line = table.line[late[0] + 1]
+        sentence = f"line {line}: the time is not later than the one before. Sort the rows by time."
+        raise bad_file(source, "tide.order", sentence, line=line)
+    if len(level) < 2:
+        raise bad_file(source, "tide.one_row", "has one row. Give at least two.")
+    return times, level
+
+
+def level_offsets(
+    tide: Times, level_m: FloatArray, times: Times, labels: Sequence[str]
+) -> FloatArray:
+    """Return how much higher than on average the water was at each of k images, metres.
+
+    The level is linear between the rows of the table. The average over the images is the level that
+    the user gives.
+    """
+    clock = tide.time_s
+    if tide.zoned != times.zoned:
+        without = times if tide.zoned else tide
+        sentence = "its times have no zone, those of the other file have. Add +02:00, or Z for UTC."
+        raise bad_file(without.name, "time.zone", sentence)
+    outside = np.flatnonzero((times.time_s < clock[0]) | (times.time_s > clock[-1]))
+    if outside.size:
+        image, at = labels[outside[0]], float(times.time_s[outside[0]])
+        taken = datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M:%S")
+        sentence = f"does not cover image {image}, taken at {taken} ({outside.size} of"
+        sentence += f" {len(labels)} images are outside). Add rows, or check the zones."
+        raise bad_file(
+            tide.name, "tide.not_covered", sentence, image=image, count=int(outside.size)
+        )
+    level = np.interp(times.time_s, clock, level_m)
+    row = np.clip(np.searchsorted(clock, times.time_s) - 1, 0, len(clock) - 2)
+    hours = float(np.diff(clock)[row].max()) / 3600.0
+    # Half a tide lasts 6.2 h; with an amplitude A of 2 m the chord over one hour is up to
+    # A (2 pi 1 h / 12.4 h)^2 / 8 = 6 cm off, that over two hours 26 cm
+    if hours > 1.0:
+        sentence = f"its rows are up to {hours:.1f} h apart; give one each hour."
+        warn(tide.name, "tide.sparse", sentence, hours=hours)
+    return np.asarray(level - level.mean())

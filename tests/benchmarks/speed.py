@@ -41,7 +41,7 @@ from tests.utils.shared import SCENE
 
 PYTHON, PCFIX = [sys.executable, "-c"], [sys.executable, "-m", "pcfix"]
 MAKE = """
-from pcfix.io.scenes import write_scene
+from pcfix.flow.demo import write_scene
 from tests.utils.matchers import matched_scene
 write_scene(matched_scene({points}, cameras={cameras}, cloud={cloud!r}), {folder!r}, overwrite=True)
 """

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.io.scenes import write_scene
+from pcfix.flow.demo import write_scene
 from pcfix.model import Lens, Outcome
 from tests.utils.program import run_pcfix
 from tests.utils.shared import needs

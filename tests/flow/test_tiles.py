@@ -16,8 +16,8 @@ import rasterio
 from pyproj import CRS
 
 import pcfix
+from pcfix.flow.demo import write_scene
 from pcfix.flow.runner import in_processes
-from pcfix.io.scenes import write_scene
 from tests.io.test_views import write_ply
 from tests.utils.codes import refused
 from tests.utils.matchers import matched_scene

@@ -5,8 +5,8 @@ import pytest
 
 import pcfix
 from pcfix.flow import view
+from pcfix.flow.demo import write_scene
 from pcfix.flow.view import GREY, view_figure
-from pcfix.io.scenes import write_scene
 from tests.utils.codes import refused
 
 

@@ -17,15 +17,14 @@ import pcfix
 from pcfix.io.cameras import read_tie_points
 from pcfix.io.cameras.colmap import FILE as FILE_OF_PLACE
 from pcfix.io.cameras.colmap import write_colmap
-from pcfix.io.clouds import read_cloud
+from pcfix.io.clouds import open_cloud, read_cloud
 from pcfix.io.files import ENSEMBLE, find_members, write_members
 from pcfix.io.ground_control import read_gnss, read_ground_control
-from pcfix.io.photographs import read_photograph, size_of
+from pcfix.io.photographs import read_image_times, read_photograph, size_of
 from pcfix.io.tables import read_check_depths
-from pcfix.io.tides import read_image_times, read_tide
-from pcfix.io.tiles import open_cloud
 from pcfix.io.vectors import read_shoreline, read_water_polygons
 from pcfix.io.views import ViewMatch, read_views
+from pcfix.io.water import read_tide
 from pcfix.model import Cameras, Lens
 from tests.flow.test_pose_errors import members_of
 from tests.io import test_ground_control as control

@@ -8,10 +8,10 @@ import pytest
 import shapely
 
 import pcfix
+from pcfix.flow.demo import write_scene
 from pcfix.flow.run_folder import waterline
 from pcfix.grid import maps
 from pcfix.grid.maps import waterlines
-from pcfix.io.scenes import write_scene
 from pcfix.simulate.scene import ORIGIN_M
 from pcfix.simulate.settings import Terrain
 

@@ -130,10 +130,12 @@ def test_topocentric():
     origin = geocentric(lon, lat, h, 6378137.0, 1 / 298.257223563)
     place = Topocentric.from_text(f"ENU:{lat},{lon},{h}", "a")
     enu = np.array([[0.0, 0, 0], [100.0, -50.0, 20.0]])
-    lon_1, lat_1, h_1 = place.to_degrees(enu)[0]
-    found = geocentric(lon_1, lat_1, h_1, 6378137.0, 1 / 298.257223563)
-    assert found == pytest.approx(origin, abs=1e-6)
-    assert place.from_degrees(place.to_degrees(enu)) == pytest.approx(enu, abs=1e-6)
+    degrees = place.to_degrees(enu)
+    found = [geocentric(*point, 6378137.0, 1 / 298.257223563) for point in degrees]
+    assert found[0] == pytest.approx(origin, abs=1e-6)
+    assert np.linalg.norm(np.subtract(found[1], origin)) == pytest.approx(np.linalg.norm(enu[1]))
+    assert (degrees[1] > [lon, -90.0, h]).all()
+    assert degrees[1, 1] < lat
     assert Topocentric.from_text("enu: 39.9, -83.0", "a") == Topocentric(39.9, -83.0, 0.0)
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pcfix.io.tides import level_offsets, read_image_times, read_tide
+from pcfix.io.photographs import read_image_times
+from pcfix.io.water import level_offsets, read_tide
 from tests.utils.codes import refused
 
 pytestmark = pytest.mark.quick_but("test_exif")

@@ -7,7 +7,7 @@ import rasterio
 from rasterio.transform import Affine, from_origin
 
 import pcfix
-from pcfix.io.scenes import write_scene
+from pcfix.flow.demo import write_scene
 from pcfix.water.surface import surface_above
 from tests.utils.codes import refused, warned
 

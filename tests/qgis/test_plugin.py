@@ -16,8 +16,8 @@ import pytest
 import pcfix
 from pcfix.cli.commands import COMMANDS
 from pcfix.cli.flags import OFFERED, plugin_table
+from pcfix.flow.demo import write_scene
 from pcfix.io.files import packed_plugin
-from pcfix.io.scenes import write_scene
 from pcfix.options.correct import RunOptions
 from pcfix.options.declare import options_of
 from pcfix.qgis.command import CommandError, program_of, words_of

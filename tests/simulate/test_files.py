@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import pcfix
-from pcfix.io.scenes import CLOUDS, colmap_vis, write_scene
+from pcfix.flow.demo import CLOUDS, colmap_vis, write_scene
 from pcfix.io.views import read_views
 from pcfix.model import Views
 from tests.utils.program import run_pcfix

@@ -61,7 +61,7 @@ def frame_of(text: str, name: str) -> Frame:
     """Return the frame that a text names: a CRS, or ``ENU:latitude,longitude,height``."""
     if systems.is_topocentric(text):
         place = systems.Topocentric.from_text(text, name)
-        crs = systems.parse_crs(systems.GEOGRAPHIC_WGS84, name)
+        crs = systems.parse_crs("EPSG:4979", name)
         return Frame(crs, place.to_degrees, topocentric=True)
     crs = systems.parse_crs(text, name)
     if crs.is_geocentric:
@@ -96,7 +96,7 @@ class Georeference:
     crs: str | None  # of the result, as in `Cameras.crs`
     notes: tuple[PcfixWarning, ...] = ()
     frame: Frame | None = None  # of the file; None if the numbers do not change
-    forward: systems.Move = lambda xyz: xyz
+    forward: systems.Move = systems.unchanged
 
     def cameras(self, cameras: Cameras) -> Cameras:
         """Return the cameras in the target; `gnss` stays in its own CRS."""
@@ -208,22 +208,14 @@ def georeference(
     if systems.heights_of(cloud) == "unstated":  # then the heights are those that the software uses
         vertical = systems.parts(frame.crs if project is None else project)[1]
         target = cloud if vertical is None else systems.with_heights(cloud, vertical)
-    here, there = systems.heights_of(frame.crs), systems.heights_of(target)
-    unit, size = systems.plan_unit(frame.crs)
-    is_guess = project is None and not frame.topocentric
-    assumed = ""
+    here, (unit, size) = systems.heights_of(frame.crs), systems.plan_unit(frame.crs)
+    assumed = "" if trusted else systems.assumed_heights(frame.crs, target)
     if here == "unstated" and frame.crs.is_projected and size != 1.0:
-        assumed = f"heights are assumed to be in {unit}, like x and y"
-    elif here == "unstated" != there and not trusted:
-        assumed = f"names no vertical datum; that of the cloud is assumed ({target.name})"
-    elif here == "ellipsoidal" and there == "unstated" and is_guess and not trusted:
-        assumed = f"the cloud's CRS ({target.name}) names no vertical datum; ellipsoidal is assumed"
-    guesses = [note(name, "cameras.heights_assumed", f"{assumed}.")] if assumed else []
+        assumed = f"heights are assumed to be in {unit}, like x and y."
+    elif here == "ellipsoidal" and (project is not None or frame.topocentric):
+        assumed = ""  # they are known to be
     # heights change only if both sides state different datums, and the user does not trust them
     heights = not ((trusted and not frame.direct) or systems.heights_agree(frame.crs, target))
-    into = systems.crs_text(target)
-    if frame.direct and not heights and systems.is_same_numbers(frame.crs, target):
-        return Georeference(name, offset, into, (*notes, *guesses))
     plan = systems.crs_text(systems.parts(frame.crs if frame.direct else target)[0])
     given = "ENU:latitude,longitude,height" if frame.topocentric else systems.shortened(plan)
     instead = f"or, if the heights of cameras and cloud agree, give --cameras-crs {given}"
@@ -233,10 +225,11 @@ def georeference(
         frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
     )
     notes += [PcfixWarning("crs.transformation", str(one), path=name) for one in of_step]
-    notes += guesses
-    return Georeference(
-        name, offset, into, tuple(notes), frame, lambda xyz: forward(frame.enter(xyz))
-    )
+    notes += [note(name, "cameras.heights_assumed", assumed)] if assumed else []
+    into, found = systems.crs_text(target), tuple(notes)
+    if forward is systems.unchanged:
+        return Georeference(name, offset, into, found)
+    return Georeference(name, offset, into, found, frame, lambda xyz: forward(frame.enter(xyz)))
 
 
 def adjusted_minus_gnss(cameras: Cameras, name: str = "cameras") -> tuple[FloatArray, str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,22 +21,10 @@ if TYPE_CHECKING:
     import laspy
 
 
-Records: TypeAlias = Any
-"""A numpy array of point records, whose dtype has named fields."""
-
-
 UPGRADE = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10, 6: 6, 7: 7, 8: 8, 9: 9, 10: 10}
 """The format that each one becomes (LAS 1.4 R15, table 6 and on)."""
 
-SCAN_ANGLE_STEP_DEG = 0.006
-"""Unit of the scan angle in formats 6 and up; whole degrees before."""
-
 _INT32 = np.iinfo(np.int32)
-
-_PACKED = (
-    *("return_number", "number_of_returns", "scan_direction_flag", "edge_of_flight_line"),
-    *("classification", "synthetic", "key_point", "withheld"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,14 +55,13 @@ COLUMNS = (
 OUTCOME = Column("Outcome", "outcome", "uint8", 1.0, "whether and why not corrected")
 """Written for the cells of rasters; see `pcfix.Outcome`."""
 SHIFTS = ("ShiftX", "ShiftY", "ShiftZ")
-MINIMAL = ("ShiftZ", "RayCount")
 
 
 def columns_for(dimensions: Dimensions) -> tuple[Column, ...]:
     """Return the columns that ``--dimensions`` asks for."""
     if dimensions == "none":
         return ()
-    return tuple(c for c in COLUMNS if dimensions == "all" or c.name in MINIMAL)
+    return tuple(c for c in COLUMNS if dimensions == "all" or c.name in ("ShiftZ", "RayCount"))
 
 
 def column_scale(column: Column, scales: FloatArray) -> float:
@@ -145,7 +132,7 @@ def convert(
     """
     import laspy
 
-    array: Records = np.zeros(len(points), point_format.dtype())
+    array: Any = np.zeros(len(points), point_format.dtype())
     new = laspy.ScaleAwarePointRecord(array, point_format, points.scales, points.offsets)
     same = points.point_format.id == point_format.id
     old, after = points.array, array.dtype.fields or {}
@@ -162,12 +149,14 @@ def convert(
         array[name] = old[name]
     if same:
         return new
-    for name in _PACKED:
+    packed = ("return_number", "number_of_returns", "scan_direction_flag", "edge_of_flight_line")
+    for name in (*packed, "classification", "synthetic", "key_point", "withheld"):
         new[name][:] = np.asarray(points[name])
+    step_deg = 0.006  # of the scan angle in formats 6 and up; whole degrees before
     if "scan_angle" in array.dtype.names and "scan_angle_rank" in old.dtype.names:
-        array["scan_angle"] = np.rint(old["scan_angle_rank"] / SCAN_ANGLE_STEP_DEG)
+        array["scan_angle"] = np.rint(old["scan_angle_rank"] / step_deg)
     elif "scan_angle_rank" in array.dtype.names and "scan_angle" in old.dtype.names:
-        array["scan_angle_rank"] = np.rint(old["scan_angle"] * SCAN_ANGLE_STEP_DEG)
+        array["scan_angle_rank"] = np.rint(old["scan_angle"] * step_deg)
     return new
 
 

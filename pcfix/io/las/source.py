@@ -10,8 +10,7 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -32,57 +31,22 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 
-WAVEFORM_PACKETS = ("LASF_Spec", 65535)
 _VLR, _EVLR = "<2x16sHH32s", "<2x16sHQ32s"
-_INTERNAL_WAVEFORMS = 2
-"""Bit of the global encoding (LAS 1.4 R15, table 4)."""
-IDENTITY_PLACE, _IDENTITY_SIZE = 26, 68
+IDENTITY_PLACE = 26
 """Where the header names system, software and date (LAS 1.4 R15, table 3)."""
 _DAMAGED = (
     *(laspy.LaspyException, lazrs.LazrsError, struct.error),
     *(ValueError, IndexError, ArithmeticError, OSError),
 )
 """What the LAS libraries raise."""
-_ONE_STREAM, _LAYERED = 1, 3
-"""Compressors of LAZ: one without chunks, and one that stores the dimensions separately."""
-_VARIABLE_CHUNKS = 2**32 - 1
-_PANIC = "PanicException"
-"""lazrs raises this, too, if the compressed points are damaged; it cannot be imported."""
-_OTHER_CLOUDS = {b"ply\n": "PLY", b"ply\r": "PLY", b"ASTM": "E57"}
 _UNITS, _OWN_CODE = {9001: "metre", 9002: "foot", 9003: "US survey foot"}, 32767
 """GeoTIFF codes of units (EPSG), and the least of the codes that only a user knows."""
 
 MOST_SCALE_M = 1000.0
 """Largest step of coordinates that a header may state."""
 
-_LAST_DIGIT = 2.0**-52
-"""Of a float64, relative."""
-
 CHUNK_POINTS = 400_000
 """Points that are worked on at a time, which bounds the memory."""
-
-CHUNK_BYTES = 500_000_000
-"""The same where records are so long that fewer points are as much."""
-
-SMALL_BYTES = 250_000_000
-"""Point records of a cloud that stay in memory until it is read again."""
-
-
-@dataclass(frozen=True)
-class RasterBand:
-    """A band of a raster that is read as a cloud; `pcfix.io.tiles.band_of` counts its points."""
-
-    path: Path
-    band: int | None = None
-    points: int = 0
-    # the lowest and highest coordinates, shape (3,), metres
-    mins: FloatArray = field(default_factory=lambda: np.zeros(3))
-    maxs: FloatArray = field(default_factory=lambda: np.zeros(3))
-
-    def __str__(self) -> str:
-        return str(self.path)
-
-    __fspath__ = __str__
 
 
 class Record(VLR):  # type: ignore[misc]  # laspy is untyped
@@ -131,7 +95,7 @@ def read_records(stream: BinaryIO) -> tuple[list[Record], list[Record]]:
     encoding, minor = head[6], head[25]
     if minor >= 4:
         start, count = struct.unpack_from("<QI", head, 235)
-    elif minor == 3 and encoding & _INTERNAL_WAVEFORMS:
+    elif minor == 3 and encoding & 2:  # waveforms inside the file (LAS 1.4 R15, table 4)
         start, count = *struct.unpack_from("<Q", head, 227), 1
     else:
         count = 0
@@ -163,7 +127,7 @@ def append_evlrs(stream: BinaryIO, records: Sequence[Record], minor_version: int
         stream.seek(235)
         stream.write(struct.pack("<QI", start, len(records)))
     for record in records:
-        if (record.user_id, record.record_id) == WAVEFORM_PACKETS:
+        if (record.user_id, record.record_id) == ("LASF_Spec", 65535):  # waveform packets
             stream.seek(227)
             stream.write(struct.pack("<Q", start))
         stream.seek(start)
@@ -176,7 +140,8 @@ def las_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except BaseException as error:
-        if not isinstance(error, _DAMAGED) and type(error).__name__ != _PANIC:
+        # lazrs panics, too, if the points are damaged; that exception cannot be imported
+        if not isinstance(error, _DAMAGED) and type(error).__name__ != "PanicException":
             raise
         reason = str(error).strip().rstrip(".") or type(error).__name__
         sentence = f"is damaged, or is not a LAS or LAZ file ({reason}). Export or copy it again."
@@ -197,22 +162,20 @@ class LasSource:
     def __init__(self, path: File, jobs: int | None = None) -> None:
         """Open; an `InputError` if the file is missing, damaged, empty, or its scales unusable."""
         self.path, self._clouds = check_input(path), current().clouds
-        with las_errors(self.path):
+        with las_errors(self.path), ExitStack() as stack:
             with self.path.open("rb") as stream:
-                if other := _OTHER_CLOUDS.get(stream.read(4)):
+                others = {b"ply\n": "PLY", b"ply\r": "PLY", b"ASTM": "E57"}
+                if other := others.get(stream.read(4)):
                     sentence = f"is a {other} file. Convert it to LAZ with CloudCompare or PDAL."
                     raise bad_file(self.path, "cloud.ply", sentence)
                 self.vlrs, self.evlrs = read_records(stream)
                 stream.seek(IDENTITY_PLACE)
-                self.identity = stream.read(_IDENTITY_SIZE)
-            self._reader = laspy.open(self.path.open("rb"), laz_backend=backend(jobs))
-        self.header: laspy.LasHeader = self._reader.header
-        try:
-            with las_errors(self.path):
-                self._check_header()
-        except BaseException:
-            self._reader.close()
-            raise
+                self.identity = stream.read(68)
+            reader = laspy.open(self.path.open("rb"), laz_backend=backend(jobs))
+            self._reader = stack.enter_context(reader)
+            self.header: laspy.LasHeader = reader.header
+            self._check_header()
+            stack.pop_all()
 
     def __enter__(self) -> LasSource:
         return self
@@ -228,7 +191,7 @@ class LasSource:
         scales, offsets = self.header.scales, self.header.offsets
         usable = (scales > 0.0) & (scales <= MOST_SCALE_M)
         # steps below the last digit of the offsets would be lost in coordinates
-        if not (usable & (np.abs(offsets) * _LAST_DIGIT <= scales)).all():
+        if not (usable & (np.abs(offsets) * np.finfo(np.float64).eps <= scales)).all():
             sentence = f"the scales {scales.tolist()} of its header are not between 0 and"
             sentence += f" {MOST_SCALE_M:,.0f}, or too small for its offsets {offsets.tolist()}."
             raise bad_file(self.path, "cloud.scales", f"{sentence} Export the cloud again.")
@@ -261,7 +224,7 @@ class LasSource:
         laszip = next((v.record_data for v in self.vlrs if v.user_id == "laszip encoded"), b"")
         (compressor,) = struct.unpack_from("<H", laszip)
         (chunk_points,) = struct.unpack_from("<I", laszip, 12)
-        if compressor == _ONE_STREAM or chunk_points == _VARIABLE_CHUNKS:
+        if compressor == 1 or chunk_points == 2**32 - 1:  # one stream, or chunks of any size
             return 0, np.inf
         with self.path.open("rb") as stream:
             stream.seek(start)
@@ -276,7 +239,7 @@ class LasSource:
             if not 0 < chunks <= table - start:  # lazrs would take memory for all of them
                 raise ValueError(f"{chunks:,} chunks in {table - start:,} bytes")
             last = 1
-            if compressor == _LAYERED:  # these chunks state their number of points
+            if compressor == 3:  # dimensions are separate; these chunks state how many points
                 stream.seek(start)
                 sizes = [size for _, size in lazrs.read_chunk_table(stream, lazrs.LazVlr(laszip))]
                 stream.seek(start + 8 + sum(sizes[:-1]) + record)
@@ -292,9 +255,10 @@ class LasSource:
         if clouds is not None and self.path in clouds:
             yield from clouds[self.path]
             return
-        is_small = len(self) * self.header.point_format.size <= SMALL_BYTES
+        size = self.header.point_format.size
+        is_small = len(self) * size <= 250_000_000  # then it stays in memory until it is read again
         read, chunks = 0, list[laspy.ScaleAwarePointRecord]()
-        most = max(1, min(CHUNK_POINTS, CHUNK_BYTES // self.header.point_format.size))
+        most = max(1, min(CHUNK_POINTS, 500_000_000 // size))  # fewer points if records are long
         while read < len(self):
             with las_errors(self.path):
                 points = self._reader.read_points(most)

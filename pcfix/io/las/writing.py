@@ -24,7 +24,7 @@ from laspy.vlrs.vlr import VLR
 from pyproj import CRS
 
 from pcfix.errors import SettingError, bad_file
-from pcfix.io.files import cannot_write, parse_json, refusing, temporary_output
+from pcfix.io.files import cannot_write, check_output, parse_json, refusing, temporary_output
 from pcfix.io.las.columns import UPGRADE, Column, column_scale
 from pcfix.io.las.source import (
     IDENTITY_PLACE,
@@ -36,6 +36,7 @@ from pcfix.io.las.source import (
     stated_crs,
 )
 from pcfix.model import FloatArray
+from pcfix.options.declare import File
 from pcfix.version import __version__
 
 EXTRA_BYTES = ("LASF_Spec", 4)
@@ -214,16 +215,16 @@ def record_errors(path: Path) -> AbstractContextManager[None]:
     return refusing(path, "cloud.vlr_damaged", sentence, kinds)
 
 
-def check_suffix(path: Path) -> bool:
-    """Return whether a name asks for LAZ rather than LAS; a `SettingError` if for neither."""
-    suffix = path.suffix.lower()
-    if path.name.lower().endswith(".copc.laz"):
+def check_cloud(path: File, *, overwrite: bool, inputs: Iterable[File] = ()) -> Path:
+    """Return the path of a cloud that may be written, by `check_output` and its suffix."""
+    target = check_output(path, overwrite=overwrite, inputs=inputs)
+    if target.name.lower().endswith(".copc.laz"):
         sentence = f"{path}: pcfix does not write COPC. Write .laz, and convert it with untwine."
-        raise SettingError("output.copc", sentence, path=path)
-    if suffix not in (".las", ".laz"):
+        raise SettingError("output.copc", sentence, path=target)
+    if target.suffix.lower() not in (".las", ".laz"):
         sentence = f"{path}: give an output name that ends in .las or .laz."
-        raise SettingError("output.suffix", sentence, path=path)
-    return suffix == ".laz"
+        raise SettingError("output.suffix", sentence, path=target)
+    return target
 
 
 @contextmanager
@@ -239,7 +240,7 @@ def las_writer(
     The suffix of its path decides between LAS and LAZ; the `evlrs` follow the points, and
     `identity` goes into the header as it is (see `LasSource`).
     """
-    laz = check_suffix(path)
+    laz = path.suffix.lower() == ".laz"
     with temporary_output(path) as temporary, temporary.open("w+b") as stream:
         try:
             writer = laspy.LasWriter(
