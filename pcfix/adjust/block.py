@@ -23,7 +23,7 @@ from pcfix.model import (
     Views,
     WaterSurface,
 )
-from pcfix.port.shapes import Port
+from pcfix.port.housing import Port
 from pcfix.water.surface import surface_above
 
 WATER = "water"

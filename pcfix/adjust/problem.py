@@ -41,8 +41,7 @@ from pcfix.model import (
     WaterRaster,
     WaterSurface,
 )
-from pcfix.port.light import window_of
-from pcfix.port.shapes import DomePort, FlatPort, Port
+from pcfix.port.housing import DomePort, FlatPort, Port, window_of
 from pcfix.water.surface import build_field, build_tin
 
 if TYPE_CHECKING:

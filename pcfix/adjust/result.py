@@ -23,7 +23,7 @@ from pcfix.adjust.problem import (
 )
 from pcfix.errors import PcfixWarning, plain
 from pcfix.model import BoolArray, Cameras, FloatArray, WaterSurface
-from pcfix.port.shapes import Port
+from pcfix.port.housing import Port
 from pcfix.water.surface import surface_above
 
 Source = Literal["tie points", "cloud"]

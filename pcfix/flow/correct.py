@@ -34,7 +34,7 @@ from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header
 from pcfix.io.tiles import Clouds, is_raster
 from pcfix.label.labelling import Labelling
-from pcfix.lens.frames import count_visible_cameras
+from pcfix.lens.imaging import count_visible_cameras
 from pcfix.model import (
     BATHYMETRIC_POINT,
     Cameras,

@@ -30,7 +30,7 @@ from pcfix.label.labelling import Labelling, WaterMask
 from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints, Views
 from pcfix.options.declare import File, OptionSet, options_of
 from pcfix.options.shared import InputOptions, LandRules, MaskOption
-from pcfix.port.shapes import port_of
+from pcfix.port.housing import port_of
 from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:
