@@ -42,7 +42,8 @@ class RiverFit(ShoreFit):
 
     axis: FloatArray  # (a, 2), vertices of the line along the river, downstream
     station_m: FloatArray  # (m,), evenly spaced along it, from the first point to the last
-    sigma_height_m: FloatArray  # (m,), standard errors of the heights there
+    height_m: FloatArray  # (m,), of the water there
+    sigma_height_m: FloatArray  # (m,), standard errors of these heights
 
     def sigma_at(self, xy: FloatArray) -> FloatArray:
         """Return the standard error (m) of the height at places (m, 2)."""
@@ -96,6 +97,7 @@ def fit_river(
         sigma_m=sigma,
         axis=axis,
         station_m=nodes,
+        height_m=height,
         sigma_height_m=sigma_height,
         figures={
             "model": "river",
