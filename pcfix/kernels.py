@@ -10,15 +10,13 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextvars import Context, copy_context
+from contextvars import copy_context
 from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar, cast, overload
+from typing import Any, TypeAlias, TypeVar, overload
 
 import numba
-import numpy as np
-import numpy.typing as npt
 
 from pcfix.errors import PcfixWarning
 from pcfix.running import current, running
@@ -39,7 +37,9 @@ MOST_CACHES = 5
 
 @cache
 def cache_folder() -> Path | None:
-    """Return the folder of the compiled kernels, created if necessary; None if it cannot be.
+    """Return the folder of the compiled kernels, created if necessary.
+
+    If it cannot be created, warn once and return None.
 
     numba compares a cached kernel with its own source file only, and does not see edits of the
     files that it imports. So the name of the folder has the version and a hash of the sources.
@@ -55,6 +55,12 @@ def cache_folder() -> Path | None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     except (OSError, RuntimeError):  # a user without a home
+        words = (
+            "Compiled kernels cannot be cached, because the user's cache folder cannot be written:"
+            " each start compiles them again (about a minute). Set NUMBA_CACHE_DIR to a folder"
+            " that can be written."
+        )
+        warnings.warn(PcfixWarning("kernels.no_cache", words), stacklevel=2)
         return None
     older = sorted(root.glob("kernels-*"), key=lambda path: path.stat().st_mtime)
     for path in older[:-MOST_CACHES]:
@@ -63,7 +69,7 @@ def cache_folder() -> Path | None:
 
 
 @overload
-def kernel(function: _Function) -> _Function: ...
+def kernel(function: _Function, *, allocates: bool = False) -> _Function: ...
 @overload
 def kernel(*, allocates: bool) -> Callable[[_Function], _Function]: ...
 def kernel(function: Any = None, *, allocates: bool = False) -> Any:
@@ -74,20 +80,15 @@ def kernel(function: Any = None, *, allocates: bool = False) -> Any:
     time of a correction.
     """
     if function is None:
-        return partial(_compile, allocates=allocates)
-    return _compile(function)
-
-
-def _compile(function: _Function, *, allocates: bool = False) -> _Function:
+        return partial(kernel, allocates=allocates)
     options = {"nogil": True, "error_model": "numpy", "_nrt": allocates}
     folder = cache_folder()
     if folder is None:
-        _warn_of_no_cache()
-        return cast(_Function, numba.njit(**options)(function))
+        return numba.njit(**options)(function)
     # numba reads its setting when a function is declared; those of other packages keep theirs
     before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
     try:
-        return cast(_Function, numba.njit(cache=True, **options)(function))
+        return numba.njit(cache=True, **options)(function)
     finally:
         numba.config.CACHE_DIR = before
 
@@ -108,19 +109,6 @@ def device(function: Any = None, *, allocates: bool = False, **options: Any) -> 
         no_cpython_wrapper=True, no_cfunc_wrapper=True, **options,
     )  # fmt: skip
     return decorator if function is None else decorator(function)
-
-
-@cache
-def _warn_of_no_cache() -> None:
-    warnings.warn(
-        PcfixWarning(
-            "kernels.no_cache",
-            "Compiled kernels cannot be cached, because the user's cache folder cannot be written:"
-            " each start compiles them again (about a minute). Set NUMBA_CACHE_DIR to a folder"
-            " that can be written.",
-        ),
-        stacklevel=2,
-    )
 
 
 Span: TypeAlias = tuple[int, int]
@@ -173,23 +161,7 @@ def in_threads(run: Callable[[_Value], _Result], values: Sequence[_Value]) -> li
 
     Much of `run` is numpy, which has one thread; its kernels share the other threads.
     """
-    each = -(-current().threads // len(values))
-
-    def one(context: Context, value: _Value) -> _Result:
-        return context.run(shared, value)
-
-    def shared(value: _Value) -> _Result:
-        with running(threads=each):
-            return run(value)
-
+    with running(threads=-(-current().threads // len(values))):
+        contexts = [copy_context() for _ in values]
     with ThreadPoolExecutor(current().threads) as pool:
-        return list(pool.map(one, [copy_context() for _ in values], values))
-
-
-@device
-def most_between(span: Span, start: npt.NDArray[np.int64]) -> int:
-    """Return the most entries, ``start[i]`` to ``start[i + 1]``, of a row of a tile."""
-    most = 0
-    for i in range(*span):
-        most = max(most, start[i + 1] - start[i])
-    return most
+        return list(pool.map(lambda there, value: there.run(run, value), contexts, values))

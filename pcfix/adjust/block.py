@@ -23,7 +23,7 @@ from pcfix.model import (
     Views,
     WaterSurface,
 )
-from pcfix.port.shapes import Port
+from pcfix.port.housing import Port
 from pcfix.water.surface import surface_above
 
 WATER = "water"
@@ -154,12 +154,9 @@ def block_of(
     wet = np.ones(len(ties.xyz), np.bool_) if inside is None else inside(*ties.xyz[:, :2].T)
     begin = replace(ties, xyz=true_start(ties.xyz, water, refractive_index, wet))
     block = plain_block(cameras, begin, water, refractive_index, wet)
-    return _with_control(block, control, level_sigma_m)
 
-
-def _with_control(block: Block, control: GroundControl, level_sigma_m: float) -> Block:
-    """Return a block of tie points with control points and their marks appended."""
-    water, xyz, under_water = block.water, control.xyz, control.under_water.copy()
+    # control points and their marks are appended
+    xyz, under_water = control.xyz, control.under_water.copy()
     deep = [] if water is None else used_as_dry(control, water, level_sigma_m)
     if deep:
         words = (
@@ -172,8 +169,8 @@ def _with_control(block: Block, control: GroundControl, level_sigma_m: float) ->
     bare = np.asarray(np.isnan(xyz).any(axis=1))
     if bare.any():  # points on surfaces without coordinates start where their rays meet
         under_water[bare] = np.array(control.on)[bare] != WATER
-        places = with_places(marks, block.cameras).xyz
-        start = true_start(places, water, block.refractive_index, under_water)
+        places = with_places(marks, cameras).xyz
+        start = true_start(places, water, refractive_index, under_water)
         xyz = np.where(bare[:, None], start, xyz)
     lost = np.isnan(xyz).any(axis=1)
     if lost.any():

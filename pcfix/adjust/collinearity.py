@@ -32,7 +32,7 @@ from pcfix.lens.algebra import (
 from pcfix.lens.formulas import distorted, plane_and_gradients, undistorted
 from pcfix.lens.imaging import image_and_gradients
 from pcfix.model import BoolArray, FloatArray, IntArray
-from pcfix.port.light import BY_PORT, NO_PORT, Window, through_port
+from pcfix.port.housing import BY_PORT, NO_PORT, Window, through_port
 from pcfix.refract.rays import direction, lay, light_and_gradients, light_path, plane_at, settle
 
 if TYPE_CHECKING:

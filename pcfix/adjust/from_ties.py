@@ -36,7 +36,6 @@ OUTLIER_SIGMAS = 4.0
 LEAST_SHARE = 0.5
 """Share of the observations that must be in front of their cameras, and no outliers."""
 
-MAD_TO_SIGMA = 1.4826
 OUTLIER_ROUNDS = 3
 
 
@@ -56,7 +55,15 @@ def adjust_ties(block: Block, unknowns: Unknowns, *, choose_lens: bool = True) -
             " the start. Check that poses and tie points belong to one model, and the camera axes."
         )
         raise GeometryError("adjust.behind", words, good=ahead, observations=total)
-    clean, now = _cleaned(problem, now)
+    # robust rounds estimate the noise, then exclude outliers
+    now = solve(problem, now, HUBER, ROUGHLY)
+    clean = with_noise(problem, now)
+    for number in range(OUTLIER_ROUNDS):
+        now = solve(clean, now, CAUCHY if number == 0 else SQUARES, ROUGHLY)
+        before = clean.used
+        clean = with_noise(without_outliers(clean, now), now)
+        if number and (clean.used == before).all():
+            break
     if clean.used[counted].mean() < LEAST_SHARE:
         words = (
             "Most tie point observations fit no poses near the given ones. Check that tie points"
@@ -76,26 +83,19 @@ def adjust_ties(block: Block, unknowns: Unknowns, *, choose_lens: bool = True) -
             notes.append(PcfixWarning("adjust.weak_lens", words, fixed=weak))
         if weak or more:
             lens = (*(name for name in unknowns.lens if name not in weak), *more)
-            problem, now, precision = _final_solution(*_with_lens(clean, now, lens))
+            wide, start = prepare(block, replace(unknowns, lens=lens))
+            start = replace(start, state=start.state._replace(xyz=now.state.xyz))
+            now = solve(wide.weighted(clean.given.weight), start, close=ROUGHLY)
+            # outliers are chosen again
+            typical = clean.given.weight[clean.of_ties].max(initial=0.0)
+            wide = wide.weighted(np.where(counted, typical, clean.given.weight))
+            problem, now, precision = _final_solution(without_outliers(wide, now), now)
     factor = disagreement_of(problem, now, precision) * common_errors(problem, precision)
     precision = precision_of(problem, now, precision.sigma0, factor)
     return adjusted_of(problem, now, precision, notes, "tie points")
 
 
-# The robust rounds
-
-
-def _cleaned(problem: Problem, now: Solution) -> tuple[Problem, Solution]:
-    """Return the problem with the noise of its tie points estimated and outliers excluded."""
-    now = solve(problem, now, HUBER, ROUGHLY)
-    problem = with_noise(problem, now)
-    for number in range(OUTLIER_ROUNDS):
-        now = solve(problem, now, CAUCHY if number == 0 else SQUARES, ROUGHLY)
-        before = problem.used
-        problem = with_noise(without_outliers(problem, now), now)
-        if number and (problem.used == before).all():
-            break
-    return problem, now
+# Noise and outliers
 
 
 def _final_solution(problem: Problem, now: Solution) -> tuple[Problem, Solution, Precision]:
@@ -120,7 +120,7 @@ def with_noise(problem: Problem, now: Solution, *, robust: bool = True) -> Probl
     r = r[np.isfinite(r).all(axis=1)]
     points = len(np.unique(problem.block.owner[rows]))
     share = max(1.0 - 3.0 * points / max(2.0 * len(r), 1.0), 0.05)
-    typical = MAD_TO_SIGMA * np.median(np.abs(r)) if robust else np.sqrt(np.mean(r * r))
+    typical = 1.4826 * np.median(np.abs(r)) if robust else np.sqrt(np.mean(r * r))
     sigma_px = max(typical / np.sqrt(share), 1e-6)
     return problem.weighted(np.where(rows, 1.0 / sigma_px, problem.given.weight))
 
@@ -137,17 +137,6 @@ def without_outliers(problem: Problem, now: Solution) -> Problem:
     left = np.bincount(owner, weight > 0.0, minlength=len(problem.block.xyz))
     weight[ties & (left[owner] < LEAST_VIEWS)] = 0.0
     return problem.weighted(weight)
-
-
-def _with_lens(problem: Problem, now: Solution, lens: tuple[str, ...]) -> tuple[Problem, Solution]:
-    """Return the problem with other lens parameters, and its outliers chosen again."""
-    weight, ties = problem.given.weight, problem.of_ties
-    wide, start = prepare(problem.block, replace(problem.unknowns, lens=lens))
-    start = replace(start, state=start.state._replace(xyz=now.state.xyz))
-    now = solve(wide.weighted(weight), start, close=ROUGHLY)
-    is_counted = ties & np.isfinite(problem.block.sigma_px)
-    weight = np.where(is_counted, weight[ties].max(initial=0.0), weight)
-    return without_outliers(wide.weighted(weight), now), now
 
 
 # Which lens parameters are free

@@ -213,7 +213,13 @@ def normal_equations(state: State, given: Given, rule: Rule) -> Equations:
     """Return the reduced normal equations at a state."""
     size = 6 * len(state.centres) + given.shared
     if size > DENSE_UP_TO and not len(given.tests):
-        return _sparse_equations(state, given, rule)
+        total: Any = 0
+        right, diagonal = np.zeros((2, size))
+        for some in sparse_rows_of(state, given, rule):
+            total = some.product(some.others) + total
+            right += some.others.T @ some.left_over()
+            diagonal += some.others.power(2).sum(axis=0)
+        return Equations(total, right, diagonal)
     parts = min(max(PARTS_BYTES // (8 * size * size), 1), PARTS)
     sums = [Equations(np.zeros((size, size)), np.zeros(size), np.zeros(size)) for _ in range(parts)]
     in_parts(_sum_up, state, given, rule, sums=sums)
@@ -407,13 +413,3 @@ def sparse_rows_of(state: State, given: Given, rule: Rule) -> Iterator[SparseRow
         points = sparse_matrix(rows.columns[:, :, POINT:SHARED], of_points, 3 * len(numbers))
         inverse = bsr_array((rows.inverse, numbers, np.arange(len(numbers) + 1))).tocsr()
         yield SparseRows(rows, others, points, inverse, inverse @ (points.T @ others))
-
-
-def _sparse_equations(state: State, given: Given, rule: Rule) -> Equations:
-    matrix: Any = 0
-    right, diagonal = np.zeros((2, 6 * len(state.centres) + given.shared))
-    for part in sparse_rows_of(state, given, rule):
-        matrix = part.product(part.others) + matrix
-        right += part.others.T @ part.left_over()
-        diagonal += part.others.power(2).sum(axis=0)
-    return Equations(matrix, right, diagonal)

@@ -107,14 +107,15 @@ def usable_codes(lens: Lens, names: tuple[str, ...]) -> tuple[int, ...]:
 
 def default_lens(lenses: tuple[Lens, ...]) -> tuple[str, ...]:
     """Return the lens parameters that are free by default: those that the lenses have."""
-
-    def is_used(name: str) -> bool:
-        """Return whether a lens has this term."""
-        code = CODES[name]
-        return any(usable_codes(lens, (name,)) and lens_parameter(lens, code) for lens in lenses)
-
     more = ("b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
-    return ("f", "cx", "cy", *filter(is_used, more))
+    used = [
+        name
+        for name in more
+        if any(
+            lens_parameter(lens, code) for lens in lenses for code in usable_codes(lens, (name,))
+        )
+    ]
+    return ("f", "cx", "cy", *used)
 
 
 def lens_parameter(lens: Lens, code: int) -> float:

@@ -41,9 +41,8 @@ from pcfix.model import (
     WaterRaster,
     WaterSurface,
 )
-from pcfix.port.light import window_of
-from pcfix.port.shapes import DomePort, FlatPort, Port
-from pcfix.water.surface import build_field, build_tin
+from pcfix.port.housing import DomePort, FlatPort, Port, window_of
+from pcfix.water.surface import build_fields, build_tin
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -145,7 +144,7 @@ def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
         lens_row=row.astype(np.int64),
         group=group,
         tin=build_tin(water) if isinstance(water, WaterMesh) else None,
-        field=build_field(water) if isinstance(water, WaterRaster) else None,
+        field=build_fields({}, 1, water) if isinstance(water, WaterRaster) else None,
         origin=origin,
         curved=bool(unknowns.surface.get("shape")),
         first_lens=first_lens,
@@ -308,25 +307,15 @@ def prior_rows(problem: Problem, found: Solution) -> tuple[csc_array, FloatArray
     start = block.cameras.centres - problem.origin
     d = start - start.mean(axis=0)
     by = similarity_gradients(d) / np.array([1.0] * 3 + [np.sqrt((d * d).sum() / k)] * 4)
-    by = by[:, :, _undetermined_motions(problem)] / k / NETWORK_SIGMA_M
+    # water whose level or tilt is fixed determines height or tilt of the block
+    known, surface = np.zeros(7, np.bool_), problem.unknowns.surface
+    if given.wet.any() and (block.refractive_index != 1.0 or surface.get("index", 0.0) > 0.0):
+        known[2], known[3:5] = surface.get("level") != np.inf, surface.get("tilt") != np.inf
+    by = by[:, :, ~known] / k / NETWORK_SIGMA_M
     held = np.zeros((by.shape[2], size))
     held[:, : 6 * k].reshape(-1, k, 6)[:, :, 3:] = by.transpose(2, 0, 1)
     moved = np.einsum("kja,kj->a", by, found.state.centres - start)
     return sparse.vstack([rows, sparse.csc_array(held)], format="csc"), np.append(left, -moved)
-
-
-def _undetermined_motions(problem: Problem) -> list[int]:
-    """Return which of shift, turn and scale the images do not determine.
-
-    A water surface whose level or tilt is not free determines height or tilt of the block.
-    """
-    sigma = problem.unknowns.surface
-    refracts = problem.block.refractive_index != 1.0 or sigma.get("index", 0.0) > 0.0
-    if not (refracts and problem.given.wet.any()):
-        return list(range(7))
-    level = [2] if sigma.get("level") == np.inf else []
-    tilt = [3, 4] if sigma.get("tilt") == np.inf else []
-    return [0, 1, *level, *tilt, 5, 6]
 
 
 def cost_at(problem: Problem, found: Solution, loss: int) -> float:

@@ -23,7 +23,7 @@ from pcfix.adjust.problem import (
 )
 from pcfix.errors import PcfixWarning, plain
 from pcfix.model import BoolArray, Cameras, FloatArray, WaterSurface
-from pcfix.port.shapes import Port
+from pcfix.port.housing import Port
 from pcfix.water.surface import surface_above
 
 Source = Literal["tie points", "cloud"]
@@ -165,6 +165,10 @@ def adjustment_dict(adjusted: Adjusted) -> Plain:
     """Return the content of adjustment.json; pcfix/cli/README.md lists its keys."""
     a, block, u = adjusted, adjusted.block, adjusted.unknowns
     observed, lenses, before_px = a.is_observed, block.cameras.lenses or (), residuals_before(a)
+    # by how much the poses changed
+    far = np.linalg.norm(a.cameras.centres - block.cameras.centres, axis=1)
+    before, after = np.asarray(block.cameras.rotations), np.asarray(a.cameras.rotations)
+    turned = np.asarray(Rotation.from_matrix(after @ before.transpose(0, 2, 1)).magnitude())
     found = {
         "source": a.source,
         "image_unit": lenses[0].unit,
@@ -195,7 +199,7 @@ def adjustment_dict(adjusted: Adjusted) -> Plain:
         "water": None if a.water is None else str(a.water),
         "port": None if a.port is None else str(a.port),
         "index": a.refractive_index,
-        "poses": _poses(a),
+        "poses": {"moved_rms_m": rms(far), "turned_rms_deg": rms(np.degrees(turned))},
         "precision": {
             "centre_mean_m": mean(a.precision.centre_sigma_m),
             "angle_mean_deg": mean(a.precision.angle_sigma_deg),
@@ -227,14 +231,6 @@ def _residuals(a: Adjusted, before_px: FloatArray, points: BoolArray) -> Plain:
         "rms_m": rms((r * (away / focal)[:, None]).ravel()),
         "sigma_xyz_m": None if sigma is None else rms(sigma[points]),
     }
-
-
-def _poses(a: Adjusted) -> Plain:
-    """Return by how much the poses changed."""
-    far = np.linalg.norm(a.cameras.centres - a.block.cameras.centres, axis=1)
-    before, after = np.asarray(a.block.cameras.rotations), np.asarray(a.cameras.rotations)
-    turned = Rotation.from_matrix(after @ before.transpose(0, 2, 1)).magnitude()
-    return {"moved_rms_m": rms(far), "turned_rms_deg": rms(np.degrees(np.asarray(turned)))}
 
 
 def _gnss(a: Adjusted) -> Plain | None:

@@ -21,7 +21,7 @@ from pcfix.adjust.problem import Problem, Solution, cost_at, port_of, prior_rows
 from pcfix.errors import GeometryError, PcfixError
 from pcfix.lens.formulas import lens_table
 from pcfix.model import FloatArray, Lens
-from pcfix.port.light import window_of
+from pcfix.port.housing import window_of
 from pcfix.running import current
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8

@@ -20,7 +20,7 @@ import numpy as np
 
 from pcfix.adjust.block import some_cameras
 from pcfix.errors import GeometryError
-from pcfix.kernels import Span, device, in_tiles, kernel, most_between
+from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot, minus, plus, plus_square, row_of, scaled, solved, times, vector
 from pcfix.lens.imaging import image_and_slopes, image_of
 from pcfix.model import BoolArray, Cameras, Correction, FloatArray, IntArray, Outcome, Views
@@ -72,7 +72,7 @@ def _transfer(
     span: Span, xyz: FloatArray, start: IntArray, camera: IntArray, original_centres: FloatArray,
     original: Optics, centres: FloatArray, adjusted: Optics, shift: FloatArray, moved: BoolArray,
 ) -> None:  # fmt: skip
-    most = most_between(span, start)
+    most = np.diff(start[span[0] : span[1] + 1]).max()
     image, who = np.empty((most, 2)), np.empty(most, np.int64)
     for i in range(*span):
         # where the original cameras image the point, by straight rays

@@ -53,7 +53,7 @@ from pcfix.model import (
 )
 from pcfix.options.correct import AdjustOptions
 from pcfix.options.declare import File, taken
-from pcfix.port.shapes import DomePort, FlatPort, Port
+from pcfix.port.housing import DomePort, FlatPort, Port
 from pcfix.refract.choice import views_in_frame
 from pcfix.report.adjustment import adjustment_page
 from pcfix.running import running, threads

@@ -19,7 +19,7 @@ from pcfix.io.clouds import check_same_crs, read_reference
 from pcfix.io.crs import shortened
 from pcfix.io.files import check_input
 from pcfix.io.ground_control import read_gnss
-from pcfix.lens.frames import count_visible_cameras
+from pcfix.lens.imaging import count_visible_cameras
 from pcfix.model import Cameras, FloatArray, TiePoints, WaterDimension
 from pcfix.options.correct import CamerasCheckOptions
 from pcfix.options.declare import File, taken

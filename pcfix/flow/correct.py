@@ -34,7 +34,7 @@ from pcfix.io.las import columns
 from pcfix.io.las.source import LasSource
 from pcfix.io.las.writing import output_header
 from pcfix.io.rasters import is_raster
-from pcfix.lens.frames import count_visible_cameras
+from pcfix.lens.imaging import count_visible_cameras
 from pcfix.model import (
     BATHYMETRIC_POINT,
     Cameras,

@@ -31,7 +31,7 @@ from pcfix.model import NO_CAMERAS, Cameras, FloatArray, IntArray, TiePoints, Vi
 from pcfix.options.declare import File, OptionSet, options_of
 from pcfix.options.shared import InputOptions, LandRules, MaskOption
 from pcfix.points.labelling import Labelling, WaterMask
-from pcfix.port.shapes import port_of
+from pcfix.port.housing import port_of
 from pcfix.water.surface import FoundSurface
 
 if TYPE_CHECKING:

@@ -19,8 +19,7 @@ from pcfix.flow.surfaces import Points
 from pcfix.io.cameras.georeference import adjusted_minus_gnss, frame_of, is_tied
 from pcfix.io.crs import heights_of
 from pcfix.io.photographs import read_altitudes
-from pcfix.lens.frames import count_visible_cameras
-from pcfix.lens.imaging import straight_images
+from pcfix.lens.imaging import count_visible_cameras, straight_images
 from pcfix.model import Cameras, FloatArray, TiePoints
 from pcfix.options.declare import File
 from pcfix.sums import Sums

@@ -251,16 +251,6 @@ def _series(c: FloatArray, at: int, count: int, r2: float) -> tuple[float, float
 
 
 @device
-def _radial(c: FloatArray, r2: float) -> tuple[float, float]:
-    """Return r' / r and its derivative by r^2."""
-    k = int(c[RADIALS])
-    above, slope = _series(c, TAIL, k, r2)
-    below, below_slope = _series(c, TAIL + k, int(c[DENOMINATORS]), r2)
-    g = above / below  # quotient rule
-    return g, (slope - g * below_slope) / below
-
-
-@device
 def _sideways(c: FloatArray, x: float, y: float) -> tuple[float, float, Jacobian]:
     """Return the tangential and thin prism terms, and their Jacobian."""
     p1, p2, p3, p4 = c[TANGENTIAL], c[TANGENTIAL + 1], c[TANGENTIAL + 2], c[TANGENTIAL + 3]
@@ -284,9 +274,12 @@ def distorted(c: FloatArray, x: float, y: float) -> tuple[float, float, Jacobian
 
     The place is NaN outside the disc where the formula is one to one.
     """
-    r2 = x * x + y * y
-    g, slope = _radial(c, r2)
-    twice = 2.0 * slope
+    # the radial terms: g = r' / r, and twice its derivative by r^2 (quotient rule)
+    r2, k = x * x + y * y, int(c[RADIALS])
+    above, slope = _series(c, TAIL, k, r2)
+    below, below_slope = _series(c, TAIL + k, int(c[DENOMINATORS]), r2)
+    g = above / below
+    twice = 2.0 * ((slope - g * below_slope) / below)
     xx, xy, yy = g + twice * x * x, twice * x * y, g + twice * y * y
     fx, fy = (g * x, g * y) if r2 <= c[DISC] * c[DISC] else (np.nan, np.nan)
     if c[IN_TURN] == 0.0:

@@ -1,17 +1,24 @@
-"""Project a direction in the camera frame to the image, and back.
+"""Project a direction in the camera frame to the image, and back; test what is in the frame.
 
 Projection, distortion and interior orientation are joined by the chain rule. NaN stands where a
 direction has no image, or a place in the image no direction.
+
+The frame of a central projection without distortion is a pyramid with its tip in the projection
+centre: a point is in the frame if it is on the inner side of its four planes. A distorted frame has
+curved sides, and the point has to be projected, except for tiles outside a pyramid around the
+frame, which is found by unprojecting the border of the image densely.
 """
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from pcfix.kernels import device, kernel
-from pcfix.lens.algebra import Vector, row_of, times, transposed_times, vector
+from pcfix.kernels import Span, device, in_tiles, kernel
+from pcfix.lens.algebra import Vector, dot, minus, row_of, scaled, times, transposed_times, vector
 from pcfix.lens.formulas import (
     B2,
     B3,
@@ -20,19 +27,23 @@ from pcfix.lens.formulas import (
     DISC,
     FOCAL_X,
     FOCAL_Y,
+    HEIGHT,
     INVERSE,
+    PLAIN,
     PRINCIPAL_X,
     PRINCIPAL_Y,
     TAIL,
     TANGENTIAL,
+    WIDTH,
     Gradients,
     angle,
     coefficients,
     distorted,
+    lens_table,
     plane_and_gradients,
     undistorted,
 )
-from pcfix.model import Cameras, FloatArray, IntArray, Lens
+from pcfix.model import Cameras, FloatArray, IntArray, Lens, Views
 
 
 def project(lens: Lens, directions: FloatArray) -> FloatArray:
@@ -199,3 +210,232 @@ def image_and_slopes(
     else:
         u, v, g = plain_image(plain, times(r, direction))
     return u, v, transposed_times(r, g[:3]), transposed_times(r, g[3:])
+
+
+# Frames
+
+
+@lru_cache(maxsize=8192)
+def frame_shape(lens: Lens) -> tuple[FloatArray, bool]:
+    """Return the pyramid of `Frames`, camera frame, and whether the frame is distorted."""
+    brown = (*lens.radial, *lens.denominator, *lens.tangential, *lens.thin_prism)
+    if lens.projection == "perspective" and not any(brown):  # straight lines stay straight
+        corners = unproject(lens, _border(lens, 1))
+        return np.cross(corners[:-1], corners[1:]), False
+    border = unproject(lens, _border(lens, BORDER))
+    if not (border[:, 2] > STEEPEST).all():
+        return np.zeros((4, 3)), True
+    flat = border[:, :2] / border[:, 2:]
+    # a curve deviates less from its points than the largest distance between neighbours
+    step = np.sqrt((np.diff(flat, axis=0) ** 2).sum(axis=1).max())
+    (left, top), (right, bottom) = flat.min(axis=0) - step, flat.max(axis=0) + step
+    return np.array([
+        (1.0, 0.0, -left), (-1.0, 0.0, right), (0.0, 1.0, -top), (0.0, -1.0, bottom),
+    ]), True  # fmt: skip
+
+
+BORDER = 400  # points along each side of a frame, which is nearly straight between neighbours
+
+STEEPEST = np.cos(np.radians(80.0))
+"""A pyramid with flatter sides would be too wide to exclude anything; that of zeros holds all."""
+
+
+def _border(lens: Lens, count: int) -> FloatArray:
+    """Return points around the image, `count` a side, the first one again at the end."""
+    w, h, way = lens.width, lens.height, np.linspace(0.0, 4.0, 4 * count + 1)  # in sides
+    x = np.interp(way, range(5), (0.0, w, w, 0.0, 0.0))
+    y = np.interp(way, range(5), (0.0, 0.0, h, h, 0.0))
+    return np.column_stack([x, y])
+
+
+NOT_DISTORTED = -1
+
+
+class Frames(NamedTuple):
+    """The frames of k cameras; directions are in the world frame."""
+
+    planes: FloatArray  # (k, 4, 3), inward normals of the pyramid that is, or encloses, the frame
+    row: IntArray  # (k,), lens of each camera; `NOT_DISTORTED` if the pyramid is the frame
+    lenses: FloatArray  # (l, ...), coefficients, one row per lens
+    rotations: FloatArray  # (k, 3, 3), world to camera
+
+
+def no_frames(k: int) -> Frames:
+    """Return frames of k cameras that hold every point: planes of zeros do."""
+    return Frames(
+        planes=np.zeros((k, 4, 3)),
+        row=np.full(k, NOT_DISTORTED),
+        lenses=np.zeros((1, 1)),
+        rotations=np.zeros((k, 3, 3)),
+    )
+
+
+def frames_of(cameras: Cameras) -> Frames:
+    """Return the frames of cameras.
+
+    Without lenses a frame is everything in front of the camera, without angles everything.
+    """
+    if cameras.rotations is None:
+        return no_frames(len(cameras))
+    rotations = np.ascontiguousarray(cameras.rotations, np.float64)
+    if cameras.lenses is None:
+        front = np.repeat(rotations[:, 2:3], 4, axis=1)
+        return no_frames(len(cameras))._replace(planes=front)
+    row, lenses = lens_table(cameras.lenses)
+    shapes = [frame_shape(lens) for lens in dict.fromkeys(cameras.lenses)]
+    # a camera's planes are those of its lens, turned into the world
+    planes, is_distorted = (np.array(one)[row] for one in zip(*shapes, strict=True))
+    return Frames(
+        planes=np.ascontiguousarray(planes @ rotations),
+        row=np.where(is_distorted, row, NOT_DISTORTED),
+        lenses=lenses,
+        rotations=rotations,
+    )
+
+
+MARGIN = 1.0
+"""A view list may name a camera whose frame misses the point by at most this times its longer side.
+
+An apparent point is some pixels from its image. Much farther outside the distortion is
+extrapolated, and the search of a true point may fail: of 40,000 points of simulated scenes 47 were
+up to 41 m off, all of them imaged more than eight lengths outside.
+"""
+
+
+def listed_frames_of(cameras: Cameras) -> Frames:
+    """Return the widened frames for points of a view list.
+
+    Those of cameras without lenses or angles hold everything: no method projects into them.
+    """
+    if cameras.rotations is None or cameras.lenses is None:
+        return no_frames(len(cameras))
+    return frames_of(narrower(cameras, -MARGIN))
+
+
+def narrower(cameras: Cameras, share: float) -> Cameras:
+    """Return cameras with frames narrower on each side by a share of their longer side."""
+    lenses = cameras.lenses or ()
+    narrow = {one: with_border(one, share * max(one.width, one.height)) for one in set(lenses)}
+    return replace(cameras, lenses=tuple(narrow[one] for one in lenses))
+
+
+def with_border(lens: Lens, border: float) -> Lens:
+    """Return a lens whose frame is narrower by a border on each side, in its unit."""
+    return replace(
+        lens,
+        width=lens.width - 2.0 * border,
+        height=lens.height - 2.0 * border,
+        principal_x=lens.principal_x - border,
+        principal_y=lens.principal_y - border,
+    )
+
+
+Pyramid: TypeAlias = tuple[Vector, Vector, Vector, Vector]
+
+
+@device
+def _pyramid(g: FloatArray) -> Pyramid:
+    """Return the planes of one camera, shape (4, 3), as numbers, which stay in registers."""
+    return row_of(g, 0), row_of(g, 1), row_of(g, 2), row_of(g, 3)
+
+
+@device
+def _in_pyramid(g: Pyramid, e: Vector) -> bool:
+    """Whether the point at C - e is on the inner side of all four planes."""
+    return (
+        (dot(g[0], e) <= 0.0)
+        & (dot(g[1], e) <= 0.0)
+        & (dot(g[2], e) <= 0.0)
+        & (dot(g[3], e) <= 0.0)
+    )
+
+
+@device
+def _images(lens: FloatArray, r: FloatArray, e: Vector) -> bool:
+    """Whether the point at C - e is in the frame of a lens with rotation r."""
+    u, v = image_of(lens, *scaled(-1.0, times(r, e)))
+    return (u >= 0.0) & (u <= lens[WIDTH]) & (v >= 0.0) & (v <= lens[HEIGHT])
+
+
+@device
+def holds(frames: Frames, c: int, e: Vector) -> bool:
+    """Whether the frame of camera c holds the point at C - e, distortion included."""
+    if not _in_pyramid(_pyramid(frames.planes[c]), e):
+        return False
+    row = frames.row[c]
+    return row == NOT_DISTORTED or _images(frames.lenses[row], frames.rotations[c], e)
+
+
+@device
+def mark(
+    marks: FloatArray, points: FloatArray, run: int, frames: Frames, c: int,
+    centre: FloatArray | Vector,
+) -> bool:  # fmt: skip
+    """Set to 1 the marks of points in the frame of camera c, to 0 those of others.
+
+    The points are runs of `run` x, y and z. It is `holds` for many of them; returns whether the
+    frame may hold any.
+    """
+    around, row = _pyramid(frames.planes[c]), frames.row[c]
+    if row == NOT_DISTORTED:
+        for j in range(marks.size):
+            e = centre[0] - points[j], centre[1] - points[run + j], centre[2] - points[2 * run + j]
+            marks[j] = 1.0 if _in_pyramid(around, e) else 0.0
+        return True
+    lens, r, count = frames.lenses[row], frames.rotations[c], 0
+    plain = plain_lens(lens)
+    # only one of the two loops runs; with the choice inside, the first would not be vectorised
+    for j in range(marks.size if lens[PLAIN] != 0.0 else 0):
+        ray = points[j] - centre[0], points[run + j] - centre[1], points[2 * run + j] - centre[2]
+        u, v, _ = plain_image(plain, times(r, ray))
+        inside = (u >= 0.0) & (u <= lens[WIDTH]) & (v >= 0.0) & (v <= lens[HEIGHT])
+        marks[j] = 1.0 if inside else 0.0
+        count += 1 if inside else 0
+    for j in range(marks.size if lens[PLAIN] == 0.0 else 0):
+        e = centre[0] - points[j], centre[1] - points[run + j], centre[2] - points[2 * run + j]
+        inside = _in_pyramid(around, e) and _images(lens, r, e)
+        marks[j] = 1.0 if inside else 0.0
+        count += 1 if inside else 0
+    return count > 0
+
+
+@device
+def may_hold(frames: Frames, c: int, centre: FloatArray, low: FloatArray, high: FloatArray) -> bool:
+    """Whether the frame of camera c may hold a point of an upright box; never wrongly False."""
+    for p in range(4):
+        # the corner of the box farthest inside this plane; if it is outside, all are
+        reach, inward = 0.0, row_of(frames.planes[c], p)
+        for axis in range(3):
+            corner = high[axis] if inward[axis] > 0.0 else low[axis]
+            reach += inward[axis] * (corner - centre[axis])
+        if reach < 0.0:
+            return False
+    return True
+
+
+def count_visible_cameras(
+    xyz: FloatArray, cameras: Cameras, views: Views | None = None
+) -> IntArray:
+    """Return how many cameras have each point, (n, 3), in their frame; occlusion is ignored.
+
+    Only those of the view lists count, if there are any, in frames as of `listed_frames_of`.
+    """
+    counts, none = np.zeros(len(xyz), np.int64), np.zeros(0, np.int64)
+    start = none if views is None else np.asarray(views.start, np.int64)
+    camera = none if views is None else np.asarray(views.camera, np.int64)
+    frames = frames_of(cameras) if views is None else listed_frames_of(cameras)
+    points = np.ascontiguousarray(xyz)
+    in_tiles(_count, len(xyz), points, start, camera, cameras.centres, frames, counts)
+    return counts
+
+
+@kernel
+def _count(
+    span: Span, xyz: FloatArray, start: IntArray, camera: IntArray, centres: FloatArray,
+    frames: Frames, counts: IntArray,
+) -> None:  # fmt: skip
+    for i in range(*span):
+        first, last = (start[i], start[i + 1]) if start.size else (0, len(centres))
+        for at in range(first, last):
+            c = camera[at] if start.size else at
+            counts[i] += holds(frames, c, minus(row_of(centres, c), row_of(xyz, i)))

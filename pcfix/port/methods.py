@@ -19,7 +19,7 @@ the image of the direction in which the light of Q comes through the port. Newto
 
     d g / d Q = sum_i J_i' L_i,    L_i = d x_i / d Q
 
-from `pcfix.port.light.through_port`. The covariance of Q is that of an adjustment of the images
+from `pcfix.port.housing.through_port`. The covariance of Q is that of an adjustment of the images
 through the port,
 
     Cov Q = H^-1 (sum_i L_i' Cov(x_i) L_i) H^-1,    H = sum_i L_i' L_i
@@ -57,11 +57,18 @@ from pcfix.lens.algebra import (
     vector,
 )
 from pcfix.lens.formulas import lens_table
-from pcfix.lens.frames import Frames, frames_of, holds, no_frames
-from pcfix.lens.imaging import image_and_gradients, image_and_slopes
+from pcfix.lens.imaging import (
+    Frames,
+    frames_of,
+    holds,
+    image_and_gradients,
+    image_and_slopes,
+    no_frames,
+)
 from pcfix.model import BoolArray, Cameras, FloatArray, IntArray, Views
 from pcfix.options.correct import ScienceOptions
-from pcfix.port.light import (
+from pcfix.port.housing import (
+    Port,
     Window,
     cosine_at_port,
     light_through,
@@ -69,7 +76,6 @@ from pcfix.port.light import (
     through_port,
     window_of,
 )
-from pcfix.port.shapes import Port
 from pcfix.refract.batch import (
     CORRECTED,
     NO_CAMERA,

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot, minus, row_of, scaled
-from pcfix.lens.frames import Frames, frames_of, holds, listed_frames_of, mark, narrower
+from pcfix.lens.imaging import Frames, frames_of, holds, listed_frames_of, mark, narrower
 from pcfix.model import (
     BoolArray,
     Cameras,
@@ -95,8 +95,8 @@ def chosen_views(batch: Batch, shift_m: FloatArray | None = None) -> Views:
     """Return the cameras whose rays each point gets, as a list.
 
     Those of the list of the batch, in its order and with its weights, that can have imaged the
-    point (`pcfix.lens.frames.MARGIN`); or, without a list, all whose frames contain the point. With
-    `shift_m`, shape (m, 3), the frames hold the image of the true point instead, which is the
+    point (`pcfix.lens.imaging.MARGIN`); or, without a list, all whose frames contain the point.
+    With `shift_m`, shape (m, 3), the frames hold the image of the true point instead, which is the
     apparent one plus the shift.
     """
     survey, views = batch.survey, batch.views

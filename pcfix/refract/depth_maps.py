@@ -33,7 +33,7 @@ import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import Vector, beyond, dot, minus, row_of, scaled
-from pcfix.lens.frames import holds, mark
+from pcfix.lens.imaging import holds, mark
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.refract import tiling
 from pcfix.refract.batch import (

@@ -24,7 +24,7 @@ import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot, minus, row_of, scaled, vector
-from pcfix.lens.frames import Frames, frames_of, mark, no_frames
+from pcfix.lens.imaging import Frames, frames_of, mark, no_frames
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.refract import tiling, uncertainty
 from pcfix.refract.batch import (

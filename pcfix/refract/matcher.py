@@ -23,8 +23,7 @@ import numpy as np
 
 from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot, minus, row_of
-from pcfix.lens.frames import Frames, frames_of, with_border
-from pcfix.lens.imaging import project
+from pcfix.lens.imaging import Frames, frames_of, project, with_border
 from pcfix.model import Cameras, FloatArray, IntArray, TiePoints
 
 MATCHED, AVERAGED, NEIGHBOURS = 5, 8, 12

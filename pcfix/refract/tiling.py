@@ -12,7 +12,7 @@ import numpy as np
 
 from pcfix.kernels import device
 from pcfix.lens.algebra import Nine, Vector, row_of
-from pcfix.lens.frames import Frames, may_hold
+from pcfix.lens.imaging import Frames, may_hold
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Batch, Chosen, normal_above
 

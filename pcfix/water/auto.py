@@ -66,15 +66,14 @@ def find_water(xyz: FloatArray, rgb: npt.NDArray[Any] | None = None) -> WaterPro
     error. The apparent points, shape (n, 3), are without noise; colours, shape (n, 3), are in any
     unit from zero up, and equal ones count as none.
     """
-    known = np.isfinite(xyz).all(axis=1)
-    if known.sum() < LEAST_POINTS:
+    if len(xyz) < LEAST_POINTS:
         raise GeometryError(
             "cloud.too_few_points",
-            f"{known.sum()} points are too few to find the water, {LEAST_POINTS} are needed."
+            f"{len(xyz)} points are too few to find the water, {LEAST_POINTS} are needed."
             f" {INSTEAD}",
-            points=int(known.sum()), least=LEAST_POINTS,
+            points=len(xyz), least=LEAST_POINTS,
         )  # fmt: skip
-    return _judged(_scanned(sample_cloud(xyz[known], None if rgb is None else rgb[known])))
+    return _judged(_scanned(sample_cloud(xyz, rgb)))
 
 
 DIFFERENT_M, DIFFERENT_SIGMAS = 0.5, 3.0
@@ -162,25 +161,6 @@ def _gains(scan: Scan, rng: np.random.Generator | None = None) -> FloatArray:
     return total
 
 
-def _refined(coarse: Scan) -> Scan:
-    """Return the sums near the best level, in fine steps; it is in the middle of their heights."""
-    near, reach = coarse, np.arange(-FINE_REACH_M, FINE_REACH_M + FINE_M / 2.0, FINE_M)
-    for _ in range(2):  # about the best of the coarse steps, then about that of the fine ones
-        best_m = float(near.heights_m[int(np.argmax(_gains(near)))])
-        near = _scan_at(near.samples, best_m + reach)
-    return near
-
-
-def _sigma_level(near: Scan) -> float:
-    """Return the standard error of the level by bootstrap."""
-    rng = np.random.default_rng(0)
-    heights = near.heights_m - near.heights_m[len(near.heights_m) // 2]
-    same = np.abs(heights) <= SAME_PLACE_M
-    draws = [_gains(near, rng)[same] for _ in range(DRAWS)]
-    levels = np.array([heights[same][int(np.argmax(draw))] for draw in draws])
-    return math.hypot(float(np.sqrt(np.mean(levels**2))), LEAST_SIGMA_M)
-
-
 LEAST_EACH = 3.0  # least gain of a cue that counts
 NEEDED = {
     ("slope", "red/green"): (12.0, 0.75),
@@ -196,8 +176,12 @@ LIFTS = 0.15, 0.75  # range of the change of slope by refraction, about 0.36, on
 
 def _judged(coarse: Scan) -> WaterProposal:
     """Return the best level; GeometryError ``water.not_found`` if its evidence is not enough."""
-    near, origin_m = _refined(coarse), float(coarse.samples.origin[2])
-    middle = len(near.heights_m) // 2
+    near, origin_m = coarse, float(coarse.samples.origin[2])
+    reach = np.arange(-FINE_REACH_M, FINE_REACH_M + FINE_M / 2.0, FINE_M)
+    for _ in range(2):  # about the best of the coarse steps, then about that of the fine ones
+        best_m = float(near.heights_m[int(np.argmax(_gains(near)))])
+        near = _scan_at(near.samples, best_m + reach)
+    middle = len(reach) // 2
     found_m = float(near.heights_m[middle])
     total, evidence, sentences, strong = 0.0, dict[str, float](), list[str](), list[str]()
     for sums in near.cues:
@@ -233,9 +217,14 @@ def _judged(coarse: Scan) -> WaterProposal:
                 f" {why}. {INSTEAD}",
                 reason=reason, evidence=evidence,
             )  # fmt: skip
+    # the standard error of the level by bootstrap
+    heights, rng = near.heights_m - found_m, np.random.default_rng(0)
+    same = np.abs(heights) <= SAME_PLACE_M
+    draws = [_gains(near, rng)[same] for _ in range(DRAWS)]
+    levels = np.array([heights[same][int(np.argmax(draw))] for draw in draws])
     return WaterProposal(
         surface=WaterPlane(found_m + origin_m),
-        sigma_level_m=_sigma_level(near),
+        sigma_level_m=math.hypot(float(np.sqrt(np.mean(levels**2))), LEAST_SIGMA_M),
         level_m=found_m + origin_m,
         confidence=float(min(1.0 - rival / total, 1.0 - math.exp(-total / (2.0 * least)))),
         evidence=evidence,

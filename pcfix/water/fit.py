@@ -162,13 +162,21 @@ class _Shore(NamedTuple):
 
 def _choose(shore: _Shore) -> tuple[Model, Regression, list[str]]:
     """Return the model with significant tilts only, its fit, and why."""
+    from scipy.special import fdtrc
+
     along, across = shore.along_m, shore.across_m
     if len(shore.z) <= _FEWEST_FOR_PLANE or along < _SAME_PLACE_M:
         few = f"{len(shore.z)} points are too few or too close together for a tilt"
         return "level", _regression(shore, "level"), [f"{few}: a level is fitted."]
     model: Model = "along" if across < LINE_RATIO * along else "plane"
     found = _regression(shore, model)
-    chance = _chance_of_tilt(shore, found)
+    # the p-value of the tilt, if the surface is level (Wald's test, F distribution); points without
+    # scatter have no covariance, which a micrometre of it makes invertible
+    rise, p = found.beta[1:], len(found.beta)
+    covariance = found.covariance[1:, 1:] + _NO_SCATTER_M**2 * np.eye(p - 1)
+    statistic = rise @ np.linalg.solve(covariance, rise) / len(rise)
+    spare = float(shore.worth[found.weight > 0.0].sum()) - p
+    chance = float(np.nan_to_num(fdtrc(p - 1, spare, statistic), nan=1.0))  # NaN: no redundancy
     if not chance < SIGNIFICANCE:
         note = f"The tilt of the points is not significant (p = {chance:.2f}): a level is fitted."
         return "level", _regression(shore, "level"), [note]
@@ -199,18 +207,6 @@ def _regression(shore: _Shore, model: Model) -> Regression:
             points=n, least=p,
         )  # fmt: skip
     return robust_regression(shore.design[:, :p], shore.z, shore.worth)
-
-
-def _chance_of_tilt(shore: _Shore, fit: Regression) -> float:
-    """Return the p-value of a tilt, if the surface is level (Wald's test, F distribution)."""
-    from scipy.stats import f
-
-    # points without scatter have no covariance, which a micrometre of it makes invertible
-    rise, p = fit.beta[1:], len(fit.beta)
-    covariance = fit.covariance[1:, 1:] + _NO_SCATTER_M**2 * np.eye(p - 1)
-    statistic = rise @ np.linalg.solve(covariance, rise) / len(rise)
-    spare = float(shore.worth[fit.weight > 0.0].sum()) - p
-    return float(np.nan_to_num(f.sf(statistic, p - 1, spare), nan=1.0))  # NaN: no redundancy
 
 
 TUKEY = 4.685061  # Tukey's constant for 95 % efficiency

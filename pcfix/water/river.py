@@ -41,12 +41,14 @@ class RiverFit(ShoreFit):
     """A water surface along a river, and its accuracy."""
 
     axis: FloatArray  # (a, 2), vertices of the line along the river, downstream
-    profile: Profile  # height along the axis
+    station_m: FloatArray  # (m,), evenly spaced along it, from the first point to the last
+    height_m: FloatArray  # (m,), of the water there
+    sigma_height_m: FloatArray  # (m,), standard errors of these heights
 
     def sigma_at(self, xy: FloatArray) -> FloatArray:
         """Return the standard error (m) of the height at places (m, 2)."""
         station = locate(self.axis, xy)[0]
-        return np.interp(station, self.profile.station_m, self.profile.sigma_height_m)
+        return np.interp(station, self.station_m, self.sigma_height_m)
 
 
 def fit_river(
@@ -60,9 +62,8 @@ def fit_river(
     of the nearest place on the axis, constant upstream of the first point and downstream of the
     last.
     """
-    points = np.asarray(xyz, np.float64)
-    known = usable_rows(points)
-    used = points[known]
+    known = usable_rows(xyz)
+    used = xyz[known]
     if len(known) < FEWEST or not np.ptp(used[:, :2], axis=0).any():
         raise GeometryError(
             "water.too_few_points",
@@ -79,37 +80,42 @@ def fit_river(
     order = np.lexsort((used[:, 2], station))
     known, station, z = known[order], station[order], used[order, 2]
     worth = np.ones(len(known)) if counts is None else np.asarray(counts, np.float64)[known]
-    profile = _fit_profile(station, z, worth)
-    upper_m, lower_m = profile.height_m[[0, -1]].tolist()
+    nodes, height, sigma_height, weight_of, sigma = _fit_profile(station, z, worth)
+    upper_m, lower_m = height[[0, -1]].tolist()
     note = (
         f"Beyond the outermost points the surface is constant: {upper_m:.2f} m upstream and"
         f" {lower_m:.2f} m downstream."
     )
-    residual, weight = np.full(len(points), np.nan), np.zeros(len(points))
-    residual[known], weight[known] = profile.residual_m, profile.weight
+    residual, weight = np.full(len(xyz), np.nan), np.zeros(len(xyz))
+    residual[known], weight[known] = z - np.interp(station, nodes, height), weight_of
     return RiverFit(
-        surface=_raster(axis, profile, bounds, name),
-        points=points,
+        surface=_raster(axis, nodes, height, bounds, name),
+        points=xyz,
         notes=(note,),
         residual_m=residual,
         weight=weight,
-        sigma_m=profile.sigma_m,
+        sigma_m=sigma,
         axis=axis,
-        profile=profile,
+        station_m=nodes,
+        height_m=height,
+        sigma_height_m=sigma_height,
         figures={
             "model": "river",
-            "length_m": float(np.ptp(profile.station_m)),
+            "length_m": float(np.ptp(nodes)),
             "width_m": width_m,
             "upper_level_m": upper_m,
             "drop_m": upper_m - lower_m,
-            "sigma_level_m": float(profile.sigma_height_m.mean()),
+            "sigma_level_m": float(sigma_height.mean()),
         },
     )
 
 
-def _raster(axis: FloatArray, profile: Profile, bounds: Bounds, name: str) -> WaterRaster:
+def _raster(
+    axis: FloatArray, nodes: FloatArray, height_m: FloatArray, bounds: Bounds, name: str
+) -> WaterRaster:
     """Return the surface over the bounds, whose corners are centres of cells.
 
+    It is constant beyond the ends of the nodes along the axis, shape (m,), which have the heights.
     Cross-sections would intersect on the inside of a bend; a raster does not fold.
     """
     left, bottom, right, top = bounds
@@ -117,12 +123,14 @@ def _raster(axis: FloatArray, profile: Profile, bounds: Bounds, name: str) -> Wa
         text = f"The bounds {bounds} of the water surface have no area. Check the cloud."
         raise GeometryError("cloud.no_extent", text, bounds=bounds)
     size = float(np.sqrt((right - left) * (top - bottom) / MOST_CELLS))
-    cell = max(size, float(profile.station_m[1] - profile.station_m[0]) / 2.0)
+    cell = max(size, float(nodes[1] - nodes[0]) / 2.0)
     columns, rows = (int(np.ceil(side / cell)) + 1 for side in (right - left, top - bottom))
     x, y = left + cell * np.arange(columns), bottom + cell * np.arange(rows)[::-1]
     xy = np.column_stack([np.tile(x, rows), np.repeat(y, columns)])
-    height = profile.height_at(locate(axis, xy)[0]).reshape(rows, columns)
-    return WaterRaster(height, left - cell / 2.0, y[0] + cell / 2.0, (cell, cell), name)
+    height = np.interp(locate(axis, xy)[0], nodes, height_m)
+    return WaterRaster(
+        height.reshape(rows, columns), left - cell / 2.0, y[0] + cell / 2.0, (cell, cell), name
+    )
 
 
 REACH = 2.0  # longest edge of the network, relative to the longest that keeps it connected
@@ -211,27 +219,17 @@ _TURNS, _CURVATURE_M, _HUBER_M = 12, 1e-3, 0.02
 _LEAST = 1e-12  # keeps the equations solvable without points
 
 
-@dataclass(frozen=True, eq=False)
-class Profile:
-    """Heights along a river."""
-
-    station_m: FloatArray  # (m,), evenly spaced, from the first point to the last
-    height_m: FloatArray  # (m,)
-    sigma_height_m: FloatArray  # (m,), standard errors
-    weight: FloatArray  # (n,), of the points, 0 to 1
-    residual_m: FloatArray  # (n,)
-    sigma_m: float  # standard deviation of one accepted point
-
-    def height_at(self, station_m: FloatArray) -> FloatArray:
-        """Return heights at stations, constant beyond the ends."""
-        return np.interp(station_m, self.station_m, self.height_m)
-
-
-def _fit_profile(station: FloatArray, z: FloatArray, worth: FloatArray) -> Profile:
+def _fit_profile(
+    station: FloatArray, z: FloatArray, worth: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
     """Fit the height of the water, shape (n,), which falls with the station, downstream.
 
     The stations are sorted. Each point is `worth` a number of independent observations; see
     `shared`. Cross-validation chooses the penalty.
+
+    Returns nodes along the river, evenly spaced from the first point to the last, heights there and
+    their standard errors, all (m,), the weights of the points, (n,), and the standard deviation of
+    one accepted point.
     """
     from scipy.linalg import solveh_banded
 
@@ -257,7 +255,7 @@ def _fit_profile(station: FloatArray, z: FloatArray, worth: FloatArray) -> Profi
     spare = accepted.sum() - float((weight * np.asarray(variance).ravel()).sum())
     sigma = float(np.sqrt((residual[accepted] ** 2).sum() / max(spare, 1.0)))
     sigma_height = sigma * np.sqrt(np.diag(inverse) * shared(weight, worth, 0.0))
-    return Profile(nodes, height, sigma_height, weight, residual, sigma)
+    return nodes, height, sigma_height, weight, sigma
 
 
 def _splines(station: FloatArray, nodes: FloatArray) -> Any:

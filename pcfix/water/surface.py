@@ -81,7 +81,7 @@ def surface_above(
         case WaterMesh() | WaterRaster():
             x, y = np.ascontiguousarray(xyz[:, :2].T)
             tin = build_tin(water) if isinstance(water, WaterMesh) else None
-            field = build_field(water) if isinstance(water, WaterRaster) else None
+            field = build_fields({}, 1, water) if isinstance(water, WaterRaster) else None
             height, slope = np.empty(x.size), np.empty((x.size, 2))
             in_tiles(_set_heights, x.size, tin, field, x, y, height, slope)
             return SurfaceAbove(height, slope)
@@ -110,12 +110,6 @@ def field_of(fields: Field | None, which: int) -> Field | None:
     if fields is None:
         return None
     return Field(fields.heights, fields.shape, fields.frame, which)
-
-
-@lru_cache(maxsize=4)
-def build_field(raster: WaterRaster) -> Field:
-    """Return a raster for the kernels."""
-    return build_fields({0: raster}, 1)
 
 
 def build_fields(
@@ -205,12 +199,7 @@ def build_tin(mesh: WaterMesh) -> Tin:
     slope = -normal[:, :2] / normal[:, 2:]
     a = xyz[:, 0, 2] - (slope * xyz[:, 0, :2]).sum(axis=1)
     corners = np.ascontiguousarray(xyz[:, :, :2])
-    grid = _index_cells(corners)
-    return Tin(float(origin[0]), float(origin[1]), *grid, corners, np.column_stack([a, slope]))
-
-
-def _index_cells(corners: FloatArray) -> tuple[float, int, int, IntArray, IntArray]:
-    """Return cell size, columns, rows, and the facets of each cell as starts and indices."""
+    # the grid of square cells, about one for each facet
     extent = corners.reshape(-1, 2).max(axis=0)
     cell = float(max(np.sqrt(extent.prod() / len(corners)), extent.max() / 4096, 1e-6))
     columns, rows = (np.floor(extent / cell).astype(int) + 1).tolist()
@@ -223,13 +212,10 @@ def _index_cells(corners: FloatArray) -> tuple[float, int, int, IntArray, IntArr
     code = (low[facet, 1] + within // width[facet]) * columns
     code += low[facet, 0] + within % width[facet]
     order = np.argsort(code, kind="stable")
-    return (
-        cell,
-        columns,
-        rows,
-        np.searchsorted(code[order], np.arange(rows * columns + 1)),
-        facet[order],
-    )
+    start = np.searchsorted(code[order], np.arange(rows * columns + 1))
+    x, y = origin.tolist()
+    planes = np.column_stack([a, slope])
+    return Tin(x, y, cell, columns, rows, start, facet[order], corners, planes)
 
 
 @device

@@ -19,8 +19,7 @@ from pcfix.adjust.parameters import CODES, PLANES, PORT, SHAPE, Unknowns, moved_
 from pcfix.adjust.problem import port_of, prepare
 from pcfix.lens.formulas import coefficients
 from pcfix.model import Cameras, Lens, TiePoints, Views, WaterPlane
-from pcfix.port.light import window_of
-from pcfix.port.shapes import DomePort, FlatPort
+from pcfix.port.housing import DomePort, FlatPort, window_of
 from tests.utils.compiled import compiled
 
 image_and_all_gradients = compiled(image_and_all_gradients)

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import pcfix
-from pcfix.lens.frames import NOT_DISTORTED, frames_of, holds
+from pcfix.lens.imaging import NOT_DISTORTED, frames_of, holds
 from pcfix.refract.intersect import TILE
 from tests.refract.test_kernels import same
 from tests.utils.beyond_frames import BEYOND_FRAMES

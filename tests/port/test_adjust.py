@@ -15,9 +15,8 @@ from pcfix.flow.adjust import adjust_cameras, correct_words
 from pcfix.io.cameras.colmap import write_colmap
 from pcfix.model import GnssPositions, TiePoints
 from pcfix.options.correct import AdjustOptions
-from pcfix.port.light import window_of
-from pcfix.port.shapes import DomePort, FlatPort
-from pcfix.port.shapes import port_of as port_of_text
+from pcfix.port.housing import DomePort, FlatPort, window_of
+from pcfix.port.housing import port_of as port_of_text
 from pcfix.report.adjustment import adjustment_text
 from pcfix.running import threads
 from tests.utils.adjust_files import EPSG, write_gnss

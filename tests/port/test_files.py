@@ -9,8 +9,8 @@ import pytest
 import pcfix
 from pcfix.errors import GeometryError, SettingError
 from pcfix.options.correct import ScienceOptions
+from pcfix.port.housing import FlatPort
 from pcfix.port.methods import correct_through_port
-from pcfix.port.shapes import FlatPort
 from pcfix.report.text import text_of
 from tests.utils.clouds import write_las
 from tests.utils.port_scenes import simulate_port

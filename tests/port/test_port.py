@@ -5,8 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from pcfix.port.light import cosine_at_port, ray_through, through_port, window_of
-from pcfix.port.shapes import DomePort, FlatPort, port_of
+from pcfix.port.housing import (
+    DomePort,
+    FlatPort,
+    cosine_at_port,
+    port_of,
+    ray_through,
+    through_port,
+    window_of,
+)
 from tests.utils.codes import refused
 from tests.utils.compiled import compiled
 from tests.utils.port_scenes import fermat_directions

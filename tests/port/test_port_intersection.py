@@ -9,9 +9,8 @@ from scipy.spatial.transform import Rotation
 from pcfix import Cameras
 from pcfix.model import Outcome
 from pcfix.options.correct import ScienceOptions
-from pcfix.port.light import ray_through, window_of
+from pcfix.port.housing import DomePort, FlatPort, ray_through, window_of
 from pcfix.port.methods import correct_through_port
-from pcfix.port.shapes import DomePort, FlatPort
 from tests.utils.codes import refused
 from tests.utils.compiled import compiled
 from tests.utils.port_scenes import images_of, simulate_port

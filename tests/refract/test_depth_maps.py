@@ -8,7 +8,7 @@ import pytest
 
 import pcfix
 from pcfix.io.views import ViewMatch, read_views
-from pcfix.lens.frames import frames_of
+from pcfix.lens.imaging import frames_of
 from pcfix.model import Outcome, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Batch, Learned, Survey

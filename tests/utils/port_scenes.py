@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from pcfix.model import Cameras, FloatArray, Lens, Views
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX
-from pcfix.port.shapes import DomePort, Port
+from pcfix.port.housing import DomePort, Port
 from pcfix.simulate.tracing import triangulate
 
 ORIGIN = np.array([512_000.0, 4_987_000.0, -12.0])
