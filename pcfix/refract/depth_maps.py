@@ -358,25 +358,27 @@ def _look_with_slopes(tile: MapTile, marks: FloatArray, given: MapInputs) -> Non
     The maps are those of the original model, in which lens and poses have changed the depths too.
     """
     bed, count = tile.room[_BED * TILE : _RAY * TILE], marks.shape[1]
-    if given.images.adjusted is not None:
-        for j in range(count):
-            tile.step[j] = min(RISE * bed[j], -LEAST_DEPTH_M)
-            bed[j] += tile.step[j]
+    if given.images.adjusted is None:
         _look(tile, marks, given)
-        for k in range(len(marks)):
-            for j in range(count):
-                tile.weights[k, j] = tile.shown[k, _DEPTH * TILE + j]
-        for j in range(count):
-            bed[j] -= tile.step[j]
+        return
+    # at another bed first; the weights of the points that are searched are not known yet, and hold
+    # the depths there meanwhile
+    for j in range(count):
+        tile.step[j] = min(RISE * bed[j], -LEAST_DEPTH_M)
+        bed[j] += tile.step[j]
     _look(tile, marks, given)
-    if given.images.adjusted is not None:
-        for k in range(len(marks)):
-            for j in range(count):
-                change = (tile.weights[k, j] - tile.shown[k, _DEPTH * TILE + j]) / tile.step[j]
-                usual, tile.weights[k, j] = tile.shown[k, _BY_HEIGHT * TILE + j], 0.0
-                # a larger difference comes from other images that agree best at the other bed
-                if abs(change / usual - 1.0) < STEEP:
-                    tile.shown[k, _BY_HEIGHT * TILE + j] = change
+    for j in range(count):
+        bed[j] -= tile.step[j]
+        for k in range(len(marks) if tile.going[j] else 0):
+            tile.weights[k, j] = tile.shown[k, _DEPTH * TILE + j]
+    _look(tile, marks, given)
+    for j in range(count):
+        for k in range(len(marks) if tile.going[j] else 0):
+            change = (tile.weights[k, j] - tile.shown[k, _DEPTH * TILE + j]) / tile.step[j]
+            usual, tile.weights[k, j] = tile.shown[k, _BY_HEIGHT * TILE + j], 0.0
+            # a larger difference comes from other images that agree best at the other bed
+            if abs(change / usual - 1.0) < STEEP:
+                tile.shown[k, _BY_HEIGHT * TILE + j] = change
 
 
 @device(forceinline=True)
