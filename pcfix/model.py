@@ -6,7 +6,7 @@ is OpenCV's: x right, y down, z forward; ``x_camera = R (x_world - C)``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
 from typing import Literal, TypeAlias
@@ -355,26 +355,6 @@ class GroundControl:
     crs: str | None = None  # None if the source does not say
     on: tuple[str, ...] = ()  # surface of each point, if any: ``water``, name of a plane, or empty
     on_sigma_m: FloatArray = field(default_factory=lambda: np.zeros(0))  # of the distance from it
-
-    @property
-    def surveyed(self) -> GroundControl:
-        """The points with coordinates."""
-        known = np.asarray(np.isfinite(self.xyz).all(axis=1))
-        rows_used, rows = known[self.point], np.flatnonzero(known)
-        return replace(
-            self,
-            names=tuple(self.names[i] for i in rows),
-            xyz=self.xyz[rows],
-            sigma_m=self.sigma_m[rows],
-            is_check=self.is_check[rows],
-            under_water=self.under_water[rows],
-            point=(np.cumsum(known) - 1)[self.point[rows_used]],
-            camera=self.camera[rows_used],
-            image_xy=self.image_xy[rows_used],
-            sigma_px=self.sigma_px[rows_used],
-            on=(),
-            on_sigma_m=np.zeros(0),
-        )
 
 
 class Outcome(IntEnum):

@@ -393,8 +393,10 @@ def _signs_of_surveys(
         return heights_from_cloud(xy, (seen.xyz for seen in view.chunks()), radius)
 
     if control is not None:
+        # points on surfaces may have no coordinates
+        known = np.isfinite(control.xyz).all(axis=1)
         level = surface_above(water, control.xyz).height_m
-        dry = control.xyz[~control.under_water & ~(control.xyz[:, 2] < level)]
+        dry = control.xyz[known & ~control.under_water & ~(control.xyz[:, 2] < level)]
         signs.append(land_sign(cloud_z(dry) - dry[:, 2], gsd))
         if deep := used_as_dry(control, water):
             words = f"control points {', '.join(deep)} are below the water: mark them under_water"

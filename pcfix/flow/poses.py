@@ -60,7 +60,7 @@ def diagnose_inputs(
     gcps: Any = None, reference: Any = None, in_passing: bool = False,
 ) -> Diagnosis:  # fmt: skip
     """Look for signs in a cloud, its cameras with their tie points, and surveys, if given."""
-    control = None if gcps is None else read_ground_control(gcps, cameras).surveyed
+    control = None if gcps is None else read_ground_control(gcps, cameras)
     return diagnosed(
         cameras, water, index, view, ties=inputs.tie_points(view.crs), control=control,
         gnss=_gnss_of(cameras, str(inputs.cameras)), reference=reference, in_passing=in_passing,

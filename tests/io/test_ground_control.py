@@ -240,10 +240,6 @@ def test_points_on_surfaces(tmp_path):
     assert (np.isnan(found.xyz).all(axis=1) == bare).all()
     assert (np.isinf(found.sigma_m).all(axis=1) == bare).all()
     assert not found.is_check.any()
-    surveyed = found.surveyed
-    assert surveyed.names == ("G1", "G2", "W2")
-    assert surveyed.point.tolist() == [0, 0, 1, 2]
-    np.testing.assert_array_equal(surveyed.image_xy, found.image_xy[[0, 1, 2, 5]])
 
 
 @pytest.mark.parametrize("head", ["name,x,y,z", "name,x,y,z,image,u"])
