@@ -1,4 +1,4 @@
-"""Poses of a correction: have they absorbed refraction, and what do their errors add to the bed.
+"""Poses of a correction: refraction that they absorbed, and the errors that they add to the bed.
 
 The errors of the bed are those of a sample that is corrected with each member of an adjustment. The
 images do not change: the cameras of each member intersect the images of the points again, whether

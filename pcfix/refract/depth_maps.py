@@ -75,7 +75,8 @@ SHALLOW, DEEP = 0.3, 3.5
 """Range of the bed of the surroundings, in heights of the first bed; outliers have it elsewhere."""
 
 RISE, STEEP = 0.1, 0.3
-"""Relative height of another bed, and the largest relative difference of the change on the way."""
+"""Distance to the other bed with which the change is computed, relative to the height of the bed;
+the largest relative difference from the estimated change."""
 
 LEAST_CHANGE, MOST_CHANGE = 0.35, 1.5
 """Range of the change of the apparent depth with that of the bed along a ray."""
@@ -353,16 +354,17 @@ def _look(tile: MapTile, weights: FloatArray, given: MapInputs) -> None:
 
 @device
 def _look_with_slopes(tile: MapTile, marks: FloatArray, given: MapInputs) -> None:
-    """Do as `_look`; of transferred points set how the depths change with the bed by differences.
+    """Do as `_look`, and for transferred points compute the change with the height by differences.
 
-    The maps are those of the original model, in which lens and poses have changed the depths too.
+    Their depth maps are those of the original model, whose lens and poses absorbed refraction. The
+    change that `_look` estimates holds for true poses only.
     """
     bed, count = tile.room[_BED * TILE : _RAY * TILE], marks.shape[1]
     if given.images.adjusted is None:
         _look(tile, marks, given)
         return
-    # at another bed first; the weights of the points that are searched are not known yet, and hold
-    # the depths there meanwhile
+    # First look at another bed. The weights of the points that are searched are set later, so that
+    # they can hold the depths of that bed until then.
     for j in range(count):
         tile.step[j] = min(RISE * bed[j], -LEAST_DEPTH_M)
         bed[j] += tile.step[j]
@@ -376,7 +378,7 @@ def _look_with_slopes(tile: MapTile, marks: FloatArray, given: MapInputs) -> Non
         for k in range(len(marks) if tile.going[j] else 0):
             change = (tile.weights[k, j] - tile.shown[k, _DEPTH * TILE + j]) / tile.step[j]
             usual, tile.weights[k, j] = tile.shown[k, _BY_HEIGHT * TILE + j], 0.0
-            # a larger difference comes from other images that agree best at the other bed
+            # where it differs by more, other partners agree best at the other bed
             if abs(change / usual - 1.0) < STEEP:
                 tile.shown[k, _BY_HEIGHT * TILE + j] = change
 

@@ -247,7 +247,7 @@ OBLIQUE_FREE, oblique_free = needs("rendered_c_free")
 @oblique_free
 @pytest.mark.nightly
 def test_fused_maps_without_list(tmp_path):
-    """The maps of the original model change otherwise with the bed than those of true poses."""
+    """In the original model depths change with the bed in another way than with true poses."""
     pcfix.correct_file(
         OBLIQUE_FREE / "cloud.las", tmp_path / "out.las", cameras=OBLIQUE / "colmap", water=0.37,
         adjusted_from=OBLIQUE_FREE / "sparse", method="consistent",

@@ -165,7 +165,7 @@ class Image(NamedTuple):
 
 
 def aligned_images(chunk: Document) -> tuple[list[Image], tuple[str, ...], bool]:
-    """Return the images of a chunk that are read, the names of all others, and `_places`'s flag.
+    """Return the images of a chunk that are read, the other names, and whether it has a transform.
 
     The others are not aligned, disabled (they took no part in the dense cloud), not of a central
     projection, or in a component without a transform. Keyframes of animations are no images.
