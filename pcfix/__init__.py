@@ -11,13 +11,13 @@ from importlib import import_module
 from pkgutil import get_data
 from typing import Any
 
+# The module of each public name.
 _HOME = {
     name.name: node.module
     for node in ast.parse(get_data("pcfix", "__init__.pyi") or b"").body
     if isinstance(node, ast.ImportFrom)
     for name in node.names
 }
-"""The module of each public name."""
 
 __all__ = sorted(_HOME)
 

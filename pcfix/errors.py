@@ -77,8 +77,8 @@ def warn(name: object, code: str, sentence: str, **values: Any) -> None:
     warnings.warn(PcfixWarning(code, f"{name}: {sentence}", **values), stacklevel=3)
 
 
+# A context in which no warning of pcfix is shown.
 silently = partial(warnings.catch_warnings, action="ignore", category=PcfixWarning)
-"""A context in which no warning of pcfix is shown."""
 
 
 def coded(code: str, notes: Iterable[object]) -> list[PcfixWarning]:

@@ -26,13 +26,12 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 _Value = TypeVar("_Value")
 _Result = TypeVar("_Result")
 
+# Files with kernels, and those whose constants are compiled into them.
 KERNEL_SOURCES = (
     "kernels.py", "model.py", "io/ply.py", "adjust/*.py", "lens/*.py", "port/*.py", "refract/*.py",
     "water/*.py",
 )  # fmt: skip
-"""Files with kernels, and those whose constants are compiled into them."""
-MOST_CACHES = 5
-"""Maximum number of folders of compiled kernels, of this and of older versions."""
+MOST_CACHES = 5  # maximum number of folders of compiled kernels, of this and of older versions
 
 
 @cache
@@ -111,14 +110,9 @@ def device(function: Any = None, *, allocates: bool = False, **options: Any) -> 
     return decorator if function is None else decorator(function)
 
 
-Span: TypeAlias = tuple[int, int]
-"""The first row of a tile, and the row after its last."""
-
-TILES_A_THREAD = 8
-"""Number of tiles for each thread, because some take longer than others."""
-
-THREAD_START_S = 2e-4
-"""Approximate time that a thread takes to start."""
+Span: TypeAlias = tuple[int, int]  # the first row of a tile, and the row after its last
+TILES_A_THREAD = 8  # number of tiles for each thread, because some take longer than others
+THREAD_START_S = 2e-4  # approximate time that a thread takes to start
 
 
 def in_tiles(run: Callable[..., Any], rows: int, *given: Any, points: int = 0) -> None:

@@ -20,8 +20,7 @@ FloatArray: TypeAlias = npt.NDArray[np.float64]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
-BATHYMETRIC_POINT = 40
-"""Classes of LAS 1.4 and its topo-bathy lidar domain profile; 40 is a point on the bed."""
+BATHYMETRIC_POINT = 40  # a point on the bed; classes of LAS 1.4 and its topo-bathy domain profile
 NOISE_CLASSES = LOW_NOISE, HIGH_NOISE = 7, 18
 
 Projection = Literal[
@@ -29,9 +28,9 @@ Projection = Literal[
 ]
 ViewKind = Literal["tracks", "depth-maps", "pairs"]
 
+# Width of the image of a lens in millimetres whose pixel size is unknown: that of a survey drone's
+# camera of 20 megapixels, 13.2 mm with pixels of 2.4 um.
 NOMINAL_WIDTH_PX = 5472.0
-"""Width of the image of a lens in millimetres whose pixel size is unknown: that of a survey drone's
-camera of 20 megapixels, 13.2 mm with pixels of 2.4 um."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,8 +195,8 @@ class Cameras:
         return len(self.labels)
 
 
+# The cameras of a correction without any; see `MethodOptions.check_no_cameras`.
 NO_CAMERAS = Cameras((), np.zeros((0, 3)))
-"""The cameras of a correction without any; see `MethodOptions.check_no_cameras`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -365,10 +364,8 @@ class Outcome(IntEnum):
     NO_CAMERA = 2
     ONE_CAMERA = 3
     PARALLEL_RAYS = 4
-    NOT_TRANSFERRED = 5
-    """It could not be transferred to the adjusted poses."""
-    FLAT_RAYS = 6
-    """Two images or more show it, but fewer than two rays are within the maximum angle."""
+    NOT_TRANSFERRED = 5  # it could not be transferred to the adjusted poses
+    FLAT_RAYS = 6  # two images or more show it, fewer than two with rays within the maximum angle
 
 
 @dataclass(frozen=True, eq=False)

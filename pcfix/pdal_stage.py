@@ -42,8 +42,7 @@ if TYPE_CHECKING:
     from pcfix.flow.runner import FileTask
     from pcfix.flow.surfaces import CloudView, Points
 
-Done: TypeAlias = tuple[Dimensions, dict[str, Any]]
-"""The arrays that a stage changes, and its summary."""
+Done: TypeAlias = tuple[Dimensions, dict[str, Any]]  # the changed arrays, and the summary
 
 COLOURS = ("Red", "Green", "Blue")
 
@@ -148,12 +147,12 @@ def _clean(options: CleanOptions, cloud: PdalCloud, task: FileTask) -> Done:
     return {"Classification": classes, **cloud.flags()}, summary
 
 
+# The function of each stage, and its options.
 STAGES: dict[str, tuple[Callable[..., Done], type[OptionSet]]] = {
     "correct": (_correct, CorrectOptions),
     "label": (_label, LabelOptions),
     "clean": (_clean, CleanOptions),
 }
-"""The function of each stage, and its options."""
 
 
 def _options(namespace: dict[str, Any], kind: type[OptionSet]) -> Any:

@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 Array: TypeAlias = npt.NDArray[Any]
+# Creates an array with undefined values: `numpy.empty`, or an array on disk.
 Empty: TypeAlias = Callable[[tuple[int, ...], npt.DTypeLike], Array]
-"""Creates an array with undefined values: `numpy.empty`, or an array on disk."""
 
 
 def _nothing(*given: object) -> None:
@@ -74,10 +74,8 @@ def threads(jobs: int | None) -> AbstractContextManager[None]:
 # Large arrays
 
 ROWS = 1_000_000
-FEW_ROWS = 65_536
-"""Rows of a block whose intermediate arrays fit into the processor's cache."""
-LARGE = 2_000_000
-"""An array with more rows is stored on disk, if there is a folder for it."""
+FEW_ROWS = 65_536  # rows of a block whose intermediate arrays fit into the processor's cache
+LARGE = 2_000_000  # an array with more rows is stored on disk, if there is a folder for it
 
 
 def empty(shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64) -> Array:

@@ -16,8 +16,8 @@ from pcfix.model import BoolArray, FloatArray, IntArray
 
 LEAST = {"join": np.minimum}
 MOST = {"join": np.maximum}
+# Metadata of fields that are joined by the minimum, by the maximum, or by taking either value.
 SAME = {"join": lambda one, other: one}
-"""Metadata of fields that are joined by the minimum, by the maximum, or by taking either value."""
 
 
 class Sums:
@@ -58,10 +58,8 @@ class Figures(SimpleNamespace):
 # the origin of the world frame. So the cell of a point depends neither on other points nor on
 # their order.
 
-MOST_CELLS = 2**24
-"""Maximum number of cells, for the memory; a larger cloud has larger cells."""
-POINTS_A_CELL = 4.0
-"""Minimum mean number of points per occupied cell."""
+MOST_CELLS = 2**24  # maximum number of cells, for the memory; a larger cloud has larger cells
+POINTS_A_CELL = 4.0  # minimum mean number of points per occupied cell
 
 Values = npt.NDArray[Any]
 

@@ -26,21 +26,13 @@ from pcfix.model import (
 from pcfix.port.housing import Port
 from pcfix.water.surface import surface_above
 
-WATER = "water"
-"""The name of the water among the surfaces of control points."""
+WATER = "water"  # the name of the water among the surfaces of control points
 
 LEAST_VIEWS = 2
-LEAST_POINTS_IN_IMAGE = 4
-"""A pose has up to four solutions with three points."""
-
-LEAST_ANGLE_DEG = 2.0
-"""Between the rays of a tie point; the depth of points with smaller angles is hardly determined."""
-
-LEAST_DETERMINANT = 1e-5
-"""Of the normal matrix of unit rays: two at a third of a degree."""
-
-TIE_POINTS = 150_000
-"""At most; more reduce only the noise, which is no longer the largest error then."""
+LEAST_POINTS_IN_IMAGE = 4  # a pose has up to four solutions with three points
+LEAST_ANGLE_DEG = 2.0  # between the rays of a tie point; smaller ones hardly determine its depth
+LEAST_DETERMINANT = 1e-5  # of the normal matrix of unit rays: two at a third of a degree
+TIE_POINTS = 150_000  # at most; more reduce only the noise, then no longer the largest error
 
 
 NO_CONTROL = GroundControl(

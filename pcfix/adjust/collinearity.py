@@ -84,10 +84,10 @@ class Given(NamedTuple):
 
 
 POINT, SURFACE, SHARED = 6, 9, 9
+# Columns of the derivatives of an image: omega and C, Q from `POINT` on, and from `SURFACE` on
+# those of `pcfix.adjust.parameters.WATER_NAMES`. In a row of the equations the shared unknowns
+# follow instead, from `SHARED` on.
 WIDTH = SURFACE + PLANES
-"""Columns of the derivatives of an image: omega and C, Q from `POINT` on, and from `SURFACE` on
-those of `pcfix.adjust.parameters.WATER_NAMES`. In a row of the equations the shared unknowns follow
-instead, from `SHARED` on."""
 
 
 class Workspace(NamedTuple):
@@ -124,8 +124,7 @@ def workspace(given: Given) -> Workspace:
 # The water
 
 
-STEPS, CLOSE_M = 30, 1e-12
-"""Iterations for the piercing point; each leaves curvature times depth of the last error."""
+STEPS, CLOSE_M = 30, 1e-12  # for the piercing point; each leaves curvature x depth of the error
 
 
 @device
@@ -164,9 +163,9 @@ def _set_plane(work: Workspace, water: FloatArray, given: Given, q: Vector, cent
     return True
 
 
+# Steps of Q, C and a in metres, of b, c and n, and of d, e and f in 1/m: the piercing point is
+# known to 1e-12 m, so derivatives are good to 1e-7.
 DIFFERENCES = (1e-4,) * 7 + (1e-5,) * 3 + (1e-6,) * 3
-"""Steps of Q, C and a in metres, of b, c and n, and of d, e and f in 1/m: the piercing point is
-known to 1e-12 m, so derivatives are good to 1e-7."""
 
 
 @device

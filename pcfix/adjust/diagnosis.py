@@ -43,42 +43,34 @@ from pcfix.water.surface import is_submerged, surface_above
 if TYPE_CHECKING:  # not quick to load
     from pcfix.adjust.from_cloud import Undone
 
+# The signs in the order in which they decide.
 ORDER = (
     *("tie points", "GNSS positions", "measured depths"),
     *("heights of land", "neighbouring points"),
 )
-"""The signs in the order in which they decide."""
 
-LEAST_POINTS, LEAST_PLACES = 30, 3
-"""Tie points under water, and places of a survey, that are needed."""
-PARTS = 5
-"""Of the area, along x and along y, for the jackknife."""
-OUTLIERS = 0.05
-"""Share of the tie points that is excluded, those with the worst residuals."""
+LEAST_POINTS, LEAST_PLACES = 30, 3  # tie points under water, and places of a survey, at least
+PARTS = 5  # of the area, along x and along y, for the jackknife
+OUTLIERS = 0.05  # share of the tie points that is excluded, those with the worst residuals
+# Share of the refraction absorbed from which poses count as wrong, the largest plausible one, and
+# the largest useful standard error. On simulated blocks with 0.5 px and 3 cm it is within 0.1 of 0
+# with true poses, and 0.54 to 1.1 after an ordinary adjustment, smaller with more weight of the
+# GNSS; see tests/adjust/test_diagnosis.py.
 SHARE, MOST_SHARE, MOST_SIGMA = 0.4, 2.0, 0.15
-"""Share of the refraction absorbed from which poses count as wrong, the largest plausible one, and
-the largest useful standard error. On simulated blocks with 0.5 px and 3 cm it is within 0.1 of 0
-with true poses, and 0.54 to 1.1 after an ordinary adjustment, smaller with more weight of the GNSS;
-see tests/adjust/test_diagnosis.py."""
-SIGMAS = 3.0
-"""Standard errors that are not chance."""
-LAND_GSD = 2.0
-"""Error of land against a survey that dense matching and smoothing leave."""
-LEAST_DEPTH_M, LAND_M = 1.0, 0.3
-"""Depth of a bed, and height above the water of land, that are compared with a survey."""
-MOST_STATED_M = 0.5
-"""A larger standard deviation of the GNSS is a default of the software, as Metashape's 10 m."""
+SIGMAS = 3.0  # standard errors that are not chance
+LAND_GSD = 2.0  # error of land against a survey that dense matching and smoothing leave
+LEAST_DEPTH_M, LAND_M = 1.0, 0.3  # depth of bed and height of land that are compared with a survey
+MOST_STATED_M = 0.5  # a larger standard deviation of GNSS is a default, as Metashape's 10 m
 
 TIE_POINTS, LEAST_TIE_VIEWS = 3000, 3
 CLOUD_POINTS, POINTS_PER_IMAGE, SURVEYED_POINTS = 1500, 10, 50_000
-LEAST_COORDINATES = 24
-"""Of GNSS positions."""
+LEAST_COORDINATES = 24  # of GNSS positions
+# For which the pattern of absorbed refraction is computed, and when it must be quick; the cost
+# grows with their cube, and is a second for the latter.
 MOST_IMAGES, QUICK_IMAGES = 600, 200
-"""For which the pattern of absorbed refraction is computed, and when it must be quick; the cost
-grows with their cube, and is a second for the latter."""
 
+# What to do if a camera file has neither tie points nor GNSS positions.
 EXPORT = "export tie points, or run 'pcfix cameras FILE --gnss GNSS.csv'"
-"""What to do if a camera file has neither tie points nor GNSS positions."""
 
 
 @dataclass(frozen=True)

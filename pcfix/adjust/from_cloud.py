@@ -44,17 +44,12 @@ from pcfix.model import Cameras, FloatArray, GnssPositions, IntArray, WaterSurfa
 from pcfix.refract.choice import views_in_frame
 from pcfix.water.surface import is_submerged, surface_above
 
+# Standard deviations of points of the cloud as tie points, tried in this order.
 SIGMAS_PX = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 3.0, 5.0, 10.0)
-"""Standard deviations of points of the cloud as tie points, tried in this order."""
 
-POOR_PX = 5.0
-"""Of `SIGMAS_PX`, from which bed and focal length may be less accurate than stated."""
-
-FITS = 1.15
-"""Mean squared residual of GNSS and control points, in variances, with which they fit."""
-
-SURE = 1e-3
-"""Probability that further lens parameters lower the misfit as much by chance."""
+POOR_PX = 5.0  # of `SIGMAS_PX`, from which bed and focal length may be less accurate than stated
+FITS = 1.15  # mean squared residual of GNSS and control points, in variances, with which they fit
+SURE = 1e-3  # probability that further lens parameters lower the misfit as much by chance
 
 MAX_STEPS = 25
 CLOSE_M = 1e-7
@@ -222,10 +217,8 @@ def _unsolved(why: str) -> GeometryError:
 # What absorbed refraction has done to a block
 
 
-SIGMA_PX = 0.25
-"""Of an image; small, so that the centres only hold the block in place."""
-OWN_SIGMA_M = 1.0
-"""Of a projection centre, which holds the block where it is."""
+SIGMA_PX = 0.25  # of an image; small, so that the centres only hold the block in place
+OWN_SIGMA_M = 1.0  # of a projection centre, which holds the block where it is
 LEAST_IMAGES_OF_POINT, LEAST_POINTS, LEAST_IMAGES = 3, 10, 5
 
 

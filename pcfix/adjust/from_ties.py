@@ -27,14 +27,9 @@ from pcfix.adjust.solve import reduced_at, solve, solver
 from pcfix.errors import GeometryError, PcfixWarning
 from pcfix.model import FloatArray
 
-ROUGHLY = 1e-4
-"""Relative gain of a step that ends the first, robust rounds."""
-
-OUTLIER_SIGMAS = 4.0
-"""Longer residuals are outliers: three good ones in 10,000."""
-
-LEAST_SHARE = 0.5
-"""Share of the observations that must be in front of their cameras, and no outliers."""
+ROUGHLY = 1e-4  # relative gain of a step that ends the first, robust rounds
+OUTLIER_SIGMAS = 4.0  # longer residuals are outliers: three good ones in 10,000
+LEAST_SHARE = 0.5  # share of the observations that must be in front of their cameras and good
 
 OUTLIER_ROUNDS = 3
 
@@ -142,19 +137,17 @@ def without_outliers(problem: Problem, now: Solution) -> Problem:
 # Which lens parameters are free
 
 
-SURE = 1e-3
-"""Probability that a further lens parameter lowers the squares as much by chance."""
+SURE = 1e-3  # probability that a further lens parameter lowers the squares as much by chance
 
+# Standard error of the image at the corner of the frame above which a lens parameter is fixed, if
+# the residuals permit; the focal length is always free.
 WEAK_PX = 2.0
-"""Standard error of the image at the corner of the frame above which a lens parameter is fixed, if
-the residuals permit; the focal length is always free."""
 
+# Probability that weak parameters move as far by chance. An adjustment without water changes them
+# too: fixing them there deforms the block instead, which no standard error shows.
 CHANGED = 0.05
-"""Probability that weak parameters move as far by chance. An adjustment without water changes
-them too: fixing them there deforms the block instead, which no standard error shows."""
 
-TRIED = ("b1", "k1", "k2", "k3", "p1", "p2")
-"""Terms that a lens may lack. Sensors have no skew b2, nor do COLMAP's lenses."""
+TRIED = ("b1", "k1", "k2", "k3", "p1", "p2")  # a lens may lack them; no sensor has skew b2
 
 
 def weak_lens_parameters(problem: Problem, found: Solution, precision: Precision) -> list[str]:

@@ -27,36 +27,28 @@ from pcfix.model import Cameras, FloatArray, GnssPositions, GroundControl
 from pcfix.water.surface import surface_above
 
 LEAST_GNSS_SIGMA_M = 0.02
+# Mean offset between GNSS and projection centres that indicates another datum, if it exceeds both.
 MOST_OFFSET_M, MOST_OFFSET_SIGMAS = 1.0, 10.0
-"""Mean offset between GNSS and projection centres that indicates another datum, if it exceeds
-both."""
 
-GROSS_SIGMAS, GROSS_PX = 20.0, 10.0
-"""A control point with larger errors than both is a mistake, not noise."""
-
-MOST_OFFSET = 0.1
-"""Share of the flying height; no absorbed refraction puts control points that far off."""
+GROSS_SIGMAS, GROSS_PX = 20.0, 10.0  # larger errors of a control point are a mistake, not noise
+MOST_OFFSET = 0.1  # share of the flying height; absorbed refraction moves no control point so far
 
 _REMEDY = (
     "Check its name, coordinates and marks (swapped names?). A point with the role check has no"
     " weight."
 )
 
-SMALL_WATER = 10
-"""Tie points on one side of the surface that are needed for it to count as observed."""
+SMALL_WATER = 10  # tie points on one side of the surface that make it count as observed
+BED_GSD = 1.5  # standard error of the heights of the bed, in ground pixels, that is worth a warning
 
-BED_GSD = 1.5
-"""Standard error of the heights of the bed, in ground pixels, that is worth a warning."""
-
+# Standard errors beyond which an unknown counts as undetermined; 1e-4 / m is 2 cm at 14 m.
 LIMITS = {
     "level": 0.02, "tilt_x": 0.0005, "tilt_y": 0.0005, "index": 0.005,
     "distance": 0.002, "centre_x": 0.002, "centre_y": 0.002, "centre_z": 0.002,
     "shape_xx": 1e-4, "shape_xy": 1e-4, "shape_yy": 1e-4,
 }  # fmt: skip
-"""Standard errors beyond which an unknown counts as undetermined; 1e-4 / m is 2 cm at 14 m."""
 
-STRONG = 0.95
-"""Correlation of two unknowns that are hardly separated."""
+STRONG = 0.95  # correlation of two unknowns that are hardly separated
 
 
 def adjust_block(

@@ -40,17 +40,13 @@ from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.lens.algebra import dot, inverted, row_of, times, transposed_times, vector
 from pcfix.model import BoolArray, FloatArray, IntArray
 
-PARTS, PARTS_BYTES = 8, 100_000_000
-"""Parts in which points are summed, and the size of the matrices of all parts."""
-DENSE_UP_TO = 6000
-"""Unknowns up to which a full matrix is faster than a sparse one, and small (288 MB)."""
+PARTS, PARTS_BYTES = 8, 100_000_000  # parts in which points are summed, bytes of their matrices
+DENSE_UP_TO = 6000  # unknowns up to which a full matrix (288 MB) is faster than a sparse one
 POINTS_AT_ONCE = 5000
-LOST = 1e6
-"""Cost of an observation whose point has left its image, as a weighted square."""
+LOST = 1e6  # cost of an observation whose point has left its image, as a weighted square
 
 SQUARES, HUBER, CAUCHY = range(3)
-LOSS_SCALE = 2.0
-"""Where a robust loss departs from least squares, in standard deviations."""
+LOSS_SCALE = 2.0  # where a robust loss departs from least squares, in standard deviations
 
 
 class Rule(NamedTuple):
@@ -62,9 +58,9 @@ class Rule(NamedTuple):
 
 
 UNDAMPED = Rule()
+# Determinant of V over the product of its diagonal, below which a point does not count: its rays
+# meet at less than about 1e-5 rad, so that it has no finite covariance.
 SINGULAR = 1e-11
-"""Determinant of V over the product of its diagonal, below which a point does not count: its rays
-meet at less than about 1e-5 rad, so that it has no finite covariance."""
 
 
 def in_parts(

@@ -13,18 +13,18 @@ import numpy as np
 
 from pcfix.model import FloatArray, IntArray, Lens
 
+# Parameters of the refracting surface: of the water, then of a housing port.
+#
+# The water is z = a + b x + c y + d x^2 + e x y + f y^2 about the origin of the block; a mesh or
+# raster stays where it is.
 WATER_NAMES = (
     *("level", "tilt_x", "tilt_y", "index", "shape_xx", "shape_xy", "shape_yy"),
     *("distance", "centre_x", "centre_y", "centre_z"),
 )
-"""Parameters of the refracting surface: of the water, then of a housing port.
-
-The water is z = a + b x + c y + d x^2 + e x y + f y^2 about the origin of the block; a mesh or
-raster stays where it is.
-"""
+# Positions of the index, of d, e, f, of the port's parameters, and of planes of control points.
 INDEX, SHAPE, PORT, PLANES = 3, 4, 7, 11
-"""Positions of the index, of d, e, f, of the port's parameters, and of planes of control points."""
 
+# What a surveyor calls the shared unknowns.
 WORDS = {
     "f": "focal length", "cx": "principal point x", "cy": "principal point y", "b1": "affinity b1",
     "b2": "skew b2", "level": "water level", "tilt_x": "water tilt along x",
@@ -33,10 +33,9 @@ WORDS = {
     "centre_x": "dome centre x", "centre_y": "dome centre y", "centre_z": "dome centre z",
     **{one: f"distortion {one}" for one in ("p1", "p2", *(f"k{i}" for i in range(1, 9)))},
 }  # fmt: skip
-"""What a surveyor calls the shared unknowns."""
 
+# By the first word of a name.
 UNITS = {"level": " m", "tilt": " m/m", "shape": " /m", "distance": " m", "centre": " m"}
-"""By the first word of a name."""
 
 
 def words_of(name: str) -> tuple[str, str]:
@@ -74,15 +73,13 @@ def similarity_gradients(d: FloatArray) -> FloatArray:
 # Lens parameters
 
 
-FOCAL, CX, CY, B1, B2, P1, P2, K1 = range(8)
-"""Codes of the lens parameters; k1, k2, ... follow from `K1` on."""
+FOCAL, CX, CY, B1, B2, P1, P2, K1 = range(8)  # codes of lens parameters; k2, k3, ... follow `K1`
 
 NAMES = ("f", "cx", "cy", "b1", "b2", "p1", "p2", *(f"k{i}" for i in range(1, 9)))
 CODES = {name: code for code, name in enumerate(NAMES)}
 _FIELDS = ("focal", "principal_x", "principal_y", "b1", "b2")
 
-FEW_IMAGES = 5.0
-"""Images per lens, on average, below which the lenses of one sensor share their corrections."""
+FEW_IMAGES = 5.0  # images per lens below which the lenses of a sensor share their corrections
 
 
 def sensor_groups(lenses: tuple[Lens, ...]) -> IntArray:

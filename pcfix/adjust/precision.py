@@ -42,14 +42,12 @@ from pcfix.adjust.problem import Problem, Solution, polynomial
 from pcfix.adjust.solve import moved_by, reduced_at, singular, solver
 from pcfix.model import Cameras, FloatArray, IntArray, WaterPlane, WaterRaster, WaterSurface
 
-DENSE_UP_TO = 12_000
-"""Unknowns up to which the whole inverse is computed (1.2 GB)."""
+DENSE_UP_TO = 12_000  # unknowns up to which the whole inverse is computed (1.2 GB)
 
+# Points whose standard errors are computed, and how many at a time, which limits the memory.
 MOST_POINTS, POINTS_AT_ONCE = 50_000, 500
-"""Points whose standard errors are computed, and how many at a time, which limits the memory."""
 
-SINGULAR = 1e-12
-"""Share of the variance of an unknown, if all others were known, below which none is meaningful."""
+SINGULAR = 1e-12  # least share of a variance (all other unknowns known) that is meaningful
 
 
 class SharedUnknown(NamedTuple):
@@ -173,19 +171,17 @@ def _point_sigma(problem: Problem, found: Solution, inverse: FloatArray) -> Floa
 # Errors that observations share
 
 
-SURE = 0.99
-"""Probability with which equal groups would not differ by as much."""
+SURE = 0.99  # probability with which equal groups would not differ by as much
 
 
 MOST_TILES, POINTS_PER_TILE, FRAME_TILES = 400, 25, 48
-LEAST_GROUPS = 10
-"""Fewer groups do not give a variance."""
+LEAST_GROUPS = 10  # fewer groups do not give a variance
 
+# Error in common to all images at the corner of the frame, as a share of the image noise: matching
+# shifts features with their slope, and outliers of the original adjustment are missing on one side.
+# Focal length and principal point absorb it, so that poses and bed are right, and residuals do not
+# show it. Rendered blocks, whose lens is known, had up to 1.5 times this.
 COMMON_SHARE = 0.5
-"""Error in common to all images at the corner of the frame, as a share of the image noise: matching
-shifts features with their slope, and outliers of the original adjustment are missing on one side.
-Focal length and principal point absorb it, so that poses and bed are right, and residuals do not
-show it. Rendered blocks, whose lens is known, had up to 1.5 times this."""
 
 
 def disagreement_of(problem: Problem, found: Solution, formal: Precision) -> FloatArray:
@@ -290,14 +286,9 @@ def _pulls_of(
 # A smooth field over the frame
 
 
-RANGES = (0.2, 0.4, 0.8)
-"""Ranges of smoothness, over half the diagonal: from waves of the sensor to whole frames."""
-
-LARGEST_PX, STEPS = 2.0, np.linspace(0.0, 1.0, 200)
-"""Range of s; a lens with larger errors is another lens."""
-
-NO_FIELD = 1e-9
-"""Share of the largest eigenvalue below which a field leaves nothing in the residuals."""
+RANGES = (0.2, 0.4, 0.8)  # ranges of smoothness, in half diagonals, from ripples to whole frames
+LARGEST_PX, STEPS = 2.0, np.linspace(0.0, 1.0, 200)  # range of s; larger errors are of another lens
+NO_FIELD = 1e-9  # share of the largest eigenvalue below which a field leaves no residuals
 
 
 def _likely_field(problem: Problem, tile: IntArray, sigma0: float, rest: FloatArray) -> FloatArray:
@@ -334,14 +325,9 @@ def _likely_field(problem: Problem, tile: IntArray, sigma0: float, rest: FloatAr
 # The ensemble
 
 
-MEMBERS, AXES = 32, 16
-"""So many members leave an eighth of a standard deviation to chance, but nothing along the axes."""
-
-TINY = 1e-10
-"""Added to the diagonal of correlations, which rounding may leave indefinite."""
-
-SAME_FOCAL = 1e-6
-"""Relative difference of the focal lengths of one block."""
+MEMBERS, AXES = 32, 16  # leaves an eighth of a standard deviation to chance, nothing along the axes
+TINY = 1e-10  # added to the diagonal of correlations, which rounding may leave indefinite
+SAME_FOCAL = 1e-6  # relative difference of the focal lengths of one block
 
 
 @dataclass(frozen=True, eq=False)

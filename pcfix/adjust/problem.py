@@ -47,13 +47,9 @@ from pcfix.water.surface import build_fields, build_tin
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
-NETWORK_SIGMA_M = 1e-4
-"""Standard deviation of the mean of the projection centres in a free network."""
-
-CELLS = 400
-"""Of a raster of curved water, along its longer side, which represents 10 cm to 1 um."""
-MARGIN = 0.2
-"""By which that raster exceeds the block, as a share of its extent."""
+NETWORK_SIGMA_M = 1e-4  # standard deviation of the mean of the projection centres in a free network
+CELLS = 400  # of a raster of curved water, along its longer side, which represents 10 cm to 1 um
+MARGIN = 0.2  # by which that raster exceeds the block, as a share of its extent
 
 
 @dataclass(frozen=True, eq=False)

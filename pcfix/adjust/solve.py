@@ -26,16 +26,13 @@ from pcfix.running import current
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-12, 1e8
 MOST_STEPS = 60
-CLOSE = 1e-10
-"""Two steps in a row that lower the cost by less than this share of it end the adjustment."""
+CLOSE = 1e-10  # two steps in a row that lower the cost by a smaller share end the adjustment
+EXACT = 1e-10  # squared residual, in variances, of an observation that is met exactly
 
-EXACT = 1e-10
-"""Squared residual, in variances, of an observation that is met exactly."""
-
+# Share of the cost by which it may rise at the minimum. In large blocks some points near the water
+# surface change sides at each step, so that the cost does not fall further. Shorter steps do not
+# help and would double the time. With a million observations this is 0.04 standard errors at most.
 ROUNDING = 1e-9
-"""Share of the cost by which it may rise at the minimum. In large blocks some points near the water
-surface change sides at each step, so that the cost does not fall further. Shorter steps do not help
-and would double the time. With a million observations this is 0.04 standard errors at most."""
 
 
 # Steps

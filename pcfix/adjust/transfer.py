@@ -31,18 +31,13 @@ from pcfix.sums import Sums
 
 MAX_STEPS = 12
 CLOSE_M = 1e-6
-LEAST_CONDITION = 1e-6
-"""Determinant of the normal matrix over the product of its diagonal."""
+LEAST_CONDITION = 1e-6  # determinant of the normal matrix over the product of its diagonal
+SAME_SIDES = 0.002  # relative difference of the sides of one image, which may be rounded
+POINTS_AT_ONCE = 100_000  # points whose cameras are listed at a time, which limits the memory
 
-SAME_SIDES = 0.002
-"""Relative difference of the sides of one image; those in millimetres are rounded by less."""
-
-POINTS_AT_ONCE = 100_000
-"""Points whose cameras are listed at a time, which limits the memory."""
-
+# Share of the flying height between two centres of one image; refraction moves a block, with its
+# datum and scale, by a few hundredths.
 MOST_SHIFT = 0.1
-"""Share of the flying height between two centres of one image; refraction moves a block, with its
-datum and scale, by a few hundredths."""
 
 
 # Points

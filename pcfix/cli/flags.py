@@ -17,8 +17,7 @@ from pcfix.options.declare import Option, OptionSet, options_of
 from pcfix.options.shared import Panel
 from pcfix.version import __version__
 
-MANY = 20
-"""If a command has more options, `--help` shows the basic ones, and `--help-all` all."""
+MANY = 20  # if a command has more options, `--help` shows the basic ones, and `--help-all` all
 _GROUPS = {name: Group(name.value, sort_key=order) for order, name in enumerate(Panel)}
 _QUIET = Parameter(
     name=["--quiet", "-q"],
@@ -40,8 +39,7 @@ class Command(NamedTuple):
     call: Callable[..., None]
     kind: type[OptionSet]
     example: str
-    helps: dict[str, str]
-    """The help of its arguments and of flags that are not options."""
+    helps: dict[str, str]  # the help of its arguments and of flags that are not options
 
     @property
     def has_many(self) -> bool:
@@ -77,8 +75,7 @@ class Command(NamedTuple):
         return call
 
 
-COMMANDS: dict[str, Command] = {}
-"""The commands by name, in the order of the help."""
+COMMANDS: dict[str, Command] = {}  # the commands by name, in the order of the help
 
 
 def command(example: str, **helps: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -124,11 +121,11 @@ def _keyword(one: Option, is_shown: bool) -> inspect.Parameter:
 # Forms of the plugin of QGIS
 
 OFFERED = ("run", "correct", "label", "water", "compare", "photos")
+# Kinds of the positional arguments; the others are clouds.
 _PLACES = {
     "output": "written", "out_dir": "folder written", "images": "folder", "reference": "file",
     "spec": "text",
 }  # fmt: skip
-"""Kinds of the positional arguments; the others are clouds."""
 
 
 def plugin_table(commands: Mapping[str, Command]) -> str:

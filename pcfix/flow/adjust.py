@@ -64,15 +64,10 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 SUMMARY = "adjustment.json"
-FOLDER = "adjusted"
-"""The folder of an adjustment in that of a run."""
-MODELS = ("colmap", "cameras.csv")
-"""The models that an adjustment writes, the preferred one first."""
-WATER_FILE = "water.tif"
-"""The water of an adjustment, where it is not a plane and was adjusted."""
-
-LEAST_TIES, CLOUD_POINTS = 100, 6000
-"""Measured tie points that are needed, and points of the cloud that stand for them."""
+FOLDER = "adjusted"  # the folder of an adjustment in that of a run
+MODELS = ("colmap", "cameras.csv")  # the models that an adjustment writes, the preferred one first
+WATER_FILE = "water.tif"  # the water of an adjustment, where it is not a plane and was adjusted
+LEAST_TIES, CLOUD_POINTS = 100, 6000  # measured tie points needed; points of the cloud otherwise
 
 _EXPORTS = (
     "Tie points are in COLMAP's model with points3D, OpenSfM's reconstruction with tracks.csv, a"

@@ -27,8 +27,7 @@ from pcfix.report.text import Plain, aligned
 from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
 
-SAMPLE_POINTS = 50_000
-"""Points of the cloud that are tested in the frames, evenly spread."""
+SAMPLE_POINTS = 50_000  # points of the cloud that are tested in the frames, evenly spread
 SHOWN_NAMES = 5
 
 

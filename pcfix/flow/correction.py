@@ -236,8 +236,8 @@ def _through_water(plan: Plan, batch: Batch, rows: IntArray, *, covariances: boo
     return replace(correction, shift_m=shift)
 
 
+# Results for each point, which methods return for the submerged ones.
 _PER_POINT = {one.name for one in fields(Correction)} & {*Intersection._fields} - {"camera_used"}
-"""Results for each point, which methods return for the submerged ones."""
 
 
 def _spread(

@@ -20,8 +20,7 @@ from pcfix.options.steps import BlockKind
 from pcfix.simulate.scene import Scene, simulate_scene
 from pcfix.version import __version__
 
-CLOUDS = ("cloud.laz", "truth.laz", "lidar.laz")
-"""The apparent cloud, the true position of each of its points, a reference with noise."""
+CLOUDS = ("cloud.laz", "truth.laz", "lidar.laz")  # apparent and true points, and a survey
 
 
 def write_scene(scene: Scene, out_dir: File, *, overwrite: bool) -> None:

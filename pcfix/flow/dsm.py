@@ -43,14 +43,10 @@ from pcfix.running import bounds, empty, release
 from pcfix.sums import Figures
 from pcfix.version import __version__
 
-WINDOW_POINTS = 400_000
-"""Points that are gridded at once, about."""
-BLOCK_CELLS = 1024
-"""Longest side of a window."""
-BIN_POINTS = 200_000
-"""Points of a tile by which they are sorted, on average."""
-DIMENSIONS = {"height": None, "depth": "WaterDepth", "uncertainty": "SigmaZ"}
-"""Where the values of a quantity are."""
+WINDOW_POINTS = 400_000  # points that are gridded at once, about
+BLOCK_CELLS = 1024  # longest side of a window
+BIN_POINTS = 200_000  # points of a tile by which they are sorted, on average
+DIMENSIONS = {"height": None, "depth": "WaterDepth", "uncertainty": "SigmaZ"}  # where a quantity is
 
 
 def grid_dsm(

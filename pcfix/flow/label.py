@@ -105,8 +105,7 @@ def _labelling(plan: LabelPlan, source: LasSource) -> FileWork:
     )
 
 
-DEEP_M = 10.0
-"""A cloud that is deeper everywhere has hardly been made of images through the water surface."""
+DEEP_M = 10.0  # clouds that are deeper everywhere hardly come from images through the surface
 
 
 def _finish(plan: LabelPlan, task: FileTask, counts: LabelCounts) -> Figures:

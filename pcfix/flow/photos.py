@@ -62,8 +62,8 @@ from pcfix.water.index import index_of
 from pcfix.water.surface import surface_above
 
 RECORD = "pcfix-rebuild.json"
+# Options that a later call may change and still resume.
 COMMAND_ONLY = ("overwrite", "jobs", "summary", "rebuild", "until_gsd", "most_rounds")
-"""Options that a later call may change and still resume."""
 
 
 def map_photos(

@@ -37,16 +37,14 @@ from pcfix.simulate.settings import SceneSettings
 from pcfix.sums import Figures
 from pcfix.water.index import index_of
 
-POINTS = 400
-"""Of each bed; they are also the tie points of the adjustments."""
-MOST_BASES, MOST_SPACINGS = 8, 4
-"""Limits of the simulated block: farther inside, the geometry repeats."""
+POINTS = 400  # of each bed; they are also the tie points of the adjustments
+MOST_BASES, MOST_SPACINGS = 8, 4  # limits of the simulated block: farther in, it repeats itself
 FEWEST_SEEN = 50
+# Parts of the error budget, and their options.
 PARTS = {
     "image": ("sigma_image",), "level": ("sigma_level",), "waves": ("sigma_waves",),
     "index": ("sigma_index",), "poses": ("sigma_centre", "sigma_attitude"),
 }  # fmt: skip
-"""Parts of the error budget, and their options."""
 
 
 def plan_flight(

@@ -32,13 +32,11 @@ from pcfix.water.fit import FEWEST
 from pcfix.water.index import with_index
 from pcfix.water.surface import FoundSurface, surface_above
 
-HEIGHT_M = 100.0
-"""Flying height if the water below the cameras is unknown, for the width of squares."""
+HEIGHT_M = 100.0  # flying height if the water below the cameras is unknown, for the width of cells
 BED_POINTS_A_M2 = 5.0
+# Size of the sample of the cloud that the bed of the surroundings is estimated from.
 FEWEST_BED_POINTS, MOST_BED_POINTS = 125_000, 1_000_000
-"""Size of the sample of the cloud that the bed of the surroundings is estimated from."""
-LEAST_R2 = 0.5
-"""Smallest coefficient of determination of a regression that is used."""
+LEAST_R2 = 0.5  # smallest coefficient of determination of a regression that is used
 
 
 def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:

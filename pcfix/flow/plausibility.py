@@ -25,29 +25,24 @@ from pcfix.options.declare import File
 from pcfix.sums import Sums
 from pcfix.water.auto import LEAST_POINTS, find_elsewhere
 
+# Points of the sample, and those of it that are tested in the frames; evenly spread.
 SAMPLE_POINTS, IN_FRAMES = 30_000, 4_000
-"""Points of the sample, and those of it that are tested in the frames; evenly spread."""
-MOST_UNSEEN = 0.01
-"""Share of a cloud that may lie in fewer than two frames: noise, and the borders of lenses."""
+MOST_UNSEEN = 0.01  # share of a cloud that may be in fewer than two frames: noise, lens borders
+# Largest residual of tie points, as a share of the frame's width, and their largest distance from
+# the heights of the cloud, as a share of the flying height; medians.
 MOST_RESIDUAL, MOST_HEIGHT = 0.01, 0.02
-"""Largest residual of tie points, as a share of the frame's width, and their largest distance from
-the heights of the cloud, as a share of the flying height; medians."""
-LEAST_TIES, TIES = 10, 3_000
-"""The fewest tie points that are compared, in an image or with the cloud, and the most."""
+LEAST_TIES, TIES = 10, 3_000  # tie points that are compared, in an image or with the cloud
+# Steps along flight lines, the consistency of their angle to the images, and its maximum.
 LEAST_STEPS, STEADY, MOST_TURN_DEG = 10, 0.9, 45.0
-"""Steps along flight lines, the consistency of their angle to the images, and its maximum."""
+# Cosine of the largest tilt, about 25 degrees, at which the upper edge of an image has a clear
+# direction in plan.
 STEEP_COSINE = 0.9
-"""Cosine of the largest tilt, about 25 degrees, at which the upper edge of an image has a clear
-direction in plan."""
-MOST_OFF_M = 15.0
-"""Largest median distance from GNSS positions, in plan or in height; these are often 5 m off."""
+MOST_OFF_M = 15.0  # largest median distance from GNSS positions, in plan or height; often 5 m
+# How high above the water drones take off, and the share of their height that barometers err.
 TAKE_OFF_M, MOST_SHARE = (-15.0, 25.0), 0.1
-"""How high above the water drones take off, and the share of their height that barometers err."""
 
-MARGIN_M = 100.0
-"""Distance from the cloud, beyond half of its sides, at which a block can still belong to it."""
-ABSURD_HEIGHTS = 3.0
-"""Largest height of cameras above the cloud, in widths of the cloud."""
+MARGIN_M = 100.0  # distance from the cloud beyond half its sides at which a block may belong to it
+ABSURD_HEIGHTS = 3.0  # largest height of cameras above the cloud, in widths of the cloud
 
 
 class Passed(str):
@@ -58,8 +53,7 @@ class Unchecked(str):
     """What could not be tested, and why."""
 
 
-Finding: TypeAlias = Passed | Unchecked | PcfixWarning
-"""The result of a test; a warning if it failed."""
+Finding: TypeAlias = Passed | Unchecked | PcfixWarning  # result of a test; a warning if it failed
 
 
 class Plausible(NamedTuple):

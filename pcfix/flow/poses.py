@@ -48,11 +48,8 @@ if TYPE_CHECKING:
     from pcfix.adjust.precision import Members
     from pcfix.flow.correction import Plan
 
-LEAST_POSITIONS = 3
-"""GNSS positions that determine position, orientation and scale of a block."""
-
-QUICK_BYTES = 25_000_000
-"""Size of a model that is read within a second or two, even if nobody asked."""
+LEAST_POSITIONS = 3  # GNSS positions that determine position, orientation and scale of a block
+QUICK_BYTES = 25_000_000  # size of a model that is read in a second or two, even if nobody asked
 
 
 def diagnose_inputs(
@@ -189,9 +186,9 @@ def flags_of(given: OptionSet) -> list[str]:
 # Errors of the bed by those of adjusted poses
 
 
+# Points that are sampled from the cloud, and points under water that are corrected with each
+# member; a thousand is enough, as the errors are smooth.
 SAMPLE_POINTS, BED_POINTS = 20_000, 1000
-"""Points that are sampled from the cloud, and points under water that are corrected with each
-member; a thousand is enough, as the errors are smooth."""
 
 
 def members_of(path: File | Cameras, cameras: Cameras) -> Members | None:

@@ -30,23 +30,19 @@ from pcfix.io.rasters import METRE, TO_95, RasterBand, RasterSource, is_raster
 from pcfix.model import BoolArray, FloatArray, Outcome, WaterPlane, WaterSurface
 from pcfix.running import current
 
+# A labelling has the last, a correction the others.
 OUTPUTS = ("height", "depth", "shift", "uncertainty", "outcome", "class")
-"""A labelling has the last, a correction the others."""
+# The bands of outputs that have several; the band of the others has their name.
 BANDS = {"shift": SHIFTS, "uncertainty": ("uncertainty", "SigmaZ")}
-"""The bands of outputs that have several; the band of the others has their name."""
-NO_CODE = 255
-"""Value of cells without a height in outcome and class, which have whole numbers."""
+NO_CODE = 255  # value of cells without a height in outcome and class, which have whole numbers
 WINDOW_CELLS = 512
-HOLE_CELLS, EDGE_CELLS = 1.5, 2
-"""Reach of known cells into holes, and beyond the edge of the raster."""
-NEAR_CELLS = 0.5
-"""Largest distance of a moved point from the centre of the cell that gets its height."""
-MOST_SHIFT_CELLS = 256
-"""Points that move farther in plan may be missing, which limits the memory."""
+HOLE_CELLS, EDGE_CELLS = 1.5, 2  # reach of known cells into holes, and beyond the raster's edge
+NEAR_CELLS = 0.5  # largest distance of a moved point from the centre of a cell that gets its height
+MOST_SHIFT_CELLS = 256  # points that move farther in plan may be missing, which limits the memory
 ITERATIONS, STEPS_A_CELL = 6, 4096.0
+# The point of a cell, all zero without one: its shift (m), NaN if it has no height any more; the
+# depth and standard error of corrected points (m); and its outcome, or the class by a labelling.
 CELL = np.dtype([("shift", "f4", 3), ("depth", "f4"), ("sigma", "f4"), ("code", "u1")])
-"""The point of a cell, all zero without one: its shift (m), NaN if it has no height any more; the
-depth and standard error of corrected points (m); and its outcome, or the class by a labelling."""
 Cells = npt.NDArray[Any]
 
 

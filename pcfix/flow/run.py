@@ -58,8 +58,8 @@ COMPARED = "compare"
 REFERENCE_DSM = "reference_dsm.tif"
 SECTIONS = 3
 COLMAP = ("cameras.bin", "images.bin", "points3D.bin", "georeference.json")
+# The files that an adjustment may leave, its report first.
 ADJUSTED = ("report.html", SUMMARY, ENSEMBLE, *(f"colmap/{name}" for name in COLMAP), *MODELS[1:])
-"""The files that an adjustment may leave, its report first."""
 
 
 def run(

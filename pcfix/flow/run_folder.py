@@ -64,16 +64,17 @@ from pcfix.version import __version__
 from pcfix.water.surface import surface_above
 
 RECORD, SURFACE = "run.json", "surface.tif"
+# The steps in order; each depends on those before it.
 STEPS = ("adjust", "correct", "clean", "dsm", "compare", "map", "report")
-"""The steps in order; each depends on those before it."""
+# The first step that depends on an option, for options that do not affect all steps.
 LATER = {
     **{one.name: "compare" for one in options_of(DistanceOptions)},
     "reference": "compare", "resolution": "dsm", "project": "report", "date": "report",
 }  # fmt: skip
-"""The first step that depends on an option, for options that do not affect all steps."""
 BED, DEPTH, UNCERTAINTY = "bed.tif", "depth.tif", "uncertainty.tif"
 COUNTS, SHADED, CORRECTED = "surface_counts.tif", "shaded.tif", "corrected.tif"
 DIFFERENCE, PAGE = "compare/dod.tif", "report.html"
+# The results of a run by name; only existing ones are listed.
 RESULTS = {
     "corrected.laz": "all points, the bed corrected",
     "cleaned.laz": "all points, with outliers flagged as noise",
@@ -91,7 +92,6 @@ RESULTS = {
     "compare/reference_dsm.tif": "heights of the reference",
     "adjusted/report.html": "the adjustment of the cameras",
 }
-"""The results of a run by name; only existing ones are listed."""
 
 
 @dataclass(frozen=True)
@@ -200,8 +200,7 @@ class RunFolder:
 
 # The rasters
 
-HOLE_CELLS = 3.0
-"""Width of holes that are filled: of cells with random points, one in twenty is empty."""
+HOLE_CELLS = 3.0  # width of filled holes: of cells with random points, one in twenty is empty
 
 
 def raster_files(run: RunFolder, errors: bool) -> list[Path]:
@@ -282,8 +281,7 @@ def _write_shaded(folder: Path) -> None:
 
 # The layers
 
-MOST_CELLS = 4_000_000
-"""Of the rasters for contours and outline."""
+MOST_CELLS = 4_000_000  # of the rasters for contours and outline
 DARK, RED, GREY = (8, 48, 107), (203, 24, 29), (120, 120, 120)
 ORANGE, GREEN = (253, 141, 60), (35, 139, 69)
 
@@ -388,8 +386,7 @@ def _checks(folder: Path, points: FloatArray, depths: File | None) -> list[Layer
 
 # The report page
 
-MOST_PAGE_CELLS = 300_000
-"""Of the map on the page, so that this stays below 4 MB."""
+MOST_PAGE_CELLS = 300_000  # of the map on the page, so that this stays below 4 MB
 
 
 def report_run(

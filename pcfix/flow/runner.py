@@ -47,15 +47,11 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 Chunk: TypeAlias = "laspy.ScaleAwarePointRecord"
 Progress: TypeAlias = Callable[[int, int], None]
-Bar: TypeAlias = Callable[[str], AbstractContextManager[Progress | None]]
-"""Shows the progress of a step, given its title."""
+Bar: TypeAlias = Callable[[str], AbstractContextManager[Progress | None]]  # shows progress
 RECORDS = ".pcfix"
-HOW = ("overwrite", "jobs", "scheduler", "summary")
-"""Options on which no output depends."""
-WAIT_S = 10
-"""For a scheduler to answer, and for its first worker."""
-POINTS_A_PROCESS = 500_000
-"""These take about as long as another process takes to start."""
+HOW = ("overwrite", "jobs", "scheduler", "summary")  # options on which no output depends
+WAIT_S = 10  # for a scheduler to answer, and for its first worker
+POINTS_A_PROCESS = 500_000  # these take about as long as another process takes to start
 
 
 def no_bar(title: str) -> AbstractContextManager[None]:
@@ -77,8 +73,7 @@ class FileWork(NamedTuple):
     identity: bytes = b""  # of the software in the header; by default that of pcfix
 
 
-Work: TypeAlias = Callable[[Any, LasSource], FileWork]
-"""Takes the plan of a command and an opened file."""
+Work: TypeAlias = Callable[[Any, LasSource], FileWork]  # of the plan and an opened file
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,8 +39,7 @@ if TYPE_CHECKING:
     from pcfix.io.views import ViewMatch
 
 
-SAMPLE_POINTS = 2_000_000
-"""Points of a cloud that are searched for water, evenly spread."""
+SAMPLE_POINTS = 2_000_000  # points of a cloud that are searched for water, evenly spread
 
 
 def corners(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -157,8 +156,7 @@ def find_surface(
     return FoundSurface(found)
 
 
-FAR_M = 1000.0
-"""Largest distance of a shoreline from the cloud, unless the cloud itself is larger."""
+FAR_M = 1000.0  # largest distance of a shoreline from the cloud, unless the cloud itself is larger
 
 
 def _check_near(name: str, xyz: FloatArray, view: CloudView, most_m: float) -> None:
@@ -174,8 +172,7 @@ def _check_near(name: str, xyz: FloatArray, view: CloudView, most_m: float) -> N
         )  # fmt: skip
 
 
-MOST_OFFSET_M = 2.0
-"""Largest median difference between the common water and that of an image, more than tides."""
+MOST_OFFSET_M = 2.0  # median difference of the water of images and the common one, above tides
 
 
 def own_water_of(

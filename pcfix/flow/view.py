@@ -34,10 +34,9 @@ if TYPE_CHECKING:
 WATER_CELLS = 40
 SHOWN = ("WaterDepth", "SigmaZ", *SHIFTS)
 LINE_COLOURS = {"water": (0.65, 0.82, 0.89), "cameras": (0.04, 0.37, 0.54)}
-GREY = 0.72
-"""Of points without a value, such as land where depths are shown."""
-BEYOND_PERCENT = 2.0
-"""Share of the values at either end that has the last colour."""
+GREY = 0.72  # of points without a value, such as land where depths are shown
+BEYOND_PERCENT = 2.0  # share of the values at either end that has the last colour
+# Ramp, name, dimension and factor of the values, and what to do where no cloud has any.
 COLOURS = {
     "depth": (DEPTH, "Depth below the water (m)", "WaterDepth", 1.0,
               "Give --water, or a cloud from 'pcfix correct'."),
@@ -49,7 +48,6 @@ COLOURS = {
                     "Give a cloud from 'pcfix correct --dimensions all'."),
     "height": (HEIGHT, "Height (m)", "", 1.0, "Its heights are not numbers."),
 }  # fmt: skip
-"""Ramp, name, dimension and factor of the values, and what to do where no cloud has any."""
 
 
 class Shown(NamedTuple):
@@ -64,8 +62,7 @@ class Shown(NamedTuple):
     rgb: FloatArray = np.empty((0, 3))
 
 
-Lines = dict[str, FloatArray]
-"""Optical axes of "cameras" and a grid of the "water", shape (k, 2, 3) each."""
+Lines = dict[str, FloatArray]  # axes of "cameras" and a grid of the "water", shape (k, 2, 3) each
 
 
 def view_clouds(

@@ -20,10 +20,8 @@ from pcfix.water.auto import WaterProposal
 from pcfix.water.fit import ShoreFit
 from pcfix.water.surface import FoundSurface, surface_above
 
-SAMPLE_POINTS = 200_000
-"""Points of the cloud that are compared with the water, evenly spread."""
-MOST_LISTED = 10
-"""Rejected points in the summary, the largest residual first."""
+SAMPLE_POINTS = 200_000  # points of the cloud that are compared with the water, evenly spread
+MOST_LISTED = 10  # rejected points in the summary, the largest residual first
 _FIT: RowTable = (
     ("Model", "{model}, {accepted} of {points} points; scatter {sigma_point_m:.3f} m", "points"),
     ("Level", "{level_m:.3f} m at {at_xy[0]:.1f}, {at_xy[1]:.1f}; standard error"

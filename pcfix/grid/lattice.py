@@ -21,8 +21,7 @@ from pcfix.options.steps import MIN_RESOLUTION_M, DsmMethod
 from pcfix.running import current
 
 MAX_CELLS = 1_000_000_000
-EDGE_M = 1e-7
-"""Tolerance of points on an edge: 5432000.1 / 0.1 in floating point may be too small."""
+EDGE_M = 1e-7  # tolerance of points on an edge: 5432000.1 / 0.1 in floating point may be too small
 
 
 class Window(NamedTuple):
@@ -154,10 +153,9 @@ def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float, name: s
     return Lattice(resolution_m, west, north, east - west + 1, south - north + 1)
 
 
-POINTS_A_CELL = 2.0, 4.0
-"""Range for a chosen resolution."""
+POINTS_A_CELL = 2.0, 4.0  # range for a chosen resolution
+# Figures of a resolution, the roundest first; neighbours differ by less than sqrt 2.
 ROUND = (1.0, 2.0, 5.0, 2.5, 4.0, 8.0, 1.25, 1.6, 3.2, 6.4)
-"""Figures of a resolution, the roundest first; neighbours differ by less than sqrt 2."""
 
 
 def round_resolution(spacing_m: float) -> float:
@@ -297,8 +295,7 @@ def _offsets(position: FloatArray) -> FloatArray:
     return np.asarray((mixed >> np.uint64(11)) / 2.0**53 - 0.5)
 
 
-SLACK_CELLS = 1.5
-"""Rims k + 1 cells apart enclose k empty ones; circles through their corners are a bit wider."""
+SLACK_CELLS = 1.5  # rims k + 1 cells apart enclose k empty ones; their circles are a bit wider
 
 
 def margin_cells(widest: float) -> int:

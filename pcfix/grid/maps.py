@@ -39,10 +39,9 @@ def stops_of(ramp: str, steps: int = 9) -> list[tuple[float, tuple[int, ...]]]:
 
 
 LAND = (214, 205, 188)
-DARKEST = 0.35
-"""Share of the colour without light."""
+DARKEST = 0.35  # share of the colour without light
+# Direction of the sun, east, north and up: in the north-west, 45 degrees above the horizon.
 SUN = np.array([-0.5, 0.5, 0.5**0.5])
-"""Direction of the sun, east, north and up: in the north-west, 45 degrees above the horizon."""
 
 
 def relief_colours(
@@ -137,14 +136,11 @@ def contours(values: FloatArray, interval: float) -> list[tuple[float, FloatArra
 
 # The waterline
 
-MOST_POINTS = 2_000_000
-"""Maximum number of points in memory, evenly spread."""
+MOST_POINTS = 2_000_000  # maximum number of points in memory, evenly spread
 POINTS_PER_CELL = 4.0
 MAX_CELLS = 25_000_000
-SMOOTH_CELLS = 1.0
-"""Standard deviation of the filter over the cells; it averages about 50 points."""
-FLATTEST = 0.01
-"""Least slope for the standard error: on flat ground the line may be anywhere."""
+SMOOTH_CELLS = 1.0  # standard deviation of the filter over the cells; it averages about 50 points
+FLATTEST = 0.01  # least slope for the standard error: on flat ground the line may be anywhere
 
 
 @dataclass(frozen=True, eq=False)

@@ -232,8 +232,7 @@ class Topocentric:
         return np.column_stack(step.transform(x, y, z, direction="INVERSE"))
 
 
-Move = Callable[[FloatArray], FloatArray]
-"""Takes points, shape (n, 3), from one CRS to another."""
+Move = Callable[[FloatArray], FloatArray]  # takes points, shape (n, 3), from one CRS to another
 
 
 def unchanged(xyz: FloatArray) -> FloatArray:

@@ -140,8 +140,8 @@ def check_output(
 
 # Outputs that appear when they are complete
 
+# What `all_or_none` tidies up, and the temporary file of each target.
 _group: ContextVar[tuple[ExitStack, dict[Path, Path]] | None] = ContextVar("_group", default=None)
-"""What `all_or_none` tidies up, and the temporary file of each target."""
 
 
 @contextmanager
@@ -399,8 +399,7 @@ def scratch_arrays(target: Path) -> Iterator[Empty]:
         yield empty
 
 
-ENSEMBLE = "ensemble.npz"
-"""The file next to an adjusted model with the members of its ensemble."""
+ENSEMBLE = "ensemble.npz"  # the file next to an adjusted model with the members of its ensemble
 
 
 def write_members(folder: Path, members: Members) -> None:

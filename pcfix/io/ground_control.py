@@ -49,11 +49,10 @@ from pcfix.io.tables import Table, match_labels, number, places, read_lines, rea
 from pcfix.model import Cameras, FloatArray, GnssPositions, GroundControl, IntArray
 from pcfix.options.declare import File
 
-SIGMA_M, SIGMA_PX = 0.01, 0.5
-"""Standard deviations if the file states none."""
-FARTHEST_M = 50e3
-"""Horizontal distance to the block that indicates another zone or swapped axes."""
+SIGMA_M, SIGMA_PX = 0.01, 0.5  # standard deviations if the file states none
+FARTHEST_M = 50e3  # horizontal distance to the block that indicates another zone or swapped axes
 
+# Names of the columns; the first one that exists is used.
 SPELLINGS: dict[str, tuple[str, ...]] = {
     **{role: POSITIONS[role] for role in ("x", "y", "z", "longitude", "latitude")},
     "point": ("point", "name", "gcp", "gcp_name", "marker", "point_name", "id", "label"),
@@ -69,13 +68,11 @@ SPELLINGS: dict[str, tuple[str, ...]] = {
     "sigma_on": ("sigma_on",),
     "under_water": ("under_water", "underwater", "submerged"),
 }
-"""Names of the columns; the first one that exists is used."""
 CHECK = ("check", "check_point", "checkpoint", "cp", "chk")
 CONTROL = ("", "control", "control_point", "controlpoint", "gcp", "3d_gcp", "ground_control_point")
 ON, WATERLINE = "on:", ("waterline", "water_line", "shoreline", "on:water")
 YES, NO = ("yes", "y", "true", "1"), ("", "no", "n", "false", "0")
-ODM = ("x", "y", "z", "u", "v", "label", "point")
-"""Fields of ODM's list, the last one optional."""
+ODM = ("x", "y", "z", "u", "v", "label", "point")  # fields of ODM's list, the last one optional
 
 
 def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None) -> GroundControl:

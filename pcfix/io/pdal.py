@@ -20,12 +20,9 @@ Dimensions: TypeAlias = "dict[str, npt.NDArray[Any]]"
 Metadata: TypeAlias = "dict[str, Any]"
 
 NAME = "the pipeline's cloud"
-OUTCOME = "Outcome"
-"""A dimension with `pcfix.Outcome`, if ``add_dimension`` adds it."""
-CLASS_FLAGS = "ClassFlags=uint8"
-"""To be added for PDAL 2.2, where point formats 0 to 5 have no such dimension."""
-_WITHHELD_FLAG = 4
-"""Bit of ClassFlags, which older PDAL has in place of the dimension Withheld."""
+OUTCOME = "Outcome"  # a dimension with `pcfix.Outcome`, if ``add_dimension`` adds it
+CLASS_FLAGS = "ClassFlags=uint8"  # added for PDAL 2.2, where formats 0 to 5 have no such dimension
+_WITHHELD_FLAG = 4  # bit of ClassFlags, which older PDAL has in place of the dimension Withheld
 
 
 def add_dimension(columns: tuple[Column, ...]) -> str:

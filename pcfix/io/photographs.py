@@ -162,9 +162,9 @@ def _write_tiff(source: Path, path: Path, pixels: Pixels) -> None:
         tifffile.imwrite(path, stored, metadata=None, **how)
 
 
+# Texts, resolution, rotation, XMP, GeoTIFF keys, and tags of multispectral cameras.
 _COPIED_TAGS = {270, 271, 272, 274, 282, 283, 296, 305, 306, 315, 700, 33432, 33550, 33922, 34735,
               34736, 34737, 48020, 48021, 48022}  # fmt: skip
-"""Texts, resolution, rotation, XMP, GeoTIFF keys, and tags of multispectral cameras."""
 
 
 @dataclass(frozen=True)
@@ -244,8 +244,8 @@ def write_spread(target: Path, spread: FloatArray) -> None:
         tifffile.imwrite(path, spread.astype(np.float32), compression="zlib", metadata=None)
 
 
+# Files that may state when and how high they were taken.
 IMAGES = (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".webp", ".heic", ".dng")
-"""Files that may state when and how high they were taken."""
 
 
 class Times(NamedTuple):

@@ -27,8 +27,7 @@ _TYPES = {
 _FORMATS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _MOST_HEADER_BYTES = 1 << 20
 _KINDS = {"vertex": "vertices", "face": "faces"}
-_ROWS_AT_ONCE = 1_000_000
-"""Records that are read at a time, which bounds the memory."""
+_ROWS_AT_ONCE = 1_000_000  # records that are read at a time, which bounds the memory
 
 
 class Element(NamedTuple):

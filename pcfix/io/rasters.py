@@ -45,17 +45,12 @@ if TYPE_CHECKING:
     from rasterio.transform import Affine
 
 
-NO_HEIGHT = -9999.0
-"""Value of cells without a height; every program that reads GeoTIFF knows this one."""
-IMPOSSIBLE_M = 9000.0
-"""A larger height is a nodata value that the file does not state."""
+NO_HEIGHT = -9999.0  # value of cells without a height, which every reader of GeoTIFF knows
+IMPOSSIBLE_M = 9000.0  # a larger height is a nodata value that the file does not state
 METRE = "metre"
-TO_95 = 1.959964
-"""Half-width of 95 % of a normal distribution, in standard deviations."""
-TILE, BLOCK_CELLS = 256, 1024
-"""Sides of the tiles of a file, and of the windows that are worked on."""
-check_tif = partial(check_output, suffixes=(".tif", ".tiff"))
-"""Return the path of a GeoTIFF that may be written."""
+TO_95 = 1.959964  # half-width of 95 % of a normal distribution, in standard deviations
+TILE, BLOCK_CELLS = 256, 1024  # sides of the tiles of a file, and of the windows that are worked on
+check_tif = partial(check_output, suffixes=(".tif", ".tiff"))  # checks the path of a GeoTIFF
 
 
 @contextmanager

@@ -22,22 +22,21 @@ from pcfix.options.declare import File
 
 METRES = dict.fromkeys(("", "m", "metre", "metres", "meter", "meters"), 1.0)
 DEGREES = dict.fromkeys(("", "deg", "degree", "degrees", "°"), 1.0)
+# Units by their names: sizes in metres and degrees.
 ANGLES = {
     **DEGREES,
     **dict.fromkeys(("gon", "gons", "grad", "grads"), 0.9),
     **dict.fromkeys(("rad", "radian", "radians"), 180.0 / math.pi),
 }
-"""Units by their names: sizes in metres and degrees."""
 PIXELS = dict.fromkeys(("", "px", "pixel", "pixels", "pix"), 1.0)
+# What numbers are in, by the role of their column; those of others have any unit.
 UNITS = {
     **dict.fromkeys(("x", "y", "z", "depth", "sigma_x", "sigma_y", "sigma_z"), ("metres", METRES)),
     **dict.fromkeys(("longitude", "latitude", "yaw", "pitch", "roll"), ("degrees", ANGLES)),
     **dict.fromkeys(("omega", "phi", "kappa"), ("degrees", ANGLES)),
     **dict.fromkeys(("u", "v"), ("pixels", PIXELS)),
 }
-"""What numbers are in, by the role of their column; those of others have any unit."""
-Spellings: TypeAlias = Mapping[str, Sequence[str]]
-"""What columns are called, by their roles."""
+Spellings: TypeAlias = Mapping[str, Sequence[str]]  # what columns are called, by their roles
 EXIF = ("gpslongitude", "gpslatitude", "gpsaltitude")
 
 
@@ -322,6 +321,7 @@ def _stem(name: str) -> str:
     return PurePosixPath(_file_name(name)).stem.lower()
 
 
+# Names of the columns of points; the first that the header has is used.
 POINT_SPELLINGS = {
     "x": ("x", "easting", "east"),
     "y": ("y", "northing", "north"),
@@ -330,7 +330,6 @@ POINT_SPELLINGS = {
     "latitude": ("latitude", "lat"),
     "depth": ("depth", "true_depth", "water_depth", "measured_depth"),
 }
-"""Names of the columns of points; the first that the header has is used."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,10 +31,8 @@ GDAL_SUFFIXES = (".gpkg", ".shp", ".geojson", ".json", ".kml", ".gpx")
 KINDS = "GeoPackage (.gpkg), Shapefile (.shp), GeoJSON, KML, GPX or a table of points (.csv)"
 LAYER_MARK = "|"
 WGS84 = "EPSG:4326"
-SPACING_M = 1.0
-"""Along lines without heights, which get these from the cloud."""
-SHORE_RADIUS_M = 1.0
-"""About shoreline points without a height, which get it from the cloud."""
+SPACING_M = 1.0  # along lines without heights, which get these from the cloud
+SHORE_RADIUS_M = 1.0  # about shoreline points without a height, which get it from the cloud
 
 
 @dataclass(frozen=True, eq=False)

@@ -156,8 +156,7 @@ def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
     return positions(path, vertex), corner.astype(np.int64)[rows]
 
 
-MOST_CELLS = 10_000_000
-"""Cells that are read, for the memory."""
+MOST_CELLS = 10_000_000  # cells that are read, for the memory
 
 
 def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRaster:

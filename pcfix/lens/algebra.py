@@ -13,10 +13,9 @@ from pcfix.kernels import device
 from pcfix.model import FloatArray
 
 Vector: TypeAlias = tuple[float, float, float]
-Symmetric: TypeAlias = tuple[float, float, float, float, float, float]
-"""A symmetric matrix: xx, xy, xz, yy, yz, zz."""
+Symmetric: TypeAlias = tuple[float, float, float, float, float, float]  # xx, xy, xz, yy, yz, zz
+# A matrix, row by row.
 Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
-"""A matrix, row by row."""
 
 
 @device
@@ -106,8 +105,7 @@ def normal_of(b: float, c: float) -> Vector:
     return -b * up, -c * up, up
 
 
-NO_SQUARES: Symmetric = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-"""Where a sum of `plus_square` begins."""
+NO_SQUARES: Symmetric = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # where a sum of `plus_square` begins
 
 
 @device

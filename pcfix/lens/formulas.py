@@ -24,22 +24,22 @@ from numpy.polynomial import Polynomial
 from pcfix.kernels import device, kernel
 from pcfix.model import FloatArray, IntArray, Lens, Projection
 
+# The projection as a number, and its limits: radians, and the radius in its plane.
 KIND, LARGEST_ANGLE, LARGEST_RADIUS = range(3)
-"""The projection as a number, and its limits: radians, and the radius in its plane."""
 
 TANGENTIAL, THIN_PRISM = 3, 7
+# `DISC` is the radius about the centre of distortion up to which Brown's formula is used.
 IN_TURN, INVERSE, CENTRE_X, CENTRE_Y, DISC = range(11, 16)
-"""`DISC` is the radius about the centre of distortion up to which Brown's formula is used."""
 
 FOCAL_X, B2, B3, FOCAL_Y, PRINCIPAL_X, PRINCIPAL_Y, WIDTH, HEIGHT = range(16, 24)
 
 PLAIN = 24  # whether the lens is the common one: perspective with Brown's k1 to k4, p1 and p2 only
 
+# Number of each; k1 is at `TAIL`, the others follow, the first shape number at `SHAPE`.
 RADIALS, DENOMINATORS, SHAPES, SHAPE, TAIL = range(25, 30)
-"""Number of each; k1 is at `TAIL`, the others follow, the first shape number at `SHAPE`."""
 
+# Zeros are added up to these numbers, so that the first few can be read unconditionally.
 LEAST_RADIALS, LEAST_SHAPES = 4, 2
-"""Zeros are added up to these numbers, so that the first few can be read unconditionally."""
 
 CODES: dict[str, int] = {name: i for i, name in enumerate(get_args(Projection))}
 PERSPECTIVE, EQUIDISTANT, EQUISOLID, POLYNOMIAL, FOV, DUAL, DIVISION, EUCM = CODES.values()
@@ -89,8 +89,8 @@ def lens_table(lenses: tuple[Lens, ...]) -> tuple[IntArray, FloatArray]:
     return row, table
 
 
+# Derivatives of two numbers by three others: a_x, a_y, a_z, b_x, b_y, b_z.
 Gradients: TypeAlias = tuple[float, float, float, float, float, float]
-"""Derivatives of two numbers by three others: a_x, a_y, a_z, b_x, b_y, b_z."""
 
 _NOWHERE = (np.nan,) * 6
 

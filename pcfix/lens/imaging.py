@@ -151,11 +151,11 @@ def image_and_gradients(
     )  # fmt: skip
 
 
+# k1 to k4, p1, p2, the centre of distortion, the squared disc, and the interior orientation.
 Plain: TypeAlias = tuple[
     float, float, float, float, float, float, float, float, float, float, float, float, float,
     float, float,
 ]  # fmt: skip
-"""k1 to k4, p1, p2, the centre of distortion, the squared disc, and the interior orientation."""
 
 
 @device
@@ -236,8 +236,8 @@ def frame_shape(lens: Lens) -> tuple[FloatArray, bool]:
 
 BORDER = 400  # points along each side of a frame, which is nearly straight between neighbours
 
+# A pyramid with flatter sides would be too wide to exclude anything; that of zeros holds all.
 STEEPEST = np.cos(np.radians(80.0))
-"""A pyramid with flatter sides would be too wide to exclude anything; that of zeros holds all."""
 
 
 def _border(lens: Lens, count: int) -> FloatArray:
@@ -293,13 +293,12 @@ def frames_of(cameras: Cameras) -> Frames:
     )
 
 
+# A view list may name a camera whose frame misses the point by at most this times its longer side.
+#
+# An apparent point is some pixels from its image. Much farther outside the distortion is
+# extrapolated, and the search of a true point may fail: of 40,000 points of simulated scenes 47
+# were up to 41 m off, all of them imaged more than eight lengths outside.
 MARGIN = 1.0
-"""A view list may name a camera whose frame misses the point by at most this times its longer side.
-
-An apparent point is some pixels from its image. Much farther outside the distortion is
-extrapolated, and the search of a true point may fail: of 40,000 points of simulated scenes 47 were
-up to 41 m off, all of them imaged more than eight lengths outside.
-"""
 
 
 def listed_frames_of(cameras: Cameras) -> Frames:

@@ -37,11 +37,8 @@ Software = Literal[
     "colmap", "metashape", "micmac", "odm", "openmvs", "opensfm", "realitycapture", "sure", "other"
 ]
 
-WITHOUT_CAMERAS = ("factor", "regression")
-"""Methods that use the apparent depth only."""
-
-LEVEL_M = 0.02
-"""Assumed standard deviation of a water level."""
+WITHOUT_CAMERAS = ("factor", "regression")  # methods that use the apparent depth only
+LEVEL_M = 0.02  # assumed standard deviation of a water level
 
 
 class MethodOptions(IndexOptions, panel=Panel.METHOD):
@@ -266,5 +263,4 @@ class AdjustOptions(
     """Polygons where points may be submerged. [default: everywhere]"""
 
 
-Options = CorrectOptions
-"""The public name of the options of a correction."""
+Options = CorrectOptions  # the public name of the options of a correction

@@ -146,8 +146,8 @@ class DsmOptions(BandOption, OverwriteOption, SummaryOption, DsmRules, panel=Pan
     """Also write a QGIS style (.qml)."""
 
 
+# Names of the lines of a cross-section; other clouds must have other names.
 LAYERS = ("water", "apparent", "corrected", "reference")
-"""Names of the lines of a cross-section; other clouds must have other names."""
 _NAME = re.compile(r"[\w .+-]*\w[\w .+-]*")
 
 

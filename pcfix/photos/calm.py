@@ -23,11 +23,9 @@ from pcfix.errors import photo_library
 from pcfix.model import BoolArray, FloatArray
 from pcfix.photos.mapping import by_bands
 
-FOLLOWED_PX = 2048
-"""Longer side of the images in which corners are tracked; larger ones are reduced."""
+FOLLOWED_PX = 2048  # longer side of the images in which corners are tracked; others are reduced
 LEAST_CORNERS = 12
-OUTLIER_PX = 5.0
-"""Waves move corners; what lies farther off in the reduced image is a mismatch."""
+OUTLIER_PX = 5.0  # waves move corners; what lies farther off in the reduced image is a mismatch
 
 
 def grey8(image: npt.NDArray[Any], longest_px: int | None = None) -> npt.NDArray[np.uint8]:

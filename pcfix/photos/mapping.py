@@ -31,12 +31,10 @@ from pcfix.model import BoolArray, FloatArray, Lens, WaterMesh, WaterPlane, Wate
 from pcfix.refract.tracing import trace
 from pcfix.water.surface import surface_above
 
+# of the surface for ray casting (200 bytes each); finer rasters are averaged
 MOST_CELLS = 6_000_000
-"""Of the surface for ray casting (200 bytes each); a raster with more is averaged."""
-STRIP_ROWS = 512
-"""Rows resampled at once, so that the places stay in the processor's cache."""
-BANDS_AT_ONCE = 4
-"""OpenCV's limit."""
+STRIP_ROWS = 512  # rows resampled at once, so that the places stay in the processor's cache
+BANDS_AT_ONCE = 4  # OpenCV's limit
 
 
 class Ground:

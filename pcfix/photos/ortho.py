@@ -20,10 +20,8 @@ from pcfix.model import BoolArray, FloatArray
 from pcfix.photos.mapping import Photo, Scene, occluded
 from pcfix.refract.tracing import trace
 
-FEATHER = 0.01
-"""Images are mixed within this difference of tangents from nadir (15 px at f = 1500 px)."""
-SPARE_SHARE = 0.15
-"""Of the frame: a straight ray may end so far outside it while the refracted ray ends inside."""
+FEATHER = 0.01  # images are mixed within this difference of tangents (15 px at f = 1500 px)
+SPARE_SHARE = 0.15  # of the frame, by which a straight ray may miss it where the refracted one hits
 REMAP_COLUMNS = 1024
 
 

@@ -21,8 +21,7 @@ from pcfix.model import BoolArray, FloatArray
 from pcfix.photos.mapping import Ground, Photo
 from pcfix.photos.ortho import Picture
 
-BASE_SHARES = (0.1, 0.3, 0.55)
-"""Shortest, best and longest base, as shares of the shorter side of the image."""
+BASE_SHARES = (0.1, 0.3, 0.55)  # shortest, best and longest base, by the image's shorter side
 SPARE_PX, BLOCK_PX = 4, 5  # disparities beyond those expected, and the side of matched blocks
 
 

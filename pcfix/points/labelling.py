@@ -41,12 +41,10 @@ class WaterMask:
         return np.asarray(shapely.intersects_xy(self.area, x, y))
 
 
-SHARE_OF_LARGEST = 0.1
-"""Pools of at least this share of the area of the largest water body count as water."""
+SHARE_OF_LARGEST = 0.1  # pools with this share of the area of the largest water count as water
 _AROUND = np.ones((3, 3), np.bool_)
 
-PRESENT, BELOW = 1, 2
-"""A cell has points; points below the surface."""
+PRESENT, BELOW = 1, 2  # a cell has points; points below the surface
 
 
 class Pools(NamedTuple):

@@ -21,9 +21,9 @@ from pcfix.running import blocks, bounds, current, empty, grouped, mapped, relea
 
 PIECE_ROWS = 65_536
 LEAF_POINTS = 32
+# Distances whose ratio is smaller than this count as equal: more than rounding, less than any step
+# of a LAS file at the distance of neighbours.
 SLACK = 1.0 + 1e-9
-"""Distances whose ratio is smaller than this count as equal: more than rounding, less than any step
-of a LAS file at the distance of neighbours."""
 
 
 class Neighbours:
@@ -77,12 +77,10 @@ def nearest_distance(places: FloatArray, points: FloatArray) -> FloatArray:
 
 
 POINTS_PER_TILE = 250_000
-MOST_SQUARES = 5_000_000
-"""Squares over which the spacing of points is computed."""
+MOST_SQUARES = 5_000_000  # squares over which the spacing of points is computed
 _MOST_TILES_A_SIDE = 200
 _SAMPLE = 10_000
-_CELLS_ACROSS = 256
-"""Cells of a tile; numpy sorts numbers of 16 bits in linear time."""
+_CELLS_ACROSS = 256  # cells of a tile; numpy sorts numbers of 16 bits in linear time
 
 
 @dataclass(frozen=True, eq=False)

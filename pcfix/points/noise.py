@@ -34,13 +34,13 @@ class Reason(IntFlag):
     FLOATING = 64
 
 
+# The tests of weak intersections: a dimension of a corrected cloud, the reason, and the name of the
+# threshold and on which side of it a point is noise.
 WEAK = {
     "RayCount": (Reason.FEW_RAYS, "min_rays", np.less),
     "RayMiss": (Reason.RAY_MISS, "max_ray_miss", np.greater),
     "Incidence": (Reason.INCIDENCE, "max_incidence", np.greater),
 }
-"""The tests of weak intersections: a dimension of a corrected cloud, the reason, and the name of
-the threshold and on which side of it a point is noise."""
 
 
 class Cloud(NamedTuple):

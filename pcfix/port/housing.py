@@ -35,8 +35,8 @@ class FlatPort:
     distance_m: float  # from the projection centre to the inner face, along the normal
     thickness_m: float = 0.0  # of the glass; 0 for a thin port
     glass_index: float = ACRYLIC_INDEX  # refractive index of the glass relative to air
+    # Normal of the faces, towards the water, camera frame; made a unit vector.
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Normal of the faces, towards the water, camera frame; made a unit vector."""
 
     def __post_init__(self) -> None:
         """Check every value against its rule."""
@@ -66,8 +66,8 @@ class DomePort:
     radius_m: float  # of the inner face
     thickness_m: float = 0.0  # of the glass; 0 for a thin port
     glass_index: float = ACRYLIC_INDEX  # refractive index of the glass relative to air
+    # Centre of the spheres relative to the projection centre, camera frame.
     centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Centre of the spheres relative to the projection centre, camera frame."""
 
     def __post_init__(self) -> None:
         """Check every value against its rule."""
@@ -226,8 +226,7 @@ def cosine_at_port(window: Window, direction: Vector) -> float:
     return dot(s, _at_face(window, 0.0, (0.0, 0.0, 0.0), s)[1])
 
 
-STEPS, CLOSE = 100, 1e-13
-"""Most steps of the search, and the length of the last one as a share of its interval."""
+STEPS, CLOSE = 100, 1e-13  # most steps of the search; its last step as a share of its interval
 
 
 @device
@@ -281,9 +280,9 @@ def _signed_miss(window: Window, n: float, w: Vector, point: Vector, across: Vec
 
 
 BY_PORT = 5  # first column of the derivatives by the position of the port, of `through_port`
+# Steps of central differences: radians, refractive index, and a share of the size of the port. They
+# leave relative errors of about 1e-8.
 BY_DIRECTION, BY_INDEX, BY_PLACE, LEAST_SIZE_M = 3e-5, 3e-4, 3e-5, 0.01
-"""Steps of central differences: radians, refractive index, and a share of the size of the port.
-They leave relative errors of about 1e-8."""
 
 
 @device

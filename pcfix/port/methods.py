@@ -89,10 +89,8 @@ from pcfix.refract.rays import line_terms, nearest_point
 from pcfix.refract.tiling import TILE, are_same, corners_of, near_cameras, spatial_order
 
 MAX_STEPS = 30
-CLOSE_M = 1e-7
-"""Length of the last step; as each squares the error, the next is below a nanometre."""
-ROUNDS = 6
-"""At the border of an image a point may alternate in and out; after so many rounds it stays."""
+CLOSE_M = 1e-7  # length of the last step; as each squares the error, the next is below a nanometre
+ROUNDS = 6  # a point at the border of an image may alternate in and out; then it stays
 
 
 class Rig(NamedTuple):
@@ -243,8 +241,8 @@ def _usable(candidates: IntArray, point: Vector, rig: Rig, through: bool) -> Int
     return usable[:k]
 
 
+# Outcome, shift and rms distance of the rays (m), least cosine at the port, whether converged.
 Solution: TypeAlias = tuple[int, Vector, float, float, bool]
-"""Outcome, shift and rms distance of the rays (m), least cosine at the port, whether converged."""
 
 
 @device(allocates=True)
@@ -273,8 +271,8 @@ def _solve(point: Vector, chosen: IntArray, rig: Rig) -> Solution:
     return CORRECTED, shift, distance, least, converged
 
 
+# u and v, their gradients by the point in the world frame, and their derivatives by n.
 Projected: TypeAlias = tuple[float, float, Vector, Vector, float, float]
-"""u and v, their gradients by the point in the world frame, and their derivatives by n."""
 
 
 @device

@@ -16,8 +16,7 @@ HELP = (
     "Install pcfix into an environment (pip install pcfix), and give that environment, or its"
     " program pcfix, under Settings > Options > Processing > Providers > pcfix."
 )
-PROGRESS = "progress "
-"""The beginning of a line of progress; percent follow."""
+PROGRESS = "progress "  # the beginning of a line of progress; percent follow
 _WAIT_S, _PATIENCE_S = 0.2, 10.0
 
 

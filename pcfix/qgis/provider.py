@@ -15,8 +15,7 @@ PROGRAM = "PCFIX_PROGRAM"
 MESSAGES = "messages"
 CLOUDS = "Point clouds and DSMs (*.las *.laz *.tif *.tiff *.vrt);;All files (*.*)"
 OUTPUTS = "LAZ (*.laz);;LAS (*.las);;GeoTIFF (*.tif)"
-LAYER = "raster_layer"
-"""A field for a raster layer of the project, which replaces the file of a cloud."""
+LAYER = "raster_layer"  # field for a raster layer of the project, instead of the file of a cloud
 
 
 class Plugin:

@@ -30,14 +30,9 @@ if TYPE_CHECKING:
     from pcfix.refract.regression import DepthRegression
 
 NO_CAMERA, ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
-PARALLEL, CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)
-"""Of `Outcome`, for kernels."""
-
-FLAT_DEG = 35.0
-"""Incidence angle beyond which methods differ most; see `reconstructions.LIMITS`."""
-
-ALIKE = ("snell", "shan", "butler", "murase", "dietrich")
-"""Methods that give all rays of a point the same weight."""
+PARALLEL, CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)  # for kernels
+FLAT_DEG = 35.0  # incidence angle beyond which methods differ most; see `reconstructions.LIMITS`
+ALIKE = ("snell", "shan", "butler", "murase", "dietrich")  # all rays of a point count alike
 
 
 class Learned(NamedTuple):

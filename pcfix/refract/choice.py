@@ -27,16 +27,15 @@ from pcfix.refract.rays import light_near, pierce
 from pcfix.refract.tiling import TILE, three
 from pcfix.water.surface import Field, SurfaceAbove, Tin, build_fields, build_tin
 
-NOMINAL_FOCAL_PX = 3700.0
-"""Of cameras without a lens: a survey drone's of 20 megapixels, 0.27 mrad a pixel."""
+NOMINAL_FOCAL_PX = 3700.0  # without a lens: a survey drone's of 20 megapixels, 0.27 mrad a pixel
 
+# Cameras without a lens have no frame to leave; nobody matches images as flat as this, and a block
+# in another CRS is recognised by it.
 MAX_ANGLE_WITHOUT_FRAMES_DEG = 80.0
-"""Cameras without a lens have no frame to leave; nobody matches images as flat as this, and a
-block in another CRS is recognised by it."""
 
+# Largest distance of the image of a true point from that of its apparent point, by the longer side
+# of the frame: the residuals of refraction, which straight rays cannot fit.
 REACH = 0.03
-"""Largest distance of the image of a true point from that of its apparent point, by the longer side
-of the frame: the residuals of refraction, which straight rays cannot fit."""
 
 
 class Rig(NamedTuple):

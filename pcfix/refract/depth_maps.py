@@ -64,30 +64,26 @@ from pcfix.refract.tiling import TILE, are_same, put, slots, three
 MAX_STEPS = 5
 CLOSE_M = 0.002  # step of the bed below which the rest is linear
 
+# Beds for which the maps of a list are averaged again; the least change from one bed to the next,
+# relative to its depth below P.
 _BEDS_OF_LIST, FAR = 3, 0.1
-"""Beds for which the maps of a list are averaged again; the least change from one bed to the next,
-relative to its depth below P."""
 
+# Height of the first bed, in terms of (n - 1) times the apparent depth; the least depth.
 LIKELY, LEAST_DEPTH_M = 1.1, 0.005
-"""Height of the first bed, in terms of (n - 1) times the apparent depth; the least depth."""
 
-SHALLOW, DEEP = 0.3, 3.5
-"""Range of the bed of the surroundings, in heights of the first bed; outliers have it elsewhere."""
+SHALLOW, DEEP = 0.3, 3.5  # range of the surrounding bed, in heights of the first; outliers leave it
 
+# Distance to the other bed with which the change is computed, relative to the height of the bed;
+# the largest relative difference from the estimated change.
 RISE, STEEP = 0.1, 0.3
-"""Distance to the other bed with which the change is computed, relative to the height of the bed;
-the largest relative difference from the estimated change."""
 
-LEAST_CHANGE, MOST_CHANGE = 0.35, 1.5
-"""Range of the change of the apparent depth with that of the bed along a ray."""
-
+LEAST_CHANGE, MOST_CHANGE = 0.35, 1.5  # of the apparent depth with that of the bed along a ray
 NOTHING = 14.0  # exp(-NOTHING), a millionth, is neglected
 
+# Angle of the ray of a base image from the vertical at which it is e times less frequent.
 BASE_RAY_DEG, LEAST_PRIOR = 27.0, 1e-4
-"""Angle of the ray of a base image from the vertical at which it is e times less frequent."""
 
-SINGLE = ("single-map", "nearest-map")
-"""Names of `pcfix.options` for software that keeps one map at each place."""
+SINGLE = ("single-map", "nearest-map")  # software that keeps one map at each place
 
 _OUTSIDE = -2
 

@@ -39,25 +39,19 @@ from pcfix.kernels import Span, device, in_tiles, kernel
 from pcfix.model import FloatArray, IntArray
 from pcfix.refract.matcher import Matcher
 
-AVERAGED_WITHIN = 0.012
-"""Depths of neighbouring maps that differ by less, relative, are averaged before the fusion."""
-
+AVERAGED_WITHIN = 0.012  # relative difference of neighbouring maps that are averaged before fusion
 AGREE = 0.01  # depths that differ by less, relative, are fused
-
 _ROUNDS, _ROUNDS_OF_LIST = 1, 2  # how often the maps are chosen again for the bed of a group
 
 ABSENT = -1
 
 POINTS_A_CELL, MOST_CELLS = 12.0, 4_000_000
-WIDTH_GSD = 2.0
-"""Standard deviation of the likely beds of one place: relief within a cell, and noise."""
-OUTLIER = 0.01
-"""Likelihood of a point none of whose likely beds is near, relative to one that has one there."""
-BINS, DEVIATIONS = 2.0, 3
-"""Bins for a standard deviation of the likely beds, and how many deviations count to both sides."""
+WIDTH_GSD = 2.0  # standard deviation of the likely beds of a place: relief in a cell, and noise
+OUTLIER = 0.01  # likelihood of a point without a likely bed near it, relative to one with a bed
+BINS, DEVIATIONS = 2.0, 3  # bins per standard deviation of likely beds; deviations to both sides
+# A cell that is farther than this from the median of its neighbours, up to `REACH` cells to each
+# side, gets that median.
 FAR_OFF_M, REACH = 0.4, 2
-"""A cell that is farther than this from the median of its neighbours, up to `REACH` cells to each
-side, gets that median."""
 
 
 class PointMaps(NamedTuple):

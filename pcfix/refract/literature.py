@@ -28,13 +28,12 @@ from pcfix.model import BoolArray, Cameras, FloatArray, Outcome
 from pcfix.refract.batch import Batch, Chosen, Intersection
 from pcfix.refract.rays import MIN_DETERMINANT
 
-TOLERANCE = 1e-9
-"""Of tan a between two iterations of `shan`; the depth then changes by less than 1e-9 of itself."""
+TOLERANCE = 1e-9  # of tan a between iterations of `shan`; depths change by less than 1e-9
 MOST_ITERATIONS = 50
 
+# Of the refracted rays of a point: how far below P each crosses the plumb line, metres; how it
+# leans, metres aside in x and y per metre down; and s = tan a / tan b, true by apparent depth.
 Crossings: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""Of the refracted rays of a point: how far below P each crosses the plumb line, metres; how it
-leans, metres aside in x and y per metre down; and s = tan a / tan b, true by apparent depth."""
 
 _MEAN, _PAIRS, _S_MODEL = range(3)
 
@@ -302,10 +301,8 @@ def _s_model(
     return x, y, sunk, True
 
 
-NADIR_DEG = 15.0
-"""An image that looks further to the side does not count: the formula is of vertical ones."""
-NODES = 100
-"""Of the overlap, along each side; the mean is the same to five digits with twice as many."""
+NADIR_DEG = 15.0  # images that look further to the side do not count: the formula is for nadir
+NODES = 100  # of the overlap, along each side; twice as many change no digit of five
 
 
 @dataclass(frozen=True)

@@ -32,17 +32,15 @@ LEAST_ANGLE_DEG, LARGEST_ANGLE_DEG, LEAST_ANGLE_WEIGHT = 3.0, 65.0, 0.1
 REPEATED_DEG = 45.0
 CELLS = 16  # along each side of an image, to measure the area that common places cover
 LEAST_AREA, SCALE_RANGE = 0.05, (0.2, 3.2)
-FINER = 1.6
-"""Ratio of distances up to which an image is as good as one as far away as the reference."""
+FINER = 1.6  # ratio of distances up to which an image is as good as at that of the reference
 
 TOLERANCE_PX2 = 0.1
 WIDTH_M, NEAR_WIDTH_M = 0.2, 0.06
-BORDER_PX = 8.0
-"""Half the width of a patch of 9 pixels at half resolution."""
+BORDER_PX = 8.0  # half the width of a patch of 9 pixels at half resolution
 
+# Of software that does not average maps: the stereo models of a base image, and how many of them
+# must show a place.
 NEAR, BASE_TO_HEIGHT, AXES_WITHIN_DEG, LEAST_NEAR = 12, (0.1, 0.5), 30.0, 3
-"""Of software that does not average maps: the stereo models of a base image, and how many of them
-must show a place."""
 
 
 class Matcher(NamedTuple):

@@ -24,11 +24,11 @@ from pcfix.water.surface import SurfaceAbove
 if TYPE_CHECKING:
     from pcfix.refract.fusion import Bed
 
-POINTS_AT_ONCE = 100_000
-"""Bounds the memory of the lists of cameras: some 50 MB at 40 rays per point."""
-BED_POINTS = 100_000
-"""Every second point of a larger sample is enough for the bed, which most of its time goes into."""
+POINTS_AT_ONCE = 100_000  # bounds the memory of lists of cameras: some 50 MB at 40 rays a point
+BED_POINTS = 100_000  # points of a sample that are enough for the bed, which takes longest
 
+# Module and function by the names of `pcfix.options.Method`: a new method is a function and an
+# entry.
 METHODS = {
     "snell": "intersect.intersect",
     "consistent": "intersect.consistent",
@@ -39,10 +39,8 @@ METHODS = {
     "factor": "literature.factor",
     "regression": "literature.regression",
 }
-"""Module and function by the names of `pcfix.options.Method`: a new method is a function and an
-entry."""
+# What `consistent` is for dense clouds.
 _MAPS, _PAIRS = "depth_maps.invert_depth_maps", "stereo_pairs.invert_pairs"
-"""What `consistent` is for dense clouds."""
 
 
 def correct(batch: Batch) -> Intersection:

@@ -28,22 +28,20 @@ from pcfix.sums import MOST_CELLS, Cells, Layer
 Heights = npt.NDArray[np.float32]
 
 NEAR_CELLS = 2.0  # distance from the point, in plan, within which nothing occludes it
+# Cells along the side of the blocks whose highest cell is known, to pass them at once. Without the
+# larger ones rays take half as long again.
 BLOCK, LARGE_BLOCK = 8, 64
-"""Cells along the side of the blocks whose highest cell is known, to pass them at once. Without
-the larger ones rays take half as long again."""
 MARGIN_BLOCK = 16
 _ONWARD = 1e-6  # step past the edge of a cell into the next one, in cells
-
-CELLS_A_POINT = 16
-"""Most cells per point at first, so that a cloud may fill a sixteenth of its rectangle."""
+CELLS_A_POINT = 16  # most cells per point at first; a cloud may fill a sixteenth of its box
 WIDE_GAP = 0.75
+# The margin is 4.5 times the upper quartile, over the cells of a block, of the gap between the
+# highest two points of a cell: four standard deviations of noise, without walls.
 GAPS_TO_MARGIN = 4.5
-"""The margin is 4.5 times the upper quartile, over the cells of a block, of the gap between the
-highest two points of a cell: four standard deviations of noise, without walls."""
 FEWEST_CELLS = 9  # with heights, in a block with a margin of its own
+# An image whose axis is farther off the nadir is an oblique. The axes of stabilised nadir blocks
+# stay within a few degrees; obliques are flown at 20 and more.
 OBLIQUE_DEG = 15.0
-"""An image whose axis is farther off the nadir is an oblique. The axes of stabilised nadir blocks
-stay within a few degrees; obliques are flown at 20 and more."""
 
 
 class Occluder(NamedTuple):

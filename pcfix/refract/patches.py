@@ -42,40 +42,30 @@ from pcfix.model import FloatArray, IntArray
 from pcfix.refract.batch import Batch, stacked
 from pcfix.running import current
 
+# To detect the type, and to test one that the user set: the standard error of the evidence is
+# mostly that of the models, which more patches do not lower.
 PATCHES, TEST_PATCHES = 750, 500
-"""To detect the type, and to test one that the user set: the standard error of the evidence is
-mostly that of the models, which more patches do not lower."""
 FEWEST_POINTS = 400
-PATCH_POINTS = (32, 16)
-"""Of a patch, or of sparse clouds."""
-FEWEST_WITHOUT_LIST = 2000
-"""Fewer are tie points, and their patches overlap."""
+PATCH_POINTS = (32, 16)  # of a patch, or of sparse clouds
+FEWEST_WITHOUT_LIST = 2000  # fewer are tie points, and their patches overlap
 
+# In flying heights: so wide that image borders cross many patches. In wider ones relief hides the
+# discontinuities.
 PATCH_WIDTH, WIDEST_PATCH = 0.04, 0.055
-"""In flying heights: so wide that image borders cross many patches. In wider ones relief hides the
-discontinuities."""
 
+# Share of the points, nearest to where the nearest image changes, that the patches of dense clouds
+# lie around: only there the maps of nearest images leave discontinuities.
 BORDER_SHARE = 0.08
-"""Share of the points, nearest to where the nearest image changes, that the patches of dense clouds
-lie around: only there the maps of nearest images leave discontinuities."""
 
-GRID_SHARE = 0.9
-"""Share of neighbours whole steps apart from which a cloud is a grid."""
-
-SMOOTH_GSD = 0.02
-"""Least scatter of neighbours: image noise leaves ten times that."""
-
-SQUARE_PATCHES, MOST_IN_SQUARES = 5.0, 1_000_000
-"""Width of a square, in patches; most points in squares."""
-
-_MIX = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0xD6E8FEB86659FD93)
-"""Odd numbers of a hash."""
-
+GRID_SHARE = 0.9  # share of neighbours whole steps apart from which a cloud is a grid
+SMOOTH_GSD = 0.02  # least scatter of neighbours: image noise leaves ten times that
+SQUARE_PATCHES, MOST_IN_SQUARES = 5.0, 1_000_000  # width of a square in patches; points in squares
+_MIX = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0xD6E8FEB86659FD93)  # odd numbers of a hash
 _TERMS = 6  # coefficients of a quadratic surface
 
+# Groups of neighbours: the m rows of a batch that are in one, and their places among these rows,
+# shape (p, 32) or (p, 16), patch by patch.
 Patches: TypeAlias = tuple[IntArray, IntArray]
-"""Groups of neighbours: the m rows of a batch that are in one, and their places among these rows,
-shape (p, 32) or (p, 16), patch by patch."""
 
 
 def patches_of(batch: Batch, *, at_borders: bool, most: int = PATCHES) -> Patches | None:
@@ -252,23 +242,17 @@ def grid_m(xyz: FloatArray) -> float | None:
 
 
 FOLDS = 4
-STARTS = (0.0, 0.75, -0.75, 1.5, -1.5)
-"""First beds, above that through the mean candidates, by the spread of these."""
+STARTS = (0.0, 0.75, -0.75, 1.5, -1.5)  # first beds, above that through the mean, by its spread
+# Noise of the steps to the bed, by sigma: wide at first, so that no candidate is excluded.
 WIDER = (3.0, 2.0, 1.4, 1.0, 1.0)
-"""Noise of the steps to the bed, by sigma: wide at first, so that no candidate is excluded."""
-AGAIN = WIDER[-2:]
-"""The same from a bed that was found with another sigma."""
-FREEDOM, DENSITY = 7.0, 0.385
-"""Degrees of freedom of t, with which the power is a whole number, and t(0)."""
-SIGMA_GSD, SIGMAS_GSD = 0.8, (0.05, 30.0)
-"""First noise, and its range."""
-OUTLIER_GSD = 0.01
-"""Density of points that are mismatches, per ground pixel."""
-MOST_A_POINT = 0.25
-"""Largest difference of two log likelihoods, per point: one patch decides nothing."""
+AGAIN = WIDER[-2:]  # the same from a bed that was found with another sigma
+FREEDOM, DENSITY = 7.0, 0.385  # degrees of freedom of t, for a whole number as power, and t(0)
+SIGMA_GSD, SIGMAS_GSD = 0.8, (0.05, 30.0)  # first noise, and its range
+OUTLIER_GSD = 0.01  # density of points that are mismatches, per ground pixel
+MOST_A_POINT = 0.25  # difference of two log likelihoods a point at most: no patch decides alone
+# Standard error of the mean difference, per point, as no model is exact: of simulated and rendered
+# clouds of every type.
 MODEL_ERROR = 0.0125
-"""Standard error of the mean difference, per point, as no model is exact: of simulated and rendered
-clouds of every type."""
 
 
 class Candidates(NamedTuple):

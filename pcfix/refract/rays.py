@@ -85,9 +85,9 @@ def line_terms(a: Vector, d: Vector, inv_length2: float) -> Nine:
     return d[0] * t[0], d[0] * t[1], d[0] * t[2], d[1] * t[1], d[1] * t[2], bx, by, bz, s
 
 
+# Least determinant of M / k. Two rays at an angle alpha have alpha^2 / 4: 1e-6 is a tenth of a
+# degree, far below any usable base, and keeps rounding below 1e-9 m.
 MIN_DETERMINANT = 1e-6
-"""Least determinant of M / k. Two rays at an angle alpha have alpha^2 / 4: 1e-6 is a tenth of a
-degree, far below any usable base, and keeps rounding below 1e-9 m."""
 
 
 @device
@@ -119,8 +119,7 @@ def ray_distance(k: float, s: Nine, q: Vector) -> float:
 
 
 PIERCING_STEPS = 64
-CLOSE_M = 1e-9
-"""Along the vertical: a thousandth of any use, and above the rounding of heights (1e-12 m)."""
+CLOSE_M = 1e-9  # along the vertical: a thousandth of any use, above the rounding of heights (1e-12)
 
 
 @device
@@ -156,8 +155,7 @@ def pierce(
     return f, normal
 
 
-Path: TypeAlias = tuple[float, float, float, float, Vector]
-"""k, S, H, D and s."""
+Path: TypeAlias = tuple[float, float, float, float, Vector]  # k, S, H, D and s
 
 NEWTON_STEPS = 40
 CLOSE = 1e-8  # relative step of k: each step squares the error, so that the next is below rounding
@@ -229,8 +227,8 @@ def direction(path: Path, normal: Vector) -> Vector:
 
 
 COLUMNS = 12
+# First columns of `light_and_gradients`.
 DIRECTION, BY_POINT, BY_CENTRE, BY_LEVEL, BY_SLOPES, BY_INDEX = 0, 1, 4, 7, 8, 10
-"""First columns of `light_and_gradients`."""
 
 
 @device

@@ -32,33 +32,26 @@ from pcfix.refract.batch import FLAT_DEG, Batch, ModelUncertainty
 from pcfix.refract.methods import bed_around, correct, with_rays
 from pcfix.refract.patches import MODEL_ERROR, SMOOTH_GSD, Candidates, scatter_m, shares
 
-SURE = 2.3264
-"""Standard errors of a significant difference: 99 %."""
+SURE = 2.3264  # standard errors of a significant difference: 99 %
+# In standard errors: against single maps in a sparse cloud, as theirs are dense; for tracks in a
+# dense and in a sparse one, as tie points are tens of pixels apart; and for the software.
 PRIOR_SPARSE, PRIOR_TRACKS, PRIOR_SOFTWARE = 8.0, (-0.5, 0.7), 1.0
-"""In standard errors: against single maps in a sparse cloud, as theirs are dense; for tracks in a
-dense and in a sparse one, as tie points are tens of pixels apart; and for the software."""
-SHARE_ERROR = 0.08
-"""Standard error of a share from what the models neglect."""
-WEAK = 3.0
-"""Divisor of the evidence of clouds that were smoothed."""
-MOST_CONFIDENCE = 0.99
-"""Larger ones were not tested (`tests.benchmarks.detection`)."""
-LEAST_PATCHES = 100
-"""With all their points corrected for each type; with fewer nothing is decided."""
+SHARE_ERROR = 0.08  # standard error of a share from what the models neglect
+WEAK = 3.0  # divisor of the evidence of clouds that were smoothed
+MOST_CONFIDENCE = 0.99  # larger ones were not tested (`tests.benchmarks.detection`)
+LEAST_PATCHES = 100  # with all their points corrected for each type; with fewer nothing is decided
+# Probability of another type up to which its difference does not count as uncertainty, and from
+# which all of it counts: odds of 100 : 1 and 20 : 1.
 OPEN = (1.0 / 101.0, 1.0 / 21.0)
-"""Probability of another type up to which its difference does not count as uncertainty, and from
-which all of it counts: odds of 100 : 1 and 20 : 1."""
-COVERED = 0.95
-"""Least share of the points that must be corrected, of those that are for most types."""
-LEAST_DEPTH_M = 0.1
-"""In shallower water the ratio of two depths means little."""
+COVERED = 0.95  # least share of the points that must be corrected, of those that are for most types
+LEAST_DEPTH_M = 0.1  # in shallower water the ratio of two depths means little
+# Largest share of the discontinuities that the right type leaves; for stereo pairs it may be more.
+# With moved cameras, and for smoothed clouds, the best type has 0.35 to 0.48. A wrong water level
+# does not change the share.
 FITS = 0.3
-"""Largest share of the discontinuities that the right type leaves; for stereo pairs it may be more.
-With moved cameras, and for smoothed clouds, the best type has 0.35 to 0.48. A wrong water level
-does not change the share."""
+# A share below this means discontinuities that were never there: of good blocks nothing lies three
+# standard errors beyond.
 MOST_BEYOND = -0.5
-"""A share below this means discontinuities that were never there: of good blocks nothing lies three
-standard errors beyond."""
 CAUSES = (
     "No reconstruction type fits this cloud well. Check that the cameras belong to it, that the"
     " poses have not absorbed refraction (pcfix cameras), and that the cloud was not filtered or"
@@ -87,14 +80,14 @@ class Reconstruction(NamedTuple):
 _TRACKS, _MAPS, _PAIRS = "tracks", "depth maps", "stereo pairs"
 _SINGLE, _NEAREST = "single depth maps", "single depth maps of the nearest images"
 _MVS = {"method": "consistent", "camera_set": "mvs"}
+# `MODEL_ERROR` where it differs. Tracks and nearest maps name one place for each point: the right
+# one was better in each of 18 clouds. The noise of stereo pairs is not modelled, so that tracks and
+# fused maps seem better than pairs by up to 0.03 in clouds of pairs.
 MODEL_ERRORS = {
     frozenset((_TRACKS, _NEAREST)): 0.005,
     frozenset((_TRACKS, _PAIRS)): 0.018,
     frozenset((_MAPS, _PAIRS)): 0.018,
 }
-"""`MODEL_ERROR` where it differs. Tracks and nearest maps name one place for each point: the right
-one was better in each of 18 clouds. The noise of stereo pairs is not modelled, so that tracks and
-fused maps seem better than pairs by up to 0.03 in clouds of pairs."""
 
 IN_FRAME = (
     Reconstruction(_TRACKS, {"method": "consistent", "camera_set": "all"}),
@@ -108,6 +101,7 @@ LISTED = (
     Reconstruction(_MAPS, {"method": "consistent"}, "depth-maps"),
     Reconstruction(_PAIRS, {"method": "consistent"}, "pairs"),
 )
+# The rays that may have been used in the reconstruction, for the methods of `ALIKE`.
 LIMITS = (
     Reconstruction("all rays", {"method": "snell"}),
     Reconstruction(
@@ -115,19 +109,18 @@ LIMITS = (
         {"method": "snell", "max_angle": FLAT_DEG},
     ),
 )
-"""The rays that may have been used in the reconstruction, for the methods of `ALIKE`."""
 
+# Types of dense clouds by a word in the name of the software. OpenMVS, which ODM calls, and COLMAP
+# fuse depth maps (their sources); Metashape merges the depth maps of single images (its manual);
+# SURE triangulates a base image with several others (Rothermel et al. 2012); MicMac computes a
+# depth map for each image (its manual, PIMs) or stereo models. For RealityCapture there is no
+# source: fused maps are assumed. Those of Pix4D and DJI Terra are unknown.
 SOFTWARE: dict[str, tuple[str, ...]] = {
     "openmvs": (_MAPS,), "odm": (_MAPS,), "opendronemap": (_MAPS,), "opensfm": (_MAPS,),
     "colmap": (_MAPS,), "realitycapture": (_MAPS,), "realityscan": (_MAPS,),
     "metashape": (_SINGLE,), "photoscan": (_SINGLE,), "sure": (_SINGLE, _PAIRS),
     "micmac": (_SINGLE, _PAIRS),
 }  # fmt: skip
-"""Types of dense clouds by a word in the name of the software. OpenMVS, which ODM calls, and COLMAP
-fuse depth maps (their sources); Metashape merges the depth maps of single images (its manual); SURE
-triangulates a base image with several others (Rothermel et al. 2012); MicMac computes a depth map
-for each image (its manual, PIMs) or stereo models. For RealityCapture there is no source: fused
-maps are assumed. Those of Pix4D and DJI Terra are unknown."""
 
 
 class Hint(NamedTuple):

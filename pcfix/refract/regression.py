@@ -13,9 +13,9 @@ from pcfix.points.labelling import Part
 from pcfix.water.fit import NearestPoints
 from pcfix.water.surface import is_submerged
 
+# A line through two check depths fits whatever they are; a third is the first that can disagree.
+# Below ten the standard errors are themselves only known to a quarter or worse.
 LEAST_COUNT, FEW = 3, 10
-"""A line through two check depths fits whatever they are; a third is the first that can disagree.
-Below ten the standard errors are themselves only known to a quarter or worse."""
 _SAME_M = 1e-3
 
 
@@ -133,9 +133,9 @@ def fit_depths(apparent_m: FloatArray, true_m: FloatArray) -> DepthRegression:
 
 NEIGHBOURS = 16
 MOST_PLACES = 1000  # that the distance between neighbours is taken at
+# In distances between neighbours. On a grid that is 50 points; of points strewn at random, where
+# the nearest neighbour is closer than on a grid, 10.
 REACH = 4.0
-"""In distances between neighbours. On a grid that is 50 points; of points strewn at random, where
-the nearest neighbour is closer than on a grid, 10."""
 
 
 def apparent_depths(

@@ -69,10 +69,8 @@ from pcfix.refract.intersect import add_camera
 from pcfix.refract.rays import MIN_DETERMINANT, light_near, nearest_point, ray_distance
 from pcfix.refract.tiling import TILE, nine, put, slots, three
 
-STEPS, MAX_STEPS = 3, 40
-"""Steps of a tile, after which the points that are not found yet form new ones; most steps."""
-CLOSE_M = 2e-4
-"""Largest distance of the median from P before the last step, which leaves some millionths."""
+STEPS, MAX_STEPS = 3, 40  # of a tile, after which its remaining points form new ones; most steps
+CLOSE_M = 2e-4  # of the median from P before the last step, which leaves some millionths
 ABSENT = -1
 
 # Columns of a search: Q, the nearest Q so far, F there and its size, the share of a step, whether

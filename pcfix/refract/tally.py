@@ -13,9 +13,7 @@ import numpy as np
 from pcfix.model import BoolArray, Correction, FloatArray, IntArray, Outcome
 from pcfix.sums import LEAST, MOST, SAME, Sums
 
-COVERAGE_95 = 1.96
-"""Standard errors of a Gaussian quantity within which 95 % lie, as S-44 takes it in one dimension.
-"""
+COVERAGE_95 = 1.96  # standard errors of a Gaussian that hold 95 %, in one dimension as in S-44
 REASONS = {
     Outcome.NO_CAMERA: "outside the frames of all cameras, or without a camera in the view list",
     Outcome.ONE_CAMERA: "only one usable ray",
@@ -33,14 +31,13 @@ class Order(NamedTuple):
     b: float
 
 
+# IHO S-44, edition 6, table 1, strictest first; 1a and 1b differ in what must be found, not here.
 ORDERS = (
     Order("Exclusive", 0.15, 0.0075),
     Order("Special", 0.25, 0.0075),
     Order("1a/1b", 0.5, 0.013),
     Order("2", 1.0, 0.023),
 )
-"""IHO S-44, edition 6, table 1, strictest first; 1a and 1b differ in what must be found, not here.
-"""
 
 
 def largest_tvu_m(order: Order, depth_m: FloatArray) -> FloatArray:

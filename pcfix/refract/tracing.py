@@ -44,18 +44,16 @@ METHODS = ("kotowski", "afrt", "mdfrt", "scattershot")
 
 BLOCK = 32_768  # endpoints traced at once
 CLOSE_M = 1e-9  # a step that ends a search: no finer than UTM northings allow in doubles
+# In depths: a step that is taken although it seems to lead away, as it may from one patch of a
+# broken surface to the next.
 SHORT = 0.1
-"""In depths: a step that is taken although it seems to lead away, as it may from one patch of a
-broken surface to the next."""
 SEARCH_STEPS, HALVINGS = 60, 24  # most steps of a search, and most halvings of a step
-DIFFERENCE_M = 1e-6
-"""Distance of the places for differences; with less, rounding exceeds what differences neglect."""
+DIFFERENCE_M = 1e-6  # between places for differences; with less, rounding is the larger error
+# Of the straight line: the search starts below the camera even where a tilted water is higher above
+# the point than the camera.
 HIGHEST_START = 0.95
-"""Of the straight line: the search starts below the camera even where a tilted water is higher
-above the point than the camera."""
 KNOTS, SHOTS = 10, 200  # to each side of the first grid of `scattershot`; most grids
-BLUNT_M = 1e-7
-"""Half the grid below which the lengths of neighbouring paths are the same by rounding."""
+BLUNT_M = 1e-7  # half the grid below which neighbouring paths are equally long by rounding
 NEIGHBOUR_M = 1e-4
 CREASE_M = 1e-7  # a path by which the ray misses the point by more goes through a crease
 NEAR = 0.25  # in depths: how far around the end of a method the shortest path is searched
@@ -278,8 +276,8 @@ def _path(pairs: Endpoints, method: str) -> Paths:
     return pierced, on_crease
 
 
+# Places where light pierces the surface, a column for each, and a property of each.
 Paths: TypeAlias = tuple[FloatArray, BoolArray]
-"""Places where light pierces the surface, a column for each, and a property of each."""
 
 
 def _search(pairs: Endpoints, start: FloatArray, level: FloatArray, method: str) -> Paths:

@@ -40,8 +40,8 @@ from pcfix.refract.rays import light_near, settle
 from pcfix.refract.tiling import TILE, add_three, inverse_of, nine, product_of, put, slots, three
 from pcfix.water.surface import Field, Tin, field_of
 
+# Two or three are usual. A point that is not found by then starts again, and may need many.
 STEPS, MOST_STEPS = 4, 60
-"""Two or three are usual. A point that is not found by then starts again, and may need many."""
 
 CLOSE_M = 1e-7  # estimated distance from the solution, from the last two steps
 

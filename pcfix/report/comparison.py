@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TIMES = (("before", "uncorrected", BEFORE), ("after", "corrected", AFTER))
-FURTHER = ("#6a3d9a", "#33804d", "#c51b7d", "#8c6d1f", "#5f6b73")
-"""Colours of further clouds, in turn."""
+FURTHER = ("#6a3d9a", "#33804d", "#c51b7d", "#8c6d1f", "#5f6b73")  # of further clouds, in turn
+# The errors of a comparison, and their titles.
 KINDS = {
     "vertical": "Vertical error",
     "bed": "Bed, vertical error",
@@ -32,7 +32,6 @@ KINDS = {
     "c2c": "C2C to reference",
     "c2c_from_reference": "C2C from reference",
 }
-"""The errors of a comparison, and their titles."""
 MOMENTS = {
     "mean": "mean_m", "sd": "sd_m", "RMSE": "rmse_m", "NMAD": "nmad_m", "median": "median_m",
 }  # fmt: skip

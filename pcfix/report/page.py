@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+# Colours of different lightness, for readers with colour blindness.
 BEFORE, AFTER, WATER, REFERENCE = "#b3541e", "#0b5e8a", "#4aa3c7", "#222222"
-"""Colours of different lightness, for readers with colour blindness."""
 
 
 def new_figure(width_in: float = 8.0, height_in: float = 4.5, **grid: Any) -> tuple[Figure, Any]:
@@ -163,8 +163,8 @@ class Report:
     files: Sequence[tuple[str, str]] = ()  # path from the page, and its contents
 
 
+# The folders of an absolute path, which mean nothing to a reader elsewhere.
 _FOLDERS = re.compile(r"(?<![\w.:/~-])(?:[A-Za-z]:)?[/\\](?:[^/\\\s:*?\"<>|]+[/\\])+")
-"""The folders of an absolute path, which mean nothing to a reader elsewhere."""
 
 
 def name_of(path: str) -> str:

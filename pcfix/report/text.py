@@ -27,10 +27,9 @@ Plain = dict[str, Any]
 Rows = list[tuple[str, str]]
 RowTable = tuple[tuple[str, str, str], ...]
 
+# Differences of which all keep an order before 95 % of all are likely to: 0.95^59 is 0.05.
 FEWEST = 59
-"""Differences of which all keep an order before 95 % of all are likely to: 0.95^59 is 0.05."""
-WIDTH = 100
-"""Columns of a printed line."""
+WIDTH = 100  # columns of a printed line
 
 _NO_SURFACE = ("No surface", "{water_unknown:,} points have no water surface", "water_unknown")
 _LABELLING: RowTable = (
@@ -70,6 +69,7 @@ _CORRECTED: RowTable = (
     ("Poses", "{poses[words]}", "poses"),
     *_LABELLING,
 )  # fmt: skip
+# By command: the line that says what was done, and the rows below it.
 _TABLES: dict[str, tuple[str, RowTable]] = {
     "correct": ("Corrected {input} -> {output}      {points:,} points in {seconds:.1f} s",
                 _CORRECTED),
@@ -137,7 +137,6 @@ _TABLES: dict[str, tuple[str, RowTable]] = {
         ("Images", "{images}, without refraction", "is_dry"),
     )),
 }  # fmt: skip
-"""By command: the line that says what was done, and the rows below it."""
 
 
 class Summary(Figures):
@@ -304,8 +303,8 @@ def summary_rows(s: Summary, measured: Plain | None = None) -> Rows:
     })  # fmt: skip
 
 
+# Of the standard deviations of a budget.
 _UNITS = {"image": " px", "index": "", "waves": " deg", "centre": " m", "attitude": " deg"}
-"""Of the standard deviations of a budget."""
 
 
 def formal_words(s: Summary) -> str:

@@ -22,8 +22,7 @@ from pcfix.simulate.tracing import (
 
 ORIGIN_M = np.array([410_200.0, 4_650_300.0, 0.0])  # in UTM zone 33 north
 EPSG = 32633
-PAIRS_AT_ONCE = 2_000_000
-"""Points times images that are traced at once, which bounds the memory."""
+PAIRS_AT_ONCE = 2_000_000  # points times images that are traced at once, which bounds the memory
 
 
 @dataclass(frozen=True, eq=False)

@@ -195,6 +195,8 @@ class Bed(NamedTuple):
     above_water: Callable[[Terrain, FloatArray, FloatArray], FloatArray]
 
 
+# Flat: one depth everywhere; slope: from the waterline at x = 0 to the greatest depth at the end. A
+# new kind is an entry here and in `BedKind`.
 BEDS: dict[BedKind, Bed] = {
     "shore": Bed(GREATEST_DEPTH_M, _shore),
     "flat": Bed(3.0, lambda ground, x, y: np.full(len(x), -ground.greatest_depth_m)),
@@ -202,5 +204,3 @@ BEDS: dict[BedKind, Bed] = {
     "steps": Bed(6.0, _steps),
     "river": Bed(2.5, _river),
 }
-"""Flat: one depth everywhere; slope: from the waterline at x = 0 to the greatest depth at the end.
-A new kind is an entry here and in `BedKind`."""

@@ -34,9 +34,9 @@ INSTEAD = "Give the water surface: a level, shoreline points, plane:a,b,c or a m
 class WaterProposal(FoundSurface):
     """A water level found in a cloud."""
 
+    # Standard error of its height, by resampling tiles of the cloud. It does not include errors
+    # that all of the shore shares, such as a bank that stops at the water.
     sigma_level_m: float
-    """Standard error of its height, by resampling tiles of the cloud. It does not include errors
-    that all of the shore shares, such as a bank that stops at the water."""
     level_m: float
     confidence: float  # 0 to 1, by how much the evidence exceeds what is refused
     evidence: dict[str, float]  # figures by name
@@ -76,11 +76,10 @@ def find_water(xyz: FloatArray, rgb: npt.NDArray[Any] | None = None) -> WaterPro
     return _judged(_scanned(sample_cloud(xyz, rgb)))
 
 
-DIFFERENT_M, DIFFERENT_SIGMAS = 0.5, 3.0
-"""A level is only reported as another one if it differs by more than both."""
+DIFFERENT_M, DIFFERENT_SIGMAS = 0.5, 3.0  # a level that differs by more than both is another one
+# Evidence of colours only, or confidence of slope and colours together, that contradicts a given
+# level. They are higher than for `find_water`, to avoid false alarms.
 LEAST_AGAINST, SURE_AGAINST = 100.0, 0.8
-"""Evidence of colours only, or confidence of slope and colours together, that contradicts a given
-level. They are higher than for `find_water`, to avoid false alarms."""
 
 
 def find_elsewhere(
@@ -111,11 +110,10 @@ def find_elsewhere(
 
 
 COARSE_M, FINE_M, MOST_HEIGHTS = 0.04, 0.01, 800
+# Half of the heights in fine steps, and the largest difference of two heights of one waterline.
 FINE_REACH_M, SAME_PLACE_M = 0.6, 0.3
-"""Half of the heights in fine steps, and the largest difference of two heights of one waterline."""
 DRAWS = 120
-LEAST_SIGMA_M = 0.015
-"""Least standard error of a waterline, from waves and the thickness of the cloud."""
+LEAST_SIGMA_M = 0.015  # least standard error of a waterline: waves, thickness of the cloud
 
 
 class Scan(NamedTuple):
@@ -162,15 +160,15 @@ def _gains(scan: Scan, rng: np.random.Generator | None = None) -> FloatArray:
 
 
 LEAST_EACH = 3.0  # least gain of a cue that counts
+# Least total gain, and largest share of it that another height may have, by the cues that count.
+# Physics gives the size of the change of slope; colours may change with height on land too, so that
+# they need more evidence where they are the only cue.
 NEEDED = {
     ("slope", "red/green"): (12.0, 0.75),
     ("slope",): (25.0, 0.5),
     ("red/green",): (40.0, 0.5),
     (): (25.0, 0.5),
 }
-"""Least total gain, and largest share of it that another height may have, by the cues that count.
-Physics gives the size of the change of slope; colours may change with height on land too, so that
-they need more evidence where they are the only cue."""
 LIFTS = 0.15, 0.75  # range of the change of slope by refraction, about 0.36, on rough ground
 
 
@@ -270,10 +268,10 @@ class Moments(NamedTuple):
     cue: Cue
 
 
+# Per metre. Clear water has about 0.3, twice the difference in attenuation over the gamma of
+# images; faster changes, except in the darkest water, are of the ground: plants, or a wet edge.
+# They count less, and not at all from twice as much.
 MOST_FADING = 1.2
-"""Per metre. Clear water has about 0.3, twice the difference in attenuation over the gamma of
-images; faster changes, except in the darkest water, are of the ground: plants, or a wet edge. They
-count less, and not at all from twice as much."""
 _TINY, _STEADY_M = 1e-12, 0.3
 
 

@@ -23,11 +23,10 @@ from pcfix.model import (
 from pcfix.sums import LEAST, MOST, Sums
 from pcfix.water.surface import surface_above
 
-MOST_TILT = 0.05
-"""Largest rise per metre of a surface. Rapids reach 2 %; a weir is steeper, but only a part."""
+MOST_TILT = 0.05  # largest rise per metre; rapids reach 2 %, a weir is steeper but only a part
+# In clear water photographs show a bed down to the first depth; the second was never reported. A
+# smaller share of deep points may be mismatches.
 DOUBTFUL_M, TOO_DEEP_M, DEEP_SHARE = 30.0, 60.0, 0.05
-"""In clear water photographs show a bed down to the first depth; the second was never reported.
-A smaller share of deep points may be mismatches."""
 _ENOUGH_HEIGHTS = 200_000
 
 

@@ -24,8 +24,7 @@ from pcfix.water.surface import FoundSurface
 
 Model = Literal["auto", "level", "plane", "along"]
 SIGNIFICANCE = 0.05  # a tilt is significant if chance gives it more rarely
-LINE_RATIO = 0.1
-"""Points are on one line if their spread across it is less than this share of that along it."""
+LINE_RATIO = 0.1  # points are on a line if their spread across it is a smaller share of that along
 LONG_RATIO = 1.0 / 3.0  # points are along a river or a coast, level across, below this ratio
 WIDE_SCATTER_M = 0.1
 _SAME_PLACE_M = 1e-3
@@ -65,9 +64,9 @@ class WaterFit(ShoreFit):
     """A level or a plane, and its accuracy without errors that all points share."""
 
     centre_xy: FloatArray  # (2,), centre of the accepted points
+    # Of the height there and of dz/dx and dz/dy, shape (3, 3): zero for what the model does not
+    # have, NaN without redundancy.
     covariance: FloatArray
-    """Of the height there and of dz/dx and dz/dy, shape (3, 3): zero for what the model does not
-    have, NaN without redundancy."""
 
     def sigma_at(self, xy: FloatArray) -> FloatArray:
         """Return the standard error (m) of the height at places (m, 2)."""
@@ -210,8 +209,7 @@ def _regression(shore: _Shore, model: Model) -> Regression:
 
 
 TUKEY = 4.685061  # Tukey's constant for 95 % efficiency
-LEAST_SCALE_M = 0.005
-"""Least scatter of residuals for their weights: the edge of water is no sharper."""
+LEAST_SCALE_M = 0.005  # least scatter of residuals for their weights: no edge of water is sharper
 SUBSETS, SAMPLE = 3000, 400
 _ROUNDS, _CONVERGED_M = 200, 1e-10
 TO_SIGMA = 1.4826  # from the median of absolute values of normal numbers

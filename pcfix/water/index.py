@@ -12,8 +12,8 @@ from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX, IndexFormula
 
 Options = TypeVar("Options", bound=MethodOptions)
 
+# Ranges of the formulas (fitted up to 35 PSU; natural seas have a little more).
 SALINITY_PSU, TEMPERATURE_C, WAVELENGTH_UM = (0.0, 40.0), (0.0, 30.0), (0.4, 0.7)
-"""Ranges of the formulas (fitted up to 35 PSU; natural seas have a little more)."""
 
 GREEN_UM = 0.53  # peak of the green pixels, where cameras see most through water
 

@@ -213,8 +213,7 @@ FOLDS = 5
 PENALTIES = tuple(10.0 ** np.arange(-4.0, 3.5, 0.5))
 MOST_NODES, NODES_A_POINT = 400, 2
 STIFF_PENALTY = 1e3  # penalty on rises, and on bends near the ends
-END_POINTS = 7
-"""The outermost points are on one straight piece, so that a single one cannot bend it."""
+END_POINTS = 7  # outermost points on one straight piece, so that a single one cannot bend it
 _TURNS, _CURVATURE_M, _HUBER_M = 12, 1e-3, 0.02
 _LEAST = 1e-12  # keeps the equations solvable without points
 

@@ -27,6 +27,7 @@ from pcfix.io.files import check_input
 from pcfix.model import Cameras, TiePoints
 from pcfix.options.declare import File
 
+# The modules of this folder and their software, in the order in which they are asked.
 FORMATS = {
     "metashape": "Agisoft Metashape, PhotoScan",
     "pix4d": "Pix4D",
@@ -39,9 +40,7 @@ FORMATS = {
     "realitycapture": "RealityCapture (XMP)",
     "table": "CSV table",
 }
-"""The modules of this folder and their software, in the order in which they are asked."""
-TAKE_SENSOR = ("table", "realitycapture")
-"""Modules that look for the sensor themselves."""
+TAKE_SENSOR = ("table", "realitycapture")  # modules that look for the sensor themselves
 
 POSES = "Give the file or folder with the camera poses"
 OPK = "Write a table with the header label,x,y,z,omega,phi,kappa and give its lens by --sensor"
@@ -51,6 +50,7 @@ BARE = "a table without a header", "Write one, for example label,x,y,z,omega,phi
 MICMAC = "a calibration of MicMac", "Give the folder with its orientations"
 NERF = "a scene of nerfstudio or instant-ngp", "Give the model from which it was converted"
 PIX4D_PART = ["a part of the parameters of Pix4D", "Give calibrated_camera_parameters.txt"]
+# Known files that are not read: patterns of the first bytes, what the file is, and what to do.
 REFUSED: tuple[tuple[bytes, str, str], ...] = (
     (rb"\A(\xff\xd8\xff|II[*+]\0|MM\0[*+]|\x89PNG)", "an image", POSES),
     (rb"\ALASF", "a point cloud (LAS, LAZ)", POSES),
@@ -74,12 +74,11 @@ REFUSED: tuple[tuple[bytes, str, str], ...] = (
     # numbers, after one name at most
     (rb"\A\s*([^\s,;]+[,;\s]+)?[-+.\d]+([,; \t]+[-+.\d]+)+\s*$", *BARE),
 )
-"""Known files that are not read: patterns of the first bytes, what the file is, and what to do."""
+# Files of Pix4D's parameters without poses, of which standard errors look like poses.
 PART = re.compile(
     r"(?i)(.*_)?(calibrated_images_position\.txt|pmatrix\.txt|offset\.xyz"
     r"|internal_camera_parameters\.cam|camera_parameters(_wgs84)?_error\.txt)"
 )
-"""Files of Pix4D's parameters without poses, of which standard errors look like poses."""
 
 
 def read_cameras(

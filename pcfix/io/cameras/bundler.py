@@ -45,8 +45,7 @@ from pcfix.model import Cameras, FloatArray, TiePoints
 CONTENT = r"\A\s*(#\s*Bundle file v0\.3|drews 1\.0|NVM_V3)"
 _CAMERA_NUMBERS = 15
 _NVM = re.compile(r"NVM_V3(_R9T)?\b(?:\s*FixedK\s+(.*))?")
-_BEFORE_VIEWS = 7
-"""Numbers of a point before its views: x, y, z, red, green, blue, count of views."""
+_BEFORE_VIEWS = 7  # numbers of a point before its views: x, y, z, red, green, blue, count of views
 _LARGEST_PX = 1e6
 
 

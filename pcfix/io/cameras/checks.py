@@ -40,8 +40,7 @@ from pcfix.model import (
 )
 
 ZIP_MAGIC = b"PK\x03\x04"
-ROUNDING = 1e-3
-"""Of a rotation's elements: files with four decimals pass, a mirrored or scaled one does not."""
+ROUNDING = 1e-3  # of a rotation's elements: four decimals pass, mirrored or scaled ones do not
 
 Angles = Literal["omega-phi-kappa", "yaw-pitch-roll", "aircraft"]
 

@@ -106,6 +106,7 @@ def read_place(folder: Path) -> tuple[FloatArray, str | None]:
         return offset, crs if crs is None or is_topocentric(crs) else checks.crs(path, crs)
 
 
+# In the order of their numbers in binary files, from 0; the names are those of `checks`.
 BY_NAME = {
     "SIMPLE_PINHOLE": LensModel("f cx cy"),
     "PINHOLE": LensModel("fx fy cx cy"),
@@ -127,7 +128,6 @@ BY_NAME = {
     "FISHEYE": LensModel("fx fy cx cy", "equidistant"),
     "EUCM": LensModel("fx fy cx cy alpha beta", "eucm"),
 }
-"""In the order of their numbers in binary files, from 0; the names are those of `checks`."""
 MODELS = tuple(BY_NAME)
 
 
@@ -157,8 +157,8 @@ class Image(NamedTuple):
 
 OBSERVATION = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _COUNT, _CAMERA, _IMAGE = struct.Struct("<Q"), struct.Struct("<IiQQ"), struct.Struct("<I7dI")
+# Of a point its number, place and count of views, without colour and error.
 _POINT, _VIEW_BYTES = struct.Struct("<Q3d11xQ"), 8
-"""Of a point its number, place and count of views, without colour and error."""
 
 
 def _take(file: mmap.mmap, form: struct.Struct) -> tuple[Any, ...]:
@@ -247,8 +247,8 @@ def read_points(path: Path) -> tuple[IntArray, FloatArray]:
         return np.array([int(row[0]) for row in rows], np.int64), places
 
 
+# Models that are written: older versions of COLMAP do not know the two others.
 WRITTEN = {k: model for k, model in BY_NAME.items() if k not in ("SIMPLE_FISHEYE", "FISHEYE")}
-"""Models that are written: older versions of COLMAP do not know the two others."""
 
 
 def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = None) -> None:

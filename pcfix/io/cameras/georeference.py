@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 LARGEST_DEG = 360.0 + 1e-6
-STEP_M, EARTH_RADIUS_M = 10.0, 6.4e6
-"""About half the distance over which directions are compared."""
+STEP_M, EARTH_RADIUS_M = 10.0, 6.4e6  # about half the distance over which directions are compared
 
 
 class Frame(NamedTuple):

@@ -49,15 +49,15 @@ PARAMETERS = {
     *("f", "fx", "fy", "cx", "cy", "b1", "b2", "skew"),
     *("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4"),
 }
+# Kinds of sensors that a lens can describe: not spherical, cylindrical or RPC.
 PROJECTIONS: dict[str, Projection] = {
     "frame": "perspective",
     "fisheye": "equidistant",
     "equidistant_fisheye": "equidistant",
     "equisolid_fisheye": "equisolid",
 }
-"""Kinds of sensors that a lens can describe: not spherical, cylindrical or RPC."""
+# Names of stated standard deviations and the axes that they are of.
 SPREADS = {"sxyz": [0, 1, 2], "sxy": [0, 1], "sx": [0], "sy": [1], "sz": [2]}
-"""Names of stated standard deviations and the axes that they are of."""
 INSIDE = r"project\.zip"
 CONTENT = re.compile(  # a project, chunks or a chunk, after the declaration and comments
     r"\A\s*(<\?.*?\?>\s*|<!--.*?-->\s*)*"

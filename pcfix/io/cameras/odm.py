@@ -62,8 +62,7 @@ _NAMES = (SHOTS, TRANSFORMATION, TOPOCENTRIC, "cameras.json", "images.json", *_O
 _SHOTS_HEAD = re.compile(r'(?s)\s*\{.*"features"\s*:\s*\[.*"(translation|rotation|filename)"')
 _KEYS = "cameras|shots|points|pano_shots|reference_lla|biases|rig_cameras|rig_instances"
 _HEAD = re.compile(rf'\s*\[\s*\{{\s*"({_KEYS})"\s*:\s*\{{')
-Files = Mapping[str, Path]
-"""The existing files of a project by name, and the one with the ``poses``."""
+Files = Mapping[str, Path]  # existing files of a project by name, and the one with the ``poses``
 
 
 def recognises(source: Source) -> bool:
@@ -341,6 +340,7 @@ def read_reconstruction(path: Path) -> tuple[Cameras, dict[str, Any]]:
         return cameras, chosen.get("points", {})
 
 
+# By names of `checks`, besides the focal lengths and the principal point of every model.
 _MODELS = {
     "perspective": LensModel("k1 k2"),
     "simple_radial": LensModel("k1"),
@@ -352,7 +352,6 @@ _MODELS = {
     "fisheye624": LensModel("k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4", "equidistant"),
     "dual": LensModel("k1 k2 transition", "dual"),
 }
-"""By names of `checks`, besides the focal lengths and the principal point of every model."""
 _CALLED = {"dx": "c_x", "dy": "c_y", "p1": "p2", "p2": "p1"}
 _CALLED |= {"s1": "s0", "s2": "s1", "s3": "s2", "s4": "s3"}
 """What OpenSfM calls what has another name in `checks`."""

@@ -37,6 +37,7 @@ from pcfix.model import Cameras, GnssPositions, Lens, TiePoints
 FORMAT = "application/opf-{}+json"
 CONTENT = '"application/opf-|"orientation_deg"'
 INSIDE = r".*\.opf"
+# The parameters of each type of sensor, by names of `checks`.
 INTERNALS = {
     "perspective": {
         **{"principal_point_px": "cx cy", "focal_length_px": "f"},
@@ -44,9 +45,7 @@ INTERNALS = {
     },
     "fisheye": {"principal_point_px": "cx cy", "affine": "fx skew b3 fy"},
 }
-"""The parameters of each type of sensor, by names of `checks`."""
-Part = dict[str, Any]
-"""An object of a JSON file."""
+Part = dict[str, Any]  # an object of a JSON file
 
 
 def read(source: Source) -> Cameras:

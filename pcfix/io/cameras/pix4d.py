@@ -34,6 +34,7 @@ from pcfix.io.tables import read_lines
 from pcfix.lens.rotations import from_omega_phi_kappa
 from pcfix.model import Cameras, FloatArray, Lens, TiePoints
 
+# Names of the files of a project, after its own name.
 NAMES = {
     "parameters": "calibrated_camera_parameters.txt",
     "external": "calibrated_external_camera_parameters.txt",
@@ -42,13 +43,13 @@ NAMES = {
     "bingo": "tp_bingo.txt",
     "gcps": "measured_estimated_gcps_position.txt",
 }
-"""Names of the files of a project, after its own name."""
 TABLE = re.compile(r"(.*_|)calibrated_(?:external_)?camera_parameters(_wgs84)?\.txt")
 HEADER = re.compile(
     r"(?i)\s*(filename imagewidth imageheight|imagename (x y z|longitude latitude altitude)"
     r" omega phi kappa)\s*?$",
     re.MULTILINE,
 )
+# Words in the header of the camera parameters, and the names of the numbers in `checks`.
 FIELDS = {
     "camera matrix": "fx skew cx b3 fy cy - - -",
     "radial": "k1 k2 k3",
@@ -59,7 +60,6 @@ FIELDS = {
     "position": "centre",
     "rotation": "rotation",
 }
-"""Words in the header of the camera parameters, and the names of the numbers in `checks`."""
 
 
 def recognises(source: Source) -> bool:

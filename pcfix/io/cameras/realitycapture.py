@@ -34,6 +34,7 @@ from pcfix.model import Cameras, Lens
 
 NAMESPACE = "http://www.capturingreality.com/ns/xcr/"
 DESCRIPTION = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}Description"
+# The coefficients of each model, in the order of its files, which list six.
 MODELS = {
     "perspective": "",
     "brown3": "k1 k2 k3",
@@ -42,7 +43,6 @@ MODELS = {
     "brown4t2": "k1 k2 k3 k4 p1 p2",
     "division": "d1",
 }
-"""The coefficients of each model, in the order of its files, which list six."""
 IMAGES = (".jpg", ".jpeg", ".tif", ".tiff", ".png", ".webp", ".bmp", ".exr", ".jp2")
 
 

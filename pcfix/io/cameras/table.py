@@ -52,6 +52,7 @@ from pcfix.lens import rotations
 from pcfix.model import Cameras, FloatArray, GnssPositions, Lens
 from pcfix.options.declare import File
 
+# Roles of columns, and their names; if a table has several, the first counts.
 SPELLINGS: dict[str, tuple[str, ...]] = {
     "label": (
         *("label", "name", "image", "imagename", "image_name", "filename", "file_name", "file"),
@@ -72,7 +73,6 @@ SPELLINGS: dict[str, tuple[str, ...]] = {
     "sigma_y": ("sigma_y", "accuracy_y", "accuracy_x/y", "accuracy_x/y/z", "accuracy_horz", "hacc"),
     "sigma_z": ("sigma_z", "accuracy_z", "accuracy_x/y/z", "accuracy_vert", "vacc"),
 }
-"""Roles of columns, and their names; if a table has several, the first counts."""
 POSE = ("x", "y", "z", "longitude", "latitude", "yaw", "pitch", "roll", "omega", "phi", "kappa")
 REALITY_CAPTURE = ("f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 QUATERNION, MATRIX = ("qw", "qx", "qy", "qz"), tuple(f"r{i}{j}" for i in "123" for j in "123")
@@ -136,8 +136,8 @@ def read(source: Source) -> Cameras:
     return Cameras(labels, xyz, turns, known, system, gnss=gnss, unposed=tuple(unposed))
 
 
+# Fields of ODM's geo.txt, the last six optional; more may follow.
 GEO = ("label", "x", "y", "z", "yaw", "pitch", "roll", "accuracy_horz", "accuracy_vert")
-"""Fields of ODM's geo.txt, the last six optional; more may follow."""
 
 
 def open_table(path: Path) -> Table:
@@ -283,10 +283,9 @@ def _degrees(columns: Table, roles: tuple[str, ...]) -> FloatArray:
 MILLIMETRES = ("focal", "sensor_x", "sensor_y")
 PIXELS = ("focal_px", "width_px", "height_px")
 OPENCV = LensModel("f cx cy k1 k2 k3 d1 d2 d3 p2 p1")
+# What OpenCV calls the parameters of `OPENCV` after the focal length.
 TERMS = ("cx", "cy", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-"""What OpenCV calls the parameters of `OPENCV` after the focal length."""
-FILM_MM = 36.0
-"""Larger side of the film that 35 mm focal lengths mean."""
+FILM_MM = 36.0  # larger side of the film that 35 mm focal lengths mean
 
 
 def sensor_file(source: Source) -> Path | None:

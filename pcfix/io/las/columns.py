@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     import laspy
 
 
+# The format that each one becomes (LAS 1.4 R15, table 6 and on).
 UPGRADE = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10, 6: 6, 7: 7, 8: 8, 9: 9, 10: 10}
-"""The format that each one becomes (LAS 1.4 R15, table 6 and on)."""
 
 _INT32 = np.iinfo(np.int32)
 
@@ -52,8 +52,8 @@ COLUMNS = (
     Column("RayCount", "ray_count", "uint16", 1.0, "rays intersected", True),
     Column("SourceClass", "", "uint8", 1.0, "class before the correction"),
 )  # fmt: skip
+# Written for the cells of rasters; see `pcfix.Outcome`.
 OUTCOME = Column("Outcome", "outcome", "uint8", 1.0, "whether and why not corrected")
-"""Written for the cells of rasters; see `pcfix.Outcome`."""
 SHIFTS = ("ShiftX", "ShiftY", "ShiftZ")
 
 

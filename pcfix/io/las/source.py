@@ -32,21 +32,17 @@ if TYPE_CHECKING:
 
 
 _VLR, _EVLR = "<2x16sHH32s", "<2x16sHQ32s"
-IDENTITY_PLACE = 26
-"""Where the header names system, software and date (LAS 1.4 R15, table 3)."""
+IDENTITY_PLACE = 26  # where the header names system, software and date (LAS 1.4 R15, table 3)
+# What the LAS libraries raise.
 _DAMAGED = (
     *(laspy.LaspyException, lazrs.LazrsError, struct.error),
     *(ValueError, IndexError, ArithmeticError, OSError),
 )
-"""What the LAS libraries raise."""
+# GeoTIFF codes of units (EPSG), and the least of the codes that only a user knows.
 _UNITS, _OWN_CODE = {9001: "metre", 9002: "foot", 9003: "US survey foot"}, 32767
-"""GeoTIFF codes of units (EPSG), and the least of the codes that only a user knows."""
 
-MOST_SCALE_M = 1000.0
-"""Largest step of coordinates that a header may state."""
-
-CHUNK_POINTS = 400_000
-"""Points that are worked on at a time, which bounds the memory."""
+MOST_SCALE_M = 1000.0  # largest step of coordinates that a header may state
+CHUNK_POINTS = 400_000  # points that are worked on at a time, which bounds the memory
 
 
 class Record(VLR):  # type: ignore[misc]  # laspy is untyped

@@ -40,14 +40,13 @@ from pcfix.options.declare import File
 from pcfix.version import __version__
 
 EXTRA_BYTES = ("LASF_Spec", 4)
+# An extra dimension: type, options, name, scale, offset and description; both are given.
 _EXTRA, _SCALED = struct.Struct("<2xBB32s76xd16xd16x32s"), 0b11000
-"""An extra dimension: type, options, name, scale, offset and description; both are given."""
 _TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32")
 USER_ID = "pcfix"
+# VLRs of pcfix: one of a correction, and one for each cleaning or labelling.
 NOTES = {"settings": 1, "cleaning": 2, "labelling": 3}
-"""VLRs of pcfix: one of a correction, and one for each cleaning or labelling."""
-_SEAL = "sha256"
-"""Key of the checksum of the record: a changed record would restore another cloud."""
+_SEAL = "sha256"  # key of the checksum of the record: a changed record would restore another cloud
 
 
 def output_header(
