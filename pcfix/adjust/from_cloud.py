@@ -20,7 +20,8 @@ solution back to the original one instead.
 Points of the apparent cloud replace the tie points of that adjustment, which were spread in much
 the same way. They have no noise; their weight is how well they represent the tie points. It is the
 largest with which GNSS positions and control points fit within their standard deviations. They
-count in every image in whose frame they are, as the software matched features in all of these.
+count in every image in whose frame they are, or in those of the view list; `pcfix.flow.adjust`
+takes what fits better.
 """
 
 from __future__ import annotations

@@ -28,7 +28,15 @@ from pcfix.adjust.methods import (
 )
 from pcfix.adjust.parameters import Unknowns, default_lens
 from pcfix.adjust.result import Adjusted, adjustment_dict
-from pcfix.errors import GeometryError, InputError, PcfixError, PcfixWarning, SettingError, bad_file
+from pcfix.errors import (
+    GeometryError,
+    InputError,
+    PcfixError,
+    PcfixWarning,
+    SettingError,
+    bad_file,
+    silently,
+)
 from pcfix.flow.inputs import Inputs, mask_of, paths_in
 from pcfix.flow.poses import flags_of, water_word
 from pcfix.flow.runner import check_folder
@@ -39,6 +47,7 @@ from pcfix.io.clouds import Clouds, cloud_of
 from pcfix.io.crs import is_topocentric, parse_crs
 from pcfix.io.files import temporary_output, write_members, write_text
 from pcfix.io.ground_control import gnss_in_frame_of, read_gnss, read_ground_control
+from pcfix.io.views import ViewList, ViewMatch
 from pcfix.io.water import write_water_raster
 from pcfix.model import (
     Cameras,
@@ -157,22 +166,29 @@ def adjust_into(
     mask = mask_of(inputs.water_mask, crs or original.crs)
 
     # 2. The block, by tie points as they were measured or by points of the cloud
-    ties, cloud_points = None, None
-    if given.ties != "cloud" and (read_ties := inputs.tie_points(crs, placed=False)) is not None:
-        ties = usable_ties(read_ties, original)
-    if ties is None or len(ties.xyz) < LEAST_TIES:
-        ties = _ties_of_cloud(view, original, name, 0 if ties is None else len(ties.xyz))
-        cloud_points = original, ties.xyz
+    guesses, by_cloud = list[TiePoints](), True
+    if given.ties != "cloud" and (measured := inputs.tie_points(crs, placed=False)) is not None:
+        guesses = [usable_ties(measured, original)]
+        by_cloud = len(guesses[0].xyz) < LEAST_TIES
+    if by_cloud:
+        with silently():  # the notes on the cameras were shown
+            listed = inputs.block(crs, read)[1]
+        guesses = _ties_of_cloud(view, original, listed, name, sum(len(one.xyz) for one in guesses))
     cameras = original if given.lens is None else _calibrated(given.lens, original)
     index, level_sigma_m = index_of(given.index, given.index_formula)[0], unknowns.water_sigma[0]
-    block = block_of(
-        cameras, ties, water, index, inside=None if mask is None else mask.inside,
-        control=control, level_sigma_m=level_sigma_m,
-    )  # fmt: skip
-    block = replace(block, port=inputs.port, parallel=given.parallel, gnss=gnss or block.gnss)
-    check_datum(block, unknowns, reason)
     chooses_lens = given.lens_unknowns is None and given.lens is None
-    found = adjust_block(block, unknowns, cloud=cloud_points, choose_lens=chooses_lens)
+    adjusted = list[Adjusted]()
+    for ties in guesses:
+        block = block_of(
+            cameras, ties, water, index, inside=None if mask is None else mask.inside,
+            control=control, level_sigma_m=level_sigma_m,
+        )  # fmt: skip
+        block = replace(block, port=inputs.port, parallel=given.parallel, gnss=gnss or block.gnss)
+        check_datum(block, unknowns, reason)
+        cloud_points = (original, ties.xyz) if by_cloud else None
+        adjusted.append(adjust_block(block, unknowns, cloud=cloud_points, choose_lens=chooses_lens))
+    # of two guesses, the one that fits GNSS and control points with a smaller noise of the cloud
+    found = min(adjusted, key=lambda one: (one.block.sigma_px[0], one.sigma0))
 
     # 3. The result
     check_control(found, gcps)
@@ -264,22 +280,29 @@ def _unknowns(given: AdjustOptions, cameras: Cameras) -> Unknowns:
     return Unknowns(given.poses, lens, surface, free_network=given.datum == "free")
 
 
-def _ties_of_cloud(view: CloudView | None, cameras: Cameras, name: str, measured: int) -> TiePoints:
-    """Return random points of the cloud in all images that show them, as tie points."""
+def _ties_of_cloud(
+    view: CloudView | None, cameras: Cameras, listed: ViewList | None, name: str, measured: int
+) -> list[TiePoints]:
+    """Return random points of the cloud as tie points, once in all images, once in those listed."""
     if view is None:
         words = (
             f"{name}: has {measured} usable tie points ({LEAST_TIES} are needed), and there is no"
             f" --cloud. {_EXPORTS}"
         )
         raise InputError("cameras.no_ties", words, path=name, ties=measured, least=LEAST_TIES)
-    count = min(CLOUD_POINTS, view.points)
+    count, match = min(CLOUD_POINTS, view.points), None
     rows = np.sort(np.random.default_rng(0).choice(view.points, count, replace=False))
-    xyz = sample_of(view, rows).xyz
-    ties = ties_of_cloud(xyz, views_in_frame(xyz, cameras), cameras)
-    if len(ties.xyz) < LEAST_TIES:
+    if listed is not None:
+        match = ViewMatch(listed, cameras, points=view.points, step_m=view.step_m)
+    sample = sample_of(view, rows, match=match)
+    guesses = [views_in_frame(sample.xyz, cameras)]
+    guesses += [] if sample.views is None else [sample.views]
+    found = [ties_of_cloud(sample.xyz, views, cameras) for views in guesses]
+    found = [ties for ties in found if len(ties.xyz) >= LEAST_TIES]
+    if not found:
         words = f"{name}: no image shows the cloud. Check the poses with 'pcfix cameras --cloud'."
         raise GeometryError("cameras.no_overlap", words, path=name)
-    return ties
+    return found
 
 
 # Writing
