@@ -4,8 +4,6 @@ The public interface is in ``__init__.pyi``. A name is loaded when it is first u
 ``import pcfix`` is quick.
 """
 
-from __future__ import annotations
-
 import ast
 from importlib import import_module
 from pkgutil import get_data

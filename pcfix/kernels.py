@@ -1,7 +1,5 @@
 """Numba settings, and threads over tiles of rows."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

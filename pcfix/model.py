@@ -4,8 +4,6 @@ Frames: the *world* is the cloud's own projected CRS, metres, right-handed, Z up
 is OpenCV's: x right, y down, z forward; ``x_camera = R (x_world - C)``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
@@ -317,7 +315,7 @@ class Views:
     weight: npt.NDArray[np.float32] | None = None
     kind: ViewKind = "tracks"
 
-    def take(self, rows: IntArray) -> Views:
+    def take(self, rows: IntArray) -> "Views":
         """Return the view list of the given points, in that order."""
         counts = (self.start[1:] - self.start[:-1])[rows]
         start = np.concatenate([[0], np.cumsum(counts)])

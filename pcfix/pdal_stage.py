@@ -16,8 +16,6 @@ Options have the names of the command line, with underscores or dashes, and are 
 code.
 """
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os
@@ -105,7 +103,7 @@ def _run_stage(name: str, namespace: dict[str, Any], ins: Dimensions, outs: Dime
     namespace["out_metadata"] = metadata_of(summary)
 
 
-def _correct(options: CorrectOptions, cloud: PdalCloud, task: FileTask) -> Done:
+def _correct(options: CorrectOptions, cloud: PdalCloud, task: "FileTask") -> Done:
     from pcfix.flow.correct import finish
     from pcfix.flow.correction import correct_chunk
     from pcfix.flow.planning import plan_correction, read_inputs
@@ -121,7 +119,7 @@ def _correct(options: CorrectOptions, cloud: PdalCloud, task: FileTask) -> Done:
     return results.dimensions, summary.as_dict()
 
 
-def _label(options: LabelOptions, cloud: PdalCloud, task: FileTask) -> Done:
+def _label(options: LabelOptions, cloud: PdalCloud, task: "FileTask") -> Done:
     from pcfix.flow.label import check, label_chunk, plan_labelling
 
     plan, classes, tally = plan_labelling(options, _view(cloud)), cloud.classes.copy(), None
@@ -135,7 +133,7 @@ def _label(options: LabelOptions, cloud: PdalCloud, task: FileTask) -> Done:
     return {"Classification": classes, **cloud.flags()}, summary
 
 
-def _clean(options: CleanOptions, cloud: PdalCloud, task: FileTask) -> Done:
+def _clean(options: CleanOptions, cloud: PdalCloud, task: "FileTask") -> Done:
     from pcfix.flow.clean import find_noise
 
     noise, found = find_noise(options, _view(cloud))
@@ -180,7 +178,7 @@ def _options(namespace: dict[str, Any], kind: type[OptionSet]) -> Any:
 
 def _chunks(
     cloud: PdalCloud, water: WaterSurface | None, names: Iterable[str] = ()
-) -> Iterator[tuple[slice, Points]]:
+) -> "Iterator[tuple[slice, Points]]":
     """Yield the rows of each chunk, and its points."""
     from pcfix.flow.surfaces import Points
     from pcfix.io.las.source import CHUNK_POINTS
@@ -201,11 +199,11 @@ def _chunks(
         )  # fmt: skip
 
 
-def _view(cloud: PdalCloud) -> CloudView:
+def _view(cloud: PdalCloud) -> "CloudView":
     """Return the facts of the cloud, and its points."""
     from pcfix.flow.surfaces import CloudView, corners
 
-    def chunks(water: WaterSurface | None = None, names: Iterable[str] = ()) -> Iterator[Points]:
+    def chunks(water: WaterSurface | None = None, names: Iterable[str] = ()) -> "Iterator[Points]":
         return (points for _, points in _chunks(cloud, water, names))
 
     low, high = corners(cloud.ins["X"], cloud.ins["Y"])

@@ -7,8 +7,6 @@ Arrays larger than memory are stored in files, and processed in blocks of rows i
 file. So results depend neither on tiles nor on threads. An array of one block is plain numpy.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager

@@ -1,7 +1,5 @@
 """Values that are accumulated chunk by chunk: sums, cells over a cloud, and results of commands."""
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable
 from dataclasses import fields, replace

@@ -3,8 +3,6 @@
 Everything is in one frame, metres, Z up.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -10,8 +10,6 @@ P as its tangent plane does. As anything changes, P moves along the surface and 
 turns with it; the derivatives are central differences.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -63,8 +61,8 @@ class Given(NamedTuple):
     lens_row: IntArray  # (k,), of the lens table
     group: IntArray  # (k,), sensor of each camera
     # refracting surface
-    tin: Tin | None  # a mesh or a raster, instead of the plane in `State.water`
-    field: Field | None
+    tin: "Tin | None"  # a mesh or a raster, instead of the plane in `State.water`
+    field: "Field | None"
     origin: FloatArray  # (3,), of the block
     curved: bool  # whether d, e, f count
     # unknowns that many points share, counted from the first of them

@@ -18,8 +18,6 @@ neighbours : neighbouring points of a dense cloud that come from different image
 The first sign that is significant decides.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -213,7 +211,7 @@ def tie_point_sign(
 # GNSS
 
 
-def gnss_sign(cameras: Cameras, gnss: GnssPositions, undone: Undone) -> Sign:
+def gnss_sign(cameras: Cameras, gnss: GnssPositions, undone: "Undone") -> Sign:
     """Look for the pattern of absorbed refraction in adjusted minus GNSS positions.
 
     The pattern is the centres minus those that an adjustment with water finds without the GNSS

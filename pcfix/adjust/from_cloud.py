@@ -24,8 +24,6 @@ count in every image in whose frame they are, or in those of the view list; `pcf
 takes what fits better.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

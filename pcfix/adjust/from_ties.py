@@ -10,8 +10,6 @@ the candidates, at a solution with right sides 0 and c, freed candidates take R^
 R = C - B' A^-1 B, and lower the squares by c' R^-1 c.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

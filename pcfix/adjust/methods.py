@@ -1,7 +1,5 @@
 """The adjustment of a block by tie points or by the cloud, with checks of what goes in and out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

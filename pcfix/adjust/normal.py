@@ -16,8 +16,6 @@ If the residuals shall be orthogonal to other columns than their own derivatives
 the first factor of each product has those columns, and S is not symmetric.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 

@@ -3,8 +3,6 @@
 They have codes or positions for the kernels, and names for users.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal

@@ -27,8 +27,6 @@ is compensated by cameras that are too high. So members of an ensemble are drawn
 covariance. Whatever is computed with each of them in turn scatters by all errors at once.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -73,7 +71,7 @@ class Precision:
     # (m, 3), standard errors of the points along x, y, z in metres; NaN if not determined, or not
     # among the `MOST_POINTS` of a large block, None for very large ones
     point_sigma_m: FloatArray | None
-    members: Members | None = None  # drawn from the joint covariance; None for very large blocks
+    members: "Members | None" = None  # drawn from the joint covariance; None for very large blocks
 
     @property
     def centre_sigma_m(self) -> FloatArray:
@@ -349,7 +347,7 @@ class Members:
     def __len__(self) -> int:
         return len(self.turn)
 
-    def aligned(self, cameras: Cameras) -> Members | None:
+    def aligned(self, cameras: Cameras) -> "Members | None":
         """Return the members in the order of their cameras, in any CRS; None for other cameras."""
         row = {label: i for i, label in enumerate(self.labels)}
         if sorted(cameras.labels) != sorted(row) or cameras.lenses is None:

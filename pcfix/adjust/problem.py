@@ -4,8 +4,6 @@ The datum and all other prior knowledge enter as observations of the unknowns: G
 surveyed points, standard deviations of lens, water and index.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -85,7 +83,7 @@ class Problem:
         lenses = self.block.cameras.lenses or ()
         return np.array([effect_at_corner(lenses[i], code) for i, code in self.lens_unknowns])
 
-    def weighted(self, weight: FloatArray) -> Problem:
+    def weighted(self, weight: FloatArray) -> "Problem":
         """Return the problem with other weights of its observations."""
         return replace(self, given=self.given._replace(weight=weight))
 
@@ -276,7 +274,7 @@ def polynomial(water: FloatArray, x: FloatArray | float, y: FloatArray | float) 
 # Prior knowledge
 
 
-def prior_rows(problem: Problem, found: Solution) -> tuple[csc_array, FloatArray]:
+def prior_rows(problem: Problem, found: Solution) -> "tuple[csc_array, FloatArray]":
     """Return prior knowledge of poses, lens and water as weighted observations of them.
 
     These are the derivatives by poses and shared unknowns, a sparse array of shape (n, 6 k + g),

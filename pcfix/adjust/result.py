@@ -1,7 +1,5 @@
 """The result of an adjustment, as arrays and as the plain values of ``adjustment.json``."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 

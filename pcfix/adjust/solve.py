@@ -4,8 +4,6 @@ Water level, its tilt, the refractive index and the lens all move the bed, and o
 the same way (Mulsow 2024): then they cannot all be free.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

@@ -11,8 +11,6 @@ by any method. Points are classified as submerged afterwards, because an adjustm
 may lower or raise a beach.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -114,7 +112,7 @@ def _intersect(
 # Two models of the same images
 
 
-def transfer_of(original: Cameras, adjusted: Cameras, place: IntArray) -> CloudTransfer:
+def transfer_of(original: Cameras, adjusted: Cameras, place: IntArray) -> "CloudTransfer":
     """Return the transfer between two models, given the original row of each adjusted image."""
     row = np.full(len(original), -1)
     row[place] = np.arange(len(adjusted))
@@ -175,7 +173,7 @@ class TransferCounts(Sums):
     sum_squares_m2: float  # of the length of the shift
 
     @classmethod
-    def of(cls, step: Transferred, correction: Correction) -> TransferCounts:
+    def of(cls, step: Transferred, correction: Correction) -> "TransferCounts":
         """Return those of a chunk, with the correction that `Transferred.as_original` returned."""
         followed = step.moved & ~correction.uncorrected
         shift = (step.xyz - step.original_xyz)[followed]

@@ -1,7 +1,5 @@
 """The command line: flags from the declared options, and one function for each command."""
 
-from __future__ import annotations
-
 import atexit
 import gc
 import inspect

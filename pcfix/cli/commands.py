@@ -1,7 +1,5 @@
 """The commands: each calls one function of the Python interface."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """Options as flags of the command line and as forms of QGIS; progress; the printed summary."""
 
-from __future__ import annotations
-
 import inspect
 import os
 import sys

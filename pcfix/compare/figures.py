@@ -1,7 +1,5 @@
 """All figures of a comparison of matched points, and cross-sections along lines in plan."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -77,7 +75,7 @@ def _csv(rows: Iterable[Iterable[Any]]) -> str:
 
 
 def figures_of(
-    match: Match, lines: Sequence[SectionLine], others: Mapping[str, Match]
+    match: Match, lines: "Sequence[SectionLine]", others: Mapping[str, Match]
 ) -> Comparison:
     """Return all figures that the settings ask for.
 
@@ -251,8 +249,8 @@ def _m3c2(match: Match, pairs: Figures | None) -> Figures:
 
 
 def _sections(
-    match: Match, lines: Sequence[SectionLine], others: Mapping[str, Match]
-) -> tuple[Section, ...]:
+    match: Match, lines: "Sequence[SectionLine]", others: Mapping[str, Match]
+) -> "tuple[Section, ...]":
     """Return the cross-sections that were asked for."""
     if match.settings.sections:
         bed = subset(match.wet, match.cloud.xyz) if match.wet.any() else match.cloud.xyz

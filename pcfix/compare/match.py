@@ -1,7 +1,5 @@
 """Choose the points of a cloud and of a reference to compare."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -41,7 +39,7 @@ class SurveyCloud:
         """The apparent points before the correction, shape (n, 3); None if they are not known."""
         return None if self.shift_m is None else mapped(np.subtract, self.xyz, self.shift_m)
 
-    def take(self, rows: BoolArray) -> SurveyCloud:
+    def take(self, rows: BoolArray) -> "SurveyCloud":
         """Return the cloud with these rows only."""
         if rows.all():
             return self

@@ -1,7 +1,5 @@
 """Statistics of distances or signed errors, by the names of ``compare.json``; M3C2 distances."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """Refractive bundle adjustment from files into a folder, for all doors."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Combine frames of one place into the image through calm water, with the water of each frame."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator

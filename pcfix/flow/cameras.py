@@ -1,7 +1,5 @@
 """Inspect a camera file: contents, fit to a cloud, absorbed refraction; ``pcfix cameras``."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,7 +31,7 @@ SHOWN_NAMES = 5
 
 def check_cameras(
     path: File, options: CamerasCheckOptions | None = None, **keywords: Any
-) -> CamerasReport:
+) -> "CamerasReport":
     """Inspect a camera file: contents, fit to a cloud, absorbed refraction; ``pcfix cameras``.
 
     Parameters

@@ -1,7 +1,5 @@
 """Clean a LAS or LAZ file: read, test, write, in bounded memory."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial

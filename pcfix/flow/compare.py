@@ -1,7 +1,5 @@
 """Compare the files of a cloud and a reference."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from dataclasses import replace

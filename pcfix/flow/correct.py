@@ -11,8 +11,6 @@ The story of ``pcfix correct``, in the order of this file:
 Arrays take the same steps in `correct_points`, without files and summary.
 """
 
-from __future__ import annotations
-
 import warnings
 from itertools import compress
 from typing import Any

@@ -6,8 +6,6 @@ These are added up, and `pcfix.flow.correct.finish` summarizes them. A housing p
 a water surface: all points are below it, whatever their height, and have no depth.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, astuple, dataclass, fields, replace
 from typing import Any
 

@@ -3,8 +3,6 @@
 These are the commands ``pcfix simulate`` and ``pcfix demo``.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -5,8 +5,6 @@ points that decide on a cell are read with its window, so that the raster does n
 size of chunks, tiles and windows.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from contextlib import ExitStack

@@ -4,8 +4,6 @@ A cloud may be corrected with adjusted poses: `adjusted_from` is the original ca
 `cameras` has the same images with adjusted poses.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections import Counter
 from collections.abc import Iterable
@@ -86,7 +84,7 @@ class Inputs(MaskOption, InputOptions):
         return read_cameras(self.cameras, self.sensor, angles=self.angles)
 
     def block(
-        self, cloud_crs: str | CRS | None, read: Cameras | None = None
+        self, cloud_crs: "str | CRS | None", read: Cameras | None = None
     ) -> tuple[Cameras, ViewList | None]:
         """Return the cameras in the cloud's CRS, and the view list if one is given.
 
@@ -111,14 +109,14 @@ class Inputs(MaskOption, InputOptions):
             return cameras, views
         return cameras, replace(views, listed=replace(views.listed, kind=self.views_are))
 
-    def _georeferenced(self, read: Cameras, cloud_crs: str | CRS | None) -> Georeference:
+    def _georeferenced(self, read: Cameras, cloud_crs: "str | CRS | None") -> Georeference:
         """Return the transformation from the frame of the camera file to the cloud's CRS."""
         return georeference(
             read, cloud_crs, cameras_crs=self.cameras_crs, offset_m=self.cameras_offset,
             name=str(self.cameras),
         )  # fmt: skip
 
-    def tie_points(self, cloud_crs: str | CRS | None, *, placed: bool = True) -> TiePoints | None:
+    def tie_points(self, cloud_crs: "str | CRS | None", *, placed: bool = True) -> TiePoints | None:
         """Return the tie points of the camera file in the cloud's CRS, if it has any.
 
         Some formats have image coordinates only; with `placed` these count as none.
@@ -230,7 +228,7 @@ def _for_some(both: list[Inputs], which: Iterable[bool], *names: str) -> list[In
 
 
 def original_ties(
-    inputs: Inputs, transfer: CloudTransfer | None, cloud_crs: str | CRS | None
+    inputs: Inputs, transfer: CloudTransfer | None, cloud_crs: "str | CRS | None"
 ) -> TiePoints | None:
     """Return the tie points of the original model, numbered as the cameras of a transfer."""
     if transfer is None:
@@ -265,7 +263,7 @@ def _rows(original: tuple[str, ...], adjusted: tuple[str, ...]) -> IntArray:
     return row
 
 
-def mask_of(path: File | None, cloud_crs: str | CRS | None) -> WaterMask | None:
+def mask_of(path: File | None, cloud_crs: "str | CRS | None") -> WaterMask | None:
     """Read the mask in the cloud's CRS, if a file is given."""
     if path is None:
         return None

@@ -1,7 +1,5 @@
 """Label submerged points, in arrays and in files of any size."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import astuple, dataclass
 from typing import Any

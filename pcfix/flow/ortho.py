@@ -1,7 +1,5 @@
 """Write an orthophoto of land and bed, tile by tile."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from functools import lru_cache

@@ -7,8 +7,6 @@ the matcher. Each round starts from the original images and the DSM of the round
 mapping ``exact`` and the true bed, one round is enough.
 """
 
-from __future__ import annotations
-
 import json
 import shlex
 import shutil

@@ -5,8 +5,6 @@ straight rays, and `pcfix.correct_points` gives the standard errors of the corre
 part of the error budget. An adjustment through the water gives the errors of the poses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

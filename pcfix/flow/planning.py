@@ -3,8 +3,6 @@
 `read_inputs` estimates nothing; `plan_correction` resolves every ``auto``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 

@@ -6,8 +6,6 @@ cloud must be at the water; images point along the flight lines, and cameras are
 barometer recorded them. What cannot be tested is listed. None of it changes a result.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
@@ -75,7 +73,7 @@ class CloudSample(Sums):
     parts: tuple[FloatArray, ...] = ()  # (n, 7) each: x, y, z, height of the water, colours
 
     @classmethod
-    def of(cls, points: Points, water_m: FloatArray, row: int, count: int) -> CloudSample:
+    def of(cls, points: Points, water_m: FloatArray, row: int, count: int) -> "CloudSample":
         """Return the sample of a chunk that begins at a row of a cloud of `count` points."""
         step = max(1, count // SAMPLE_POINTS)
         rows = slice(-row % step, None, step)

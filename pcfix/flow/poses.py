@@ -5,8 +5,6 @@ images do not change: the cameras of each member intersect the images of the poi
 the cloud is of the original or of the adjusted cameras.
 """
 
-from __future__ import annotations
-
 import shlex
 import warnings
 from dataclasses import replace
@@ -73,7 +71,7 @@ def _gnss_of(cameras: Cameras, name: str) -> GnssPositions | None:
 
 
 def diagnose_in_passing(
-    plan: Plan, ties: TiePoints | None
+    plan: "Plan", ties: TiePoints | None
 ) -> tuple[dict[str, Any], PcfixWarning | None]:
     """Check the poses with what a correction has read anyway; warn if they absorbed refraction.
 
@@ -191,7 +189,7 @@ def flags_of(given: OptionSet) -> list[str]:
 SAMPLE_POINTS, BED_POINTS = 20_000, 1000
 
 
-def members_of(path: File | Cameras, cameras: Cameras) -> Members | None:
+def members_of(path: File | Cameras, cameras: Cameras) -> "Members | None":
     """Return the members of the adjustment in the folder of its cameras, if there are any.
 
     Raises InputError if they are damaged, or of other cameras.
@@ -209,7 +207,7 @@ def members_of(path: File | Cameras, cameras: Cameras) -> Members | None:
 
 
 def pose_errors(
-    sample: Points, survey: Survey, members: Members, transfer: CloudTransfer | None
+    sample: Points, survey: Survey, members: "Members", transfer: CloudTransfer | None
 ) -> PoseErrors | None:
     """Return the errors of the bed by those of the poses; None if no point is corrected.
 
@@ -260,7 +258,7 @@ def pose_errors_of(xy: FloatArray, variance_m2: FloatArray) -> PoseErrors:
 
 
 def variances(
-    sample: Points, survey: Survey, members: Members, transfer: CloudTransfer
+    sample: Points, survey: Survey, members: "Members", transfer: CloudTransfer
 ) -> FloatArray:
     """Return the variance of the heights of a sample by the poses, shape (n,); NaN if unknown."""
 
@@ -279,7 +277,7 @@ def variances(
     return np.asarray(np.square(off).mean(axis=0))
 
 
-def _survey_of(survey: Survey, members: Members, member: int) -> Survey:
+def _survey_of(survey: Survey, members: "Members", member: int) -> Survey:
     """Return a survey with cameras and water of a member, for points without a view list too."""
     bare = survey.unlisted
     index = survey.settings.refractive_index + float(members.water[member, 3])

@@ -5,8 +5,6 @@ points have moved in plan too, so that the grid of the input is slightly deforme
 cell under water is interpolated in the deformed grid. All other cells keep their stored values.
 """
 
-from __future__ import annotations
-
 import json
 import warnings
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """Undo a correction with the extra dimensions that it wrote."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -3,8 +3,6 @@
 The results are opened as rasters, lines and tables (`RunResults`).
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Iterable, Sequence
@@ -70,7 +68,7 @@ def run(
     say: Callable[[str], None] = lambda text: None,
     bar: Bar = no_bar,
     **keywords: Any,
-) -> RunResults:
+) -> "RunResults":
     """Adjust, correct, clean, grid, compare and report; what ``pcfix run`` runs.
 
     Every step that is not done yet is done. Called again with the same options, a run resumes; if
@@ -399,31 +397,31 @@ class RunResults:
         return dict(self._steps.get("compare", {}).get("figures", {}))
 
     @property
-    def depth(self) -> DataArray:
+    def depth(self) -> "DataArray":
         """Depth of the bed, shape (y, x), metres below the water, positive down; NaN on land."""
         return self._raster(results.DEPTH)
 
     @property
-    def bed(self) -> DataArray:
+    def bed(self) -> "DataArray":
         """Heights of the bed, shape (y, x), metres; NaN on land."""
         return self._raster(results.BED)
 
     @property
-    def surface(self) -> DataArray:
+    def surface(self) -> "DataArray":
         """Heights of land and bed, shape (y, x), metres."""
         return self._raster(SURFACE)
 
     @property
-    def uncertainty(self) -> DataArray:
+    def uncertainty(self) -> "DataArray":
         """Vertical uncertainty of the bed at 95 %, shape (y, x), metres, predicted."""
         return self._raster(results.UNCERTAINTY)
 
-    def layer(self, name: str) -> GeoDataFrame:
+    def layer(self, name: str) -> "GeoDataFrame":
         """Return a layer of ``map.gpkg``: depth_contours, waterline, corrected_area, cameras ..."""
         return analysis_library("geopandas").read_file(self._file("map.gpkg"), layer=name)
 
     @property
-    def tables(self) -> dict[str, DataFrame]:
+    def tables(self) -> "dict[str, DataFrame]":
         """Tables of the comparison by name, metres; empty where there was no reference.
 
         ``depth_bins``, errors by depth;
@@ -432,7 +430,7 @@ class RunResults:
         files = sorted((self.folder / COMPARED).glob("*.csv")) if self.compared else []
         return {one.stem: analysis_library("pandas").read_csv(one) for one in files}
 
-    def _raster(self, name: str) -> DataArray:
+    def _raster(self, name: str) -> "DataArray":
         array = analysis_library("rioxarray").open_rasterio(self._file(name), masked=True)
         return array.squeeze("band", drop=True).rename(name.partition(".")[0])
 

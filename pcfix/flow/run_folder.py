@@ -1,7 +1,5 @@
 """The folder of a run: its inputs, and the rasters, layers and page that it gets besides clouds."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -118,7 +116,7 @@ class RunFolder:
         suffix = Path(str(self.options.reference)).suffix.lower()
         return is_cloud(self.reference) or suffix in (".tif", ".tiff")
 
-    def with_adjusted(self, model: str | None) -> RunFolder:
+    def with_adjusted(self, model: str | None) -> "RunFolder":
         """Return the run for the next steps, with the adjusted cameras if there are any."""
         if model is None:
             return self

@@ -6,8 +6,6 @@ writes its output, and its statistics in the folder `RECORDS`. A file whose outp
 same key (a hash of options and input files) is skipped.
 """
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import pickle
@@ -67,7 +65,7 @@ class FileWork(NamedTuple):
     runs while the next chunk is computed.
     """
 
-    header: laspy.LasHeader
+    header: "laspy.LasHeader"
     compute: Callable[[Chunk, int], tuple[Any, Any]]
     apply: Callable[[Chunk, Any], Chunk]
     identity: bytes = b""  # of the software in the header; by default that of pcfix

@@ -1,7 +1,5 @@
 """The water surface of a cloud: read, fitted to shoreline points, or found in it."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterable, Iterator
 from functools import partial
@@ -79,7 +77,7 @@ def file_points(
 
 def sample_of(
     view: CloudView, rows: IntArray | int, water: WaterSurface | None = None,
-    match: ViewMatch | None = None,
+    match: "ViewMatch | None" = None,
 ) -> Points:  # fmt: skip
     """Return some points of a cloud, with their views if there is a view list.
 

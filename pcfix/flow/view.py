@@ -1,7 +1,5 @@
 """Show clouds before and after a correction, a reference, cameras and water in one view."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Sequence
@@ -193,7 +191,7 @@ def _grid(surface: WaterSurface, low: FloatArray, high: FloatArray) -> FloatArra
     return np.asarray(edges[np.isfinite(edges).all(axis=(1, 2))])
 
 
-def _scale_of(what: str, values: FloatArray) -> ScalarMappable:
+def _scale_of(what: str, values: FloatArray) -> "ScalarMappable":
     """Return the colour scale of values, NaN where unknown.
 
     Its ``to_rgba`` gives colours; those of NaN are grey.
@@ -234,7 +232,7 @@ def _show(shown: list[Shown], lines: Lines, title: str) -> None:
     )
 
 
-def view_figure(shown: list[Shown], lines: Lines, scale: ScalarMappable, label: str) -> Figure:
+def view_figure(shown: list[Shown], lines: Lines, scale: "ScalarMappable", label: str) -> "Figure":
     """Draw each cloud as dots with its name, side by side, and the scale of the colours."""
     width, grid = 0.8 + 6.4 * len(shown), {"ncols": len(shown), "squeeze": False}
     figure, axes = new_figure(width, 5.2, **grid, subplot_kw={"projection": "3d"})

@@ -1,7 +1,5 @@
 """Describe a water surface: given, fitted or detected in a cloud; ``pcfix water``."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

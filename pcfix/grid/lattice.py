@@ -5,8 +5,6 @@ centre. There a plan position is given in cells from the top left corner of the 
 the right, rows downwards, so that the centre of the first cell is (0.5, 0.5).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -42,26 +40,26 @@ class Window(NamedTuple):
         """Number of columns."""
         return self.column_stop - self.column
 
-    def grown(self, cells: int) -> Window:
+    def grown(self, cells: int) -> "Window":
         """Return the window with a margin on each side, which may extend beyond the raster."""
         return Window(
             self.row - cells, self.row_stop + cells, self.column - cells, self.column_stop + cells
         )
 
-    def parts(self, side: int) -> Iterator[Window]:
+    def parts(self, side: int) -> "Iterator[Window]":
         """Yield squares of `side` cells that cover the window, row by row."""
         for row in range(self.row, self.row_stop, side):
             for column in range(self.column, self.column_stop, side):
                 yield Window(row, row + side, column, column + side).clipped(self)
 
-    def clipped(self, other: Window) -> Window:
+    def clipped(self, other: "Window") -> "Window":
         """Return the intersection with another window."""
         return Window(
             max(self.row, other.row), min(self.row_stop, other.row_stop),
             max(self.column, other.column), min(self.column_stop, other.column_stop),
         )  # fmt: skip
 
-    def within(self, other: Window) -> tuple[slice, slice]:
+    def within(self, other: "Window") -> tuple[slice, slice]:
         """Return the rows and columns of this window in an array that covers `other`."""
         return (
             slice(self.row - other.row, self.row_stop - other.row),

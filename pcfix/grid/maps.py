@@ -7,8 +7,6 @@ The waterline of a cloud is the zero contour of the heights above the water, ave
 error in height moves it by the error over the slope of the bed.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass

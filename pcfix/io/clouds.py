@@ -3,8 +3,6 @@
 Comparisons and rasters need to know which points count, and where the water was.
 """
 
-from __future__ import annotations
-
 import glob
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -42,8 +40,6 @@ from pcfix.running import FEW_ROWS, blocks, empty, mapped, release, subset
 if TYPE_CHECKING:
     from pyproj import CRS
 
-
-Clouds: TypeAlias = "File | Iterable[File] | Tiles"
 
 SUFFIXES = (".las", ".laz")
 
@@ -84,6 +80,7 @@ class TiledSource(LasSource):
                 yield from source.chunks()
 
 
+Clouds: TypeAlias = File | Iterable[File] | Tiles  # as users name them
 CloudFiles: TypeAlias = Path | RasterBand | Tiles
 
 
@@ -244,7 +241,7 @@ class Points(NamedTuple):
         good = ~np.isin(self.classes, skip_classes)
         return good if self.withheld is None else good & ~self.withheld
 
-    def take(self, rows: IntArray | slice) -> Points:
+    def take(self, rows: IntArray | slice) -> "Points":
         """Return some of the points, without dimensions."""
         some: list[Any] = [None if v is None else np.ascontiguousarray(v[rows]) for v in self[:-2]]
         views = None if self.views is None else self.views.take(np.arange(len(self.xyz))[rows])
@@ -256,7 +253,7 @@ class CloudView:
     """A cloud in one file, in many, or in memory: its properties, and all its points."""
 
     name: str  # for messages
-    crs: CRS | str | None
+    crs: "CRS | str | None"
     low: FloatArray  # (2,), south-west and north-east corner, metres
     high: FloatArray
     points: int
@@ -405,7 +402,7 @@ def read_reference(reference: Clouds) -> Reference:
     return Reference(str(found), xyz, crs, height.size - len(xyz), raster=True)
 
 
-def check_same_crs(cloud: str, crs: CRS | None, reference: str, other: CRS | None) -> None:
+def check_same_crs(cloud: str, crs: "CRS | None", reference: str, other: "CRS | None") -> None:
     """Refuse to compare what does not lie in one CRS; warn where one has none.
 
     Nothing is transformed here: heights moved silently between datums would look like errors of the

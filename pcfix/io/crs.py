@@ -10,8 +10,6 @@ unchanged, some 50 m off, and horizontal datums are treated as one. Here that is
 names the grid, or a note. Heights are shifted only if both sides state their datum.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Callable
@@ -32,7 +30,7 @@ Heights = Literal["ellipsoidal", "gravity", "unstated"]
 METRES = ("metre", "meter")
 
 
-def parse_crs(given: str | CRS, name: str) -> CRS:
+def parse_crs(given: "str | CRS", name: str) -> "CRS":
     """Return the CRS of a text: an EPSG code, WKT of any flavour, PROJ string or name.
 
     ``local``, and axes east, north, up at a place, are not tied to the earth; see `is_local`. The
@@ -59,12 +57,12 @@ def parse_crs(given: str | CRS, name: str) -> CRS:
     return crs
 
 
-def is_local(crs: CRS) -> bool:
+def is_local(crs: "CRS") -> bool:
     """Whether a CRS is not tied to the earth (engineering CRS, LOCAL_CS)."""
     return crs.is_engineering or any(part.is_engineering for part in crs.sub_crs_list)
 
 
-def parts(crs: CRS) -> tuple[CRS, CRS | None]:
+def parts(crs: "CRS") -> "tuple[CRS, CRS | None]":
     """Return the horizontal CRS, two axes, and the vertical CRS or None."""
     if crs.is_compound:
         plan, vertical = crs.sub_crs_list[:2]
@@ -74,14 +72,14 @@ def parts(crs: CRS) -> tuple[CRS, CRS | None]:
     return (crs if crs.is_geocentric else crs.to_2d()), None
 
 
-def heights_of(crs: CRS) -> Heights:
+def heights_of(crs: "CRS") -> Heights:
     """Return whether z is above the ellipsoid, above a vertical datum, or not stated."""
     if parts(crs)[1] is not None:
         return "gravity"
     return "ellipsoidal" if len(crs.axis_info) == 3 else "unstated"
 
 
-def crs_words(crs: CRS | None) -> tuple[str, str]:
+def crs_words(crs: "CRS | None") -> tuple[str, str]:
     """Return the horizontal CRS, with its code, and the vertical datum; empty if not stated."""
     if crs is None:
         return "", ""
@@ -93,7 +91,7 @@ def crs_words(crs: CRS | None) -> tuple[str, str]:
     return name, "above the ellipsoid" if heights_of(crs) == "ellipsoidal" else ""
 
 
-def is_same(one: CRS, other: CRS) -> bool:
+def is_same(one: "CRS", other: "CRS") -> bool:
     """Whether two CRS are the same, whatever their order of axes and their shift to WGS 84."""
     one, other = unbound(one), unbound(other)
     if one.equals(other, ignore_axis_order=True):
@@ -102,18 +100,18 @@ def is_same(one: CRS, other: CRS) -> bool:
     return code is not None and code == other.to_epsg()
 
 
-def unbound(crs: CRS) -> CRS:
+def unbound(crs: "CRS") -> "CRS":
     """Return a CRS without its shift to WGS 84 (TOWGS84)."""
     return crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
 
 
-def plan_unit(crs: CRS) -> tuple[str, float]:
+def plan_unit(crs: "CRS") -> tuple[str, float]:
     """Return name and size of the unit of x and y: metres, or radians of a geographic CRS."""
     axis = crs.axis_info[0]
     return axis.unit_name, axis.unit_conversion_factor
 
 
-def metres_up(crs: CRS) -> float:
+def metres_up(crs: "CRS") -> float:
     """Return how many metres up one unit of z is; unstated heights are in the unit of the plan.
 
     A frame of cameras has one scale, so a projected CRS in feet without a vertical part has its
@@ -128,7 +126,7 @@ def metres_up(crs: CRS) -> float:
     return 1.0 if crs.is_geographic else plan_unit(crs)[1]
 
 
-def check_projected_metres(crs: CRS, name: str) -> None:
+def check_projected_metres(crs: "CRS", name: str) -> None:
     """Refuse a cloud that is not in a projected CRS in metres, heights included."""
     units = {axis.unit_name for axis in crs.axis_info}
     if not crs.is_projected or not units.issubset(METRES):
@@ -138,7 +136,7 @@ def check_projected_metres(crs: CRS, name: str) -> None:
         raise bad_file(name, code, sentence, crs=crs.name, unit=unit)
 
 
-def with_heights(plan: CRS, vertical: CRS) -> CRS:
+def with_heights(plan: "CRS", vertical: "CRS") -> "CRS":
     """Return a horizontal CRS with the datum of a vertical one, heights in metres."""
     from pyproj import CRS
     from pyproj.crs import CompoundCRS, VerticalCRS
@@ -148,7 +146,7 @@ def with_heights(plan: CRS, vertical: CRS) -> CRS:
     return CRS(CompoundCRS(f"{plan.name} + {vertical.name}", [plan, vertical]))
 
 
-def crs_text(crs: CRS) -> str:
+def crs_text(crs: "CRS") -> str:
     """Return the shortest text that names a CRS exactly: its codes, else WKT."""
     own = _code(crs)
     if own is not None:
@@ -160,7 +158,7 @@ def crs_text(crs: CRS) -> str:
     return crs.to_wkt()
 
 
-def _code(crs: CRS) -> tuple[str, str] | None:
+def _code(crs: "CRS") -> tuple[str, str] | None:
     """Return authority and code that a CRS states; a search for one that fits takes long."""
     given = crs.to_json_dict().get("id")
     return None if given is None else (str(given["authority"]), str(given["code"]))
@@ -175,7 +173,7 @@ def shortened(text: str) -> str:
 LOCAL = "local"
 
 
-def geographic_3d(crs: CRS) -> CRS:
+def geographic_3d(crs: "CRS") -> "CRS":
     """Return longitude, latitude and ellipsoidal height on the datum of a geocentric CRS."""
     from pyproj import CRS
     from pyproj.crs import BoundCRS, GeographicCRS
@@ -205,7 +203,7 @@ class Topocentric:
     height_m: float
 
     @classmethod
-    def from_text(cls, text: str, name: str) -> Topocentric:
+    def from_text(cls, text: str, name: str) -> "Topocentric":
         """Read ``ENU:latitude,longitude,height``; without a height it is 0."""
         try:
             latitude, longitude, *height = map(float, text.partition(":")[2].split(","))
@@ -248,7 +246,7 @@ class HeightsError(InputError):
 
 
 def transformation(
-    source: CRS, target: CRS, at: FloatArray, name: str, *, heights: bool, instead: str = ""
+    source: "CRS", target: "CRS", at: FloatArray, name: str, *, heights: bool, instead: str = ""
 ) -> tuple[Move, Notes]:
     """Return PROJ's best transformation that is not a ballpark where that matters, and notes.
 
@@ -320,7 +318,7 @@ def transformation(
     return forward, notes
 
 
-def heights_agree(source: CRS, target: CRS) -> bool:
+def heights_agree(source: "CRS", target: "CRS") -> bool:
     """Whether heights need no change: one datum, or one side does not state which."""
     kinds = heights_of(source), heights_of(target)
     if "unstated" in kinds:
@@ -333,7 +331,7 @@ def heights_agree(source: CRS, target: CRS) -> bool:
     return kinds[0] == kinds[1] and is_same(plan, other_plan)
 
 
-def assumed_heights(source: CRS, target: CRS) -> str:
+def assumed_heights(source: "CRS", target: "CRS") -> str:
     """Return in words what is assumed if one of two CRS names no vertical datum, else nothing."""
     kinds = heights_of(source), heights_of(target)
     if kinds[0] == "unstated" != kinds[1]:
@@ -344,7 +342,12 @@ def assumed_heights(source: CRS, target: CRS) -> str:
 
 
 def to_cloud_crs(
-    crs: str | CRS | None, cloud_crs: str | CRS | None, at: FloatArray, name: str, *, heights: bool
+    crs: "str | CRS | None",
+    cloud_crs: "str | CRS | None",
+    at: FloatArray,
+    name: str,
+    *,
+    heights: bool,
 ) -> Move:
     """Return the transformation from a file's CRS to the cloud's, and warn of guesses.
 

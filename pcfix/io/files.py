@@ -5,8 +5,6 @@ a hidden name next to its target, flushed to the disk, and renamed. What a kille
 that hidden file; the next command that writes the same target removes it.
 """
 
-from __future__ import annotations
-
 import errno
 import glob
 import hashlib
@@ -402,12 +400,12 @@ def scratch_arrays(target: Path) -> Iterator[Empty]:
 ENSEMBLE = "ensemble.npz"  # the file next to an adjusted model with the members of its ensemble
 
 
-def write_members(folder: Path, members: Members) -> None:
+def write_members(folder: Path, members: "Members") -> None:
     """Write members into a folder, as the arrays of `Members`, for ``numpy.load``."""
     np.savez_compressed(folder / ENSEMBLE, **vars(members))
 
 
-def find_members(cameras: File) -> tuple[Path, Members] | None:
+def find_members(cameras: File) -> "tuple[Path, Members] | None":
     """Return the members next to a camera file, and their file; None if there is none.
 
     It is in the folder of the adjustment: a model's own folder, or one of the two above it.

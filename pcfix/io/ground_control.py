@@ -25,8 +25,6 @@ check point. The first frame has the images of each marker, in pixels from the u
 Reference: "Ground Control Points" in the manual of OpenDroneMap, https://docs.opendronemap.org/gcp.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

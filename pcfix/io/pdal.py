@@ -4,8 +4,6 @@ PDAL checks neither the length nor the strides of the arrays that it gets back. 
 have PDAL's own types, are C-contiguous, and are as long as its own.
 """
 
-from __future__ import annotations
-
 import json
 from typing import Any, TypeAlias
 
@@ -16,8 +14,8 @@ from pcfix.errors import SettingError
 from pcfix.io.las.columns import COLUMNS, Column, changes_of, column_scale
 from pcfix.model import BATHYMETRIC_POINT, Correction, FloatArray
 
-Dimensions: TypeAlias = "dict[str, npt.NDArray[Any]]"
-Metadata: TypeAlias = "dict[str, Any]"
+Dimensions: TypeAlias = dict[str, npt.NDArray[Any]]
+Metadata: TypeAlias = dict[str, Any]
 
 NAME = "the pipeline's cloud"
 OUTCOME = "Outcome"  # a dimension with `pcfix.Outcome`, if ``add_dimension`` adds it

@@ -10,8 +10,6 @@ The heights above the take-off place are those that drones recorded in their ima
 ``drone-dji:RelativeAltitude`` (metres, by the barometer).
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import warnings

@@ -5,8 +5,6 @@ their properties, ``property TYPE NAME`` or ``property list COUNT_TYPE ITEM_TYPE
 follow as bytes without padding. Records that follow as text are refused.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any, NamedTuple

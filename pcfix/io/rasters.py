@@ -5,8 +5,6 @@ square windows, so that its size does not matter. Where it has no height (no dat
 or impossible) there is no point.
 """
 
-from __future__ import annotations
-
 import errno
 import math
 import os
@@ -54,7 +52,7 @@ check_tif = partial(check_output, suffixes=(".tif", ".tiff"))  # checks the path
 
 
 @contextmanager
-def open_raster(path: File) -> Iterator[DatasetReader]:
+def open_raster(path: File) -> "Iterator[DatasetReader]":
     """Open a raster to read parts of it; what cannot be read is a ``raster.damaged``."""
     import rasterio
 
@@ -72,20 +70,20 @@ def raster_errors(path: Path) -> AbstractContextManager[None]:
     return refusing(path, "raster.damaged", sentence, kinds)
 
 
-def place_of(transform: Affine, column: Any, row: Any) -> tuple[Any, Any]:
+def place_of(transform: "Affine", column: Any, row: Any) -> tuple[Any, Any]:
     """Return x and y of a column and row: numbers or arrays of them."""
     t = transform
     return t.a * column + t.b * row + t.c, t.d * column + t.e * row + t.f
 
 
-def lattice_of(source: DatasetReader) -> Lattice:
+def lattice_of(source: "DatasetReader") -> Lattice:
     """Return the cells of a raster that pcfix wrote."""
     size, t = source.res[0], source.transform
     first = round(t.c / size), round(-t.f / size)
     return Lattice(size, *first, source.width, source.height)
 
 
-def transform_of(lattice: Lattice) -> Affine:
+def transform_of(lattice: Lattice) -> "Affine":
     """Return the geotransform of the cells of a lattice."""
     from rasterio.transform import from_origin
 
@@ -112,7 +110,7 @@ def read_onto(path: Path, lattice: Lattice) -> FloatArray:
         return read_masked(same)
 
 
-def filled_heights(source: DatasetReader) -> FloatArray:
+def filled_heights(source: "DatasetReader") -> FloatArray:
     """Return the first band with its holes interpolated."""
     height = read_masked(source)
     if np.isnan(height).all():
@@ -130,7 +128,7 @@ def filled(values: FloatArray, reach: float) -> FloatArray:
     return np.where(known, values, fillnodata(values.copy(), known, max_search_distance=reach))
 
 
-def write_bands(target: DatasetWriter, bands: Iterable[npt.NDArray[Any]], window: Window) -> None:
+def write_bands(target: "DatasetWriter", bands: Iterable[npt.NDArray[Any]], window: Window) -> None:
     """Write part of all bands, each of shape (rows, columns); NaN becomes the raster's nodata."""
     for number, values in enumerate(bands, start=1):
         if np.issubdtype(values.dtype, np.floating):
@@ -146,8 +144,8 @@ def slices(window: Window) -> tuple[tuple[int, int], tuple[int, int]]:
 @contextmanager
 def new_raster(
     target: Path,
-    cells: Lattice | DatasetReader,
-    crs: CRS | str | None,
+    cells: "Lattice | DatasetReader",
+    crs: "CRS | str | None",
     bands: Mapping[str, str],
     *,
     dtype: str = "float32",
@@ -155,7 +153,7 @@ def new_raster(
     tags: Mapping[str, str] | None = None,
     scale_offset: tuple[float, float] = (1.0, 0.0),
     resampling: str = "average",
-) -> Iterator[DatasetWriter]:
+) -> "Iterator[DatasetWriter]":
     """Open a new cloud optimised GeoTIFF (COG) for `write_bands`.
 
     It is written as a plain GeoTIFF, which is then copied. `bands` maps the description of each
@@ -247,7 +245,7 @@ def write_dod(dsm: Path, reference: Path, output: Path) -> None:
                 raise GeometryError("raster.no_overlap", sentence, dsm=dsm, reference=reference)
 
 
-def preview(path: Path, cells: int = 360_000) -> tuple[FloatArray, Affine]:
+def preview(path: Path, cells: int = 360_000) -> "tuple[FloatArray, Affine]":
     """Return a raster of at most `cells`, NaN for no data, and its geotransform."""
     from rasterio.transform import from_bounds
 
@@ -382,7 +380,7 @@ class RasterSource(LasSource):
             yield points
 
 
-def _height_band(raster: DatasetReader, part: RasterBand) -> int:
+def _height_band(raster: "DatasetReader", part: RasterBand) -> int:
     """Return the number of the band of heights; an `InputError` if there are other values."""
     path, band = part.path, part.band
     kinds = [one.name for one in raster.colorinterp]

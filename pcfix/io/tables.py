@@ -1,7 +1,5 @@
 """Read tables, that is text files with a header line, and match the names of images in them."""
 
-from __future__ import annotations
-
 import codecs
 import csv
 import math
@@ -70,7 +68,7 @@ class Table:
             return [re.split(r"[\\/]", label)[-1] for label in labels]
         return labels
 
-    def take(self, rows: IntArray) -> Table:
+    def take(self, rows: IntArray) -> "Table":
         """Return the table with some of its rows."""
         chosen, lines = [self.rows[i] for i in rows], [self.line[i] for i in rows]
         return replace(self, rows=chosen, line=lines)

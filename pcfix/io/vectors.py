@@ -1,7 +1,5 @@
 """Read shorelines and water masks from vector files and tables; write layers as a GeoPackage."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -96,7 +94,7 @@ def read_vectors(path: File, *, crs: str | None = None) -> Vectors:
     return vectors
 
 
-def in_cloud_crs(vectors: Vectors, cloud_crs: str | CRS | None, *, heights: bool) -> Vectors:
+def in_cloud_crs(vectors: Vectors, cloud_crs: "str | CRS | None", *, heights: bool) -> Vectors:
     """Transform geometries to the cloud's CRS; see `to_cloud_crs`. Without `heights` z stays."""
     at = vectors.coordinates
     heights = heights and bool(np.isfinite(at[:, 2]).any())
@@ -181,7 +179,7 @@ class Shoreline(NamedTuple):
 
 
 def read_shoreline(
-    path: File, cloud_crs: str | CRS | None = None, *, crs: str | None = None
+    path: File, cloud_crs: "str | CRS | None" = None, *, crs: str | None = None
 ) -> Shoreline:
     """Read shoreline points, from points, lines and rings of polygons, holes included.
 
@@ -239,7 +237,7 @@ def _vertices(geometries: Geometries) -> FloatArray:
     return np.asarray(np.delete(xyz, again, axis=0), np.float64)
 
 
-def read_water_polygons(path: File, cloud_crs: str | CRS | None = None) -> Vectors:
+def read_water_polygons(path: File, cloud_crs: "str | CRS | None" = None) -> Vectors:
     """Read the polygons inside which points may be submerged, as one valid geometry.
 
     Its holes are dry.
@@ -278,7 +276,7 @@ class Layer(NamedTuple):
 
 
 def write_layers(
-    path: File, layers: Sequence[Layer], crs: CRS | str | None, *, overwrite: bool
+    path: File, layers: Sequence[Layer], crs: "CRS | str | None", *, overwrite: bool
 ) -> None:
     """Write layers in a CRS as one GeoPackage, with their styles as QGIS stores them."""
     write, target = load_pyogrio().raw.write, check_output(path, overwrite=overwrite)

@@ -23,8 +23,6 @@ dense cloud points 5 cm apart hardly have a camera in common. A list without pos
 row number. Then the numbers of points must agree, and the geometry is tested at the first points.
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -293,7 +291,7 @@ class ViewMatch:
         xyz: Any = self.view_list.xyz
         return cKDTree(xyz, balanced_tree=False, compact_nodes=False)
 
-    def with_image_order(self, xyz: FloatArray) -> ViewMatch:
+    def with_image_order(self, xyz: FloatArray) -> "ViewMatch":
         """Return the match with the order of the images that the cloud's first points show.
 
         A list that is matched by row number is refused if its cameras do not see them.
@@ -302,7 +300,7 @@ class ViewMatch:
             return self
         return replace(self, view_list=fitted(self.view_list, self.cameras, xyz))
 
-    def views_of(self, xyz: FloatArray, first_row: int) -> tuple[Views, ViewReport]:
+    def views_of(self, xyz: FloatArray, first_row: int) -> "tuple[Views, ViewReport]":
         """Return the cameras of a chunk's points, and the counts of the matches.
 
         The points, shape (n, 3), are apparent ones in the frame of the cameras, from the cloud's

@@ -6,8 +6,6 @@ apart at a northing of five million, and a damaged PLY ends the process.
 A raster is north-up, in the cloud's own CRS, and used cell by cell.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Sequence
@@ -46,7 +44,7 @@ KINDS = (
 _CORNERS = "vertex_indices", "vertex_index"
 
 
-def read_water(spec: float | File, cloud_crs: str | CRS | None = None) -> WaterSurface:
+def read_water(spec: float | File, cloud_crs: "str | CRS | None" = None) -> WaterSurface:
     """Read the water surface.
 
     Parameters
@@ -159,7 +157,7 @@ def _read_ply(path: Path) -> tuple[FloatArray, IntArray]:
 MOST_CELLS = 10_000_000  # cells that are read, for the memory
 
 
-def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRaster:
+def read_water_raster(path: File, cloud_crs: "str | CRS | None" = None) -> WaterRaster:
     """Read the heights of the water, metres; warn of what is assumed.
 
     Parameters
@@ -205,7 +203,7 @@ def read_water_raster(path: File, cloud_crs: str | CRS | None = None) -> WaterRa
     return WaterRaster(heights, float(t.c), float(t.f), (float(t.a), float(-t.e)), short)
 
 
-def _heights(source: DatasetReader, crs: CRS | None, name: str) -> FloatArray:
+def _heights(source: "DatasetReader", crs: "CRS | None", name: str) -> FloatArray:
     """Read a raster, metres, NaN for no height; warn of impossible ones."""
     unit = (source.units[0] or "").strip()
     # the unit of heights is that of the band, else that of the CRS

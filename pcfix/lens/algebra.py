@@ -3,8 +3,6 @@
 Sums are always formed from left to right, so that equal operands give equal results.
 """
 
-from __future__ import annotations
-
 from typing import TypeAlias
 
 import numpy as np

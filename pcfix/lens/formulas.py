@@ -13,8 +13,6 @@ places to have the same image. Without tangential terms it is the disc up to the
 d r' / d r = 0.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import TypeAlias, get_args
 

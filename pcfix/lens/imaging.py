@@ -9,8 +9,6 @@ curved sides, and the point has to be projected, except for tiles outside a pyra
 frame, which is found by unprojecting the border of the image densely.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple, TypeAlias

@@ -5,8 +5,6 @@ right, y down, z forward. The *photogrammetric* camera has x right, y up and z b
 All angles are in degrees, one per image; Rx, Ry, Rz are right-handed rotations about those axes.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from pcfix.model import FloatArray

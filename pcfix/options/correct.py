@@ -1,7 +1,5 @@
 """The options of a correction, of what comes before it, and of a whole run."""
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 from pcfix.errors import SettingError

@@ -11,8 +11,6 @@ and reaches none twice. Names are the same everywhere: ``max_angle`` in Python a
 ``--max-angle`` on the command line.
 """
 
-from __future__ import annotations
-
 import ast
 import difflib
 import inspect

@@ -1,7 +1,5 @@
 """Options that several commands share: water, cameras, views, files."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """The options of the steps after a correction, of photographs, and of commands without data."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -10,8 +10,6 @@ others, and each is weighted by the inverse variance of its scatter in the regis
 land decides where there is some, and elsewhere many corners, each about its mean over the frames.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import Any

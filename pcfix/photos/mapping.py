@@ -15,8 +15,6 @@ against 1.34 for n = 1.34). Each step is n - 1 = 0.34 of the one before, as in t
 (0.30 to 0.35).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

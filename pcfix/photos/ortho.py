@@ -8,8 +8,6 @@ Images whose rays are nearly as steep as the steepest are mixed, weighted by the
 seams do not show.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 

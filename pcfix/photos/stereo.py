@@ -7,8 +7,6 @@ the median of the heights from the pairs. There are no weights and no visibility
 all pairs are in memory (a few hundred images). It suits land and bed seen from above.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

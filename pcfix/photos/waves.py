@@ -32,8 +32,6 @@ Not observable are the mean level, waves longer than twice the image or shorter 
 and, without land, the part of the waves that looks like a movement of the camera.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 

@@ -5,8 +5,6 @@ respected class, and, if that is asked for, in the connected water. Connected wa
 cells over the whole cloud, filled chunk by chunk.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
@@ -98,7 +96,7 @@ class Labelling:
         """Whether a point is submerged exactly if it is below the surface."""
         return self.mask is None and not (self.settings.respect_classes or self.settings.connected)
 
-    def scanned(self, parts: Iterable[Part], low: FloatArray, high: FloatArray) -> Labelling:
+    def scanned(self, parts: Iterable[Part], low: FloatArray, high: FloatArray) -> "Labelling":
         """Return the rules with the water bodies, if they need them.
 
         `parts` are the whole cloud in chunks, and `low` and `high` its corners, if they are known.

@@ -7,8 +7,6 @@ what its predecessor needed. A tree needs about 16 bytes of memory per point; th
 may be on disk.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -29,7 +27,7 @@ SLACK = 1.0 + 1e-9
 class Neighbours:
     """Search neighbours among the points of tiles, in space (3 axes) or in plan (2 axes)."""
 
-    def __init__(self, tiles: PointTiles, axes: int) -> None:
+    def __init__(self, tiles: "PointTiles", axes: int) -> None:
         from scipy.spatial import cKDTree  # slow to import
 
         self.tiles, self.axes, points = tiles, axes, tiles.xyz

@@ -3,8 +3,6 @@
 They are independent of each other: each looks at all used points, whatever another found.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from enum import IntFlag
 from typing import NamedTuple

@@ -10,8 +10,6 @@ window of any kind; `light_through` searches the ray that passes a point, and `t
 the derivatives for intersections and for the bundle adjustment.
 """
 
-from __future__ import annotations
-
 import math
 from contextlib import suppress
 from dataclasses import dataclass

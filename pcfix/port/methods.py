@@ -31,8 +31,6 @@ frames hold the image of the true point that they lead to. There may be several 
 point may be wrong.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple, TypeAlias
 
 import numpy as np

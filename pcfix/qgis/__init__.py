@@ -4,8 +4,6 @@ It runs under QGIS's own Python and calls the ``pcfix`` of an environment that t
 that it imports QGIS and the standard library alone; `pcfix qgis-plugin` packs it.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 

@@ -1,7 +1,5 @@
 """Run a command of pcfix from the values of a form: command line, process, messages."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """The Processing provider of pcfix in QGIS: its setting, and an algorithm for each command."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -76,7 +74,7 @@ class Algorithm(core.QgsProcessingAlgorithm):
         self.command = command
         self.fields = [*command["places"], *command["options"]]
 
-    def createInstance(self) -> Algorithm:  # noqa: N802
+    def createInstance(self) -> "Algorithm":  # noqa: N802
         """Return a copy."""
         return Algorithm(self.command)
 

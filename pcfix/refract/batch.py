@@ -5,8 +5,6 @@ compared images in the geometry of its own cameras; a direction there becomes on
 cameras by its place in the image (`OriginalModel`, `Images`).
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -38,13 +36,13 @@ ALIKE = ("snell", "shan", "butler", "murase", "dietrich")  # all rays of a point
 class Learned(NamedTuple):
     """What was estimated from the cloud as a whole; None where it was not."""
 
-    regression: DepthRegression | None = None  # for the method of that name
-    occluder: Occluder | None = None  # the surface of the cloud
-    matcher: Matcher | None = None  # which images were matched with each other
-    bed: Bed | None = None  # the bed that agrees with most fused points
-    model_uncertainty: ModelUncertainty | None = None
-    land: Survey | None = None  # for land transferred to adjusted cameras, if it differs
-    poses: PoseErrors | None = None  # errors of Z from the adjusted poses
+    regression: "DepthRegression | None" = None  # for the method of that name
+    occluder: "Occluder | None" = None  # the surface of the cloud
+    matcher: "Matcher | None" = None  # which images were matched with each other
+    bed: "Bed | None" = None  # the bed that agrees with most fused points
+    model_uncertainty: "ModelUncertainty | None" = None
+    land: "Survey | None" = None  # for land transferred to adjusted cameras, if it differs
+    poses: "PoseErrors | None" = None  # errors of Z from the adjusted poses
     limit_deg: float | None = None  # largest incidence angle of the rays of the points
 
 
@@ -94,7 +92,7 @@ class Survey:
     settings: ScienceOptions
     level_offset_m: FloatArray | None = None  # (k,), how much higher the water stood per image
     learned: Learned = field(default_factory=Learned)
-    unlisted: Survey | None = None
+    unlisted: "Survey | None" = None
     own_water: Field | None = None
 
     @property
@@ -127,7 +125,7 @@ class Batch:
     original_model: OriginalModel | None = None
     level_sigma_m: FloatArray | None = None  # (m,), of the surface above each point, from its fit
 
-    def take(self, rows: IntArray) -> Batch:
+    def take(self, rows: IntArray) -> "Batch":
         """Return some of the points, in the order of `rows`."""
         sigma, model = self.level_sigma_m, self.original_model
         return replace(
@@ -144,7 +142,7 @@ class Batch:
     def __len__(self) -> int:
         return len(self.xyz)
 
-    def parts(self) -> list[tuple[IntArray, Batch]]:
+    def parts(self) -> "list[tuple[IntArray, Batch]]":
         """Return the points with a view list and those without: the rows and the batch of each."""
         if self.survey.unlisted is None or self.views is None:
             return [(np.arange(len(self)), self)]
@@ -166,7 +164,7 @@ class Batch:
         """Rays of each point, shape (m,)."""
         return np.diff(self.rays.start)
 
-    def chosen(self) -> Chosen:
+    def chosen(self) -> "Chosen":
         """Return the points and their cameras, if these are known, for kernels."""
         survey, views, none = self.survey, self.views, np.zeros(0, np.int64)
         original = self.xyz if self.original_model is None else self.original_model.xyz
@@ -194,7 +192,7 @@ class Batch:
         *,
         outcome: npt.NDArray[np.uint8],
         ray_miss_m: FloatArray | None = None,
-    ) -> Intersection:
+    ) -> "Intersection":
         """Return the result of a method that gives shifts; zeros for points that are not moved."""
         moved, zero = outcome == Outcome.CORRECTED, np.zeros(len(self.xyz))
         used = np.zeros(len(self.survey.cameras), np.bool_)
@@ -244,13 +242,13 @@ class Intersection(NamedTuple):
     covariance_m2: FloatArray | None = None
     ambiguity_m: FloatArray | None = None  # of Z, by the choice among groups of depth maps
 
-    def take(self, rows: IntArray | BoolArray) -> Intersection:
+    def take(self, rows: IntArray | BoolArray) -> "Intersection":
         """Return the results of some points."""
         known = {name: value for name, value in self._asdict().items() if value is not None}
         known.pop("camera_used")
         return self._replace(**{name: value[rows] for name, value in known.items()})
 
-    def with_rows(self, rows: IntArray, other: Intersection) -> Intersection:
+    def with_rows(self, rows: IntArray, other: "Intersection") -> "Intersection":
         """Return the results with those of some points replaced, in the same arrays."""
         for name, value in other._asdict().items():
             if value is not None and name != "camera_used":
@@ -259,7 +257,7 @@ class Intersection(NamedTuple):
 
 
 @kernel
-def _incidence(span: Span, points: Chosen, cosine: FloatArray) -> None:
+def _incidence(span: Span, points: "Chosen", cosine: FloatArray) -> None:
     """Write the cosine of the largest incidence angle of each point's rays."""
     for i in range(*span):
         least, normal = 1.0, normal_above(points, i)

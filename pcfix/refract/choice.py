@@ -1,7 +1,5 @@
 """Choose the cameras of each point: all whose frames contain it, or those of a view list."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

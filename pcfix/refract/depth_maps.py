@@ -25,8 +25,6 @@ With a view list the fused maps are known. Without one they are chosen as the gr
 nearest to that of the surroundings. A point needs some 80 light paths for each bed that is tried.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -29,8 +29,6 @@ the bed is the height z with the largest
 It serves only to choose among the likely beds of a point; no point is put onto it.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -16,8 +16,6 @@ lay below the apparent point saw it through air; its ray goes straight. Or it ha
 own, see `Survey.own_water`.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Estimate everything that a correction needs to know about the block and the whole cloud."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -74,7 +72,7 @@ def wants_sample(survey: Survey, views: ViewKind | None) -> bool:
     return views in ("depth-maps", "pairs") and settings.method == "consistent"
 
 
-def with_factor(batch: Batch) -> tuple[Batch, StereoFactor | None]:
+def with_factor(batch: Batch) -> "tuple[Batch, StereoFactor | None]":
     """Replace the depth factor ``auto`` by a number; return the batch and the factor found."""
     survey = batch.survey
     if survey.settings.depth_factor != "auto":

@@ -15,8 +15,6 @@ Each camera may have its own water level; where that is below the apparent point
 straight.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TypeAlias
 

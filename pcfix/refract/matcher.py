@@ -13,8 +13,6 @@ constants. On a real block it finds 91 % of the partners from places of the dens
 from the tie points that the matcher used.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple

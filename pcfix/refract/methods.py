@@ -4,8 +4,6 @@
 batches of points with chosen cameras. A method is loaded when it is first used.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from importlib import import_module
@@ -164,7 +162,7 @@ def with_rays(batch: Batch, shift_m: FloatArray | None = None) -> Batch:
     return replace(batch, views=views)
 
 
-def bed_around(batch: Batch) -> Bed | None:
+def bed_around(batch: Batch) -> "Bed | None":
     """Return the most likely bed of a sample of fused points; None if no image sees a point."""
     from pcfix.refract.depth_maps import likely_beds
     from pcfix.refract.fusion import bed_of

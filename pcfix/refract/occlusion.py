@@ -13,8 +13,6 @@ A cell has the height of its second highest point, and at most that of the highe
 neighbours, so that neither a single flying point nor a single cell counts.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

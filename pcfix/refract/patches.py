@@ -29,8 +29,6 @@ The bed is fitted to three quarters of a patch and predicts the others, in turn:
 candidates gains nothing by fitting noise.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple, TypeAlias
 

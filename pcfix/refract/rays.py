@@ -41,8 +41,6 @@ iteration.
 The plane is N.x = h.
 """
 
-from __future__ import annotations
-
 from typing import TypeAlias
 
 import numpy as np

@@ -13,8 +13,6 @@ with the largest distance from its runner-up; the confidence is the product of t
 that it is better than each other type.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

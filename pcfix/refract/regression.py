@@ -1,7 +1,5 @@
 """Depths by regression: true depth = a + b * apparent depth, fitted to check depths."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

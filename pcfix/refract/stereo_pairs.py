@@ -26,8 +26,6 @@ to half such a step wherever it does not come nearer.
 Points that need more than a few steps form new tiles.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 Vertical uncertainty is the TVU at 95 % of hydrographic surveys, IHO S-44, edition 6.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -73,7 +71,7 @@ class _Figures(Sums):
     most_m: float = field(metadata=MOST)
 
     @classmethod
-    def of(cls, values_m: FloatArray, low_m: float = 0.0, high_m: float = 0.0) -> _Figures:
+    def of(cls, values_m: FloatArray, low_m: float = 0.0, high_m: float = 0.0) -> "_Figures":
         """Return the figures of some values; between equal limits there are no percentiles."""
         places = np.rint((np.clip(values_m, low_m, high_m) - low_m) / _BIN_M).astype(np.int64)
         bins = np.bincount(places, minlength=round((high_m - low_m) / _BIN_M) + 1)
@@ -110,7 +108,7 @@ class Tally(Sums):
     incidence_deg: float = field(default=0.0, metadata=MOST)
 
     @classmethod
-    def of(cls, correction: Correction) -> Tally:
+    def of(cls, correction: Correction) -> "Tally":
         """Return the tally of a chunk."""
         apparent, moved = correction.apparent_xyz, correction.corrected
         # axis by axis: numpy is slow along the short one

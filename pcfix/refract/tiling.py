@@ -4,8 +4,6 @@ Kernels process points tile by tile: a tile of neighbours needs few cameras, and
 its points are vectorised.
 """
 
-from __future__ import annotations
-
 from itertools import accumulate
 
 import numpy as np

@@ -22,8 +22,6 @@ faces away from the camera, all is NaN. The ray is taken to cross the surface on
 All is numpy: blocks of pairs are traced at once, and the pairs that are not found yet go on.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple, TypeAlias
@@ -170,7 +168,7 @@ class Endpoints(NamedTuple):
     e: FloatArray  # (3, m), projection centres relative to them
     n: float
 
-    def of(self, rows: IntArray | BoolArray) -> Endpoints:
+    def of(self, rows: IntArray | BoolArray) -> "Endpoints":
         """Return some of the pairs."""
         return self._replace(point=self.point[:, rows], e=self.e[:, rows])
 
@@ -245,7 +243,7 @@ def _unit(a: FloatArray) -> FloatArray:
     return a / np.sqrt(_dot(a, a))
 
 
-def _path(pairs: Endpoints, method: str) -> Paths:
+def _path(pairs: Endpoints, method: str) -> "Paths":
     """Return where the light of pairs pierces the surface, (3, m), and whether on a crease."""
     e, m = pairs.e, pairs.e.shape[1]
     pierced, on_crease = np.full((3, m), np.nan), np.zeros(m, np.bool_)

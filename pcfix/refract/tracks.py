@@ -25,8 +25,6 @@ about three digits, and two or three steps are enough.
 The inner loops over the points of a tile are vectorised for the usual lens and a plane of water.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from pcfix.kernels import device

@@ -45,8 +45,6 @@ Agrafiotis 2018); up to 45 degrees its standard errors are the same to 2 %.
 Neglected is the turn of M, and of J, times the residual, which is of second order.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 All text is derived from the plain values of `adjustment_dict`, which a resumed run has, too.
 """
 
-from __future__ import annotations
-
 import math
 
 from pcfix.adjust.parameters import words_of

@@ -4,8 +4,6 @@ Everything works on the plain values of `Comparison.as_dict`, so that a resumed 
 earlier one measured. The terminal and the page show the same tables.
 """
 
-from __future__ import annotations
-
 from itertools import cycle
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -183,7 +181,7 @@ def evaluation(
     return pictures, _tables(compared)
 
 
-def c2c_figure(compared: Plain) -> Figure:
+def c2c_figure(compared: Plain) -> "Figure":
     """Draw the histograms of all C2C: a column a direction, a row a cloud, one axis."""
     both = (errors_of(compared, kind) for kind in ("c2c", "c2c_from_reference"))
     columns = [one for one in both if one]
@@ -194,7 +192,7 @@ def c2c_figure(compared: Plain) -> Figure:
     return figure
 
 
-def _histograms(columns: list[list[Errors]], label: str, *, sharex: bool) -> Figure:
+def _histograms(columns: list[list[Errors]], label: str, *, sharex: bool) -> "Figure":
     """Draw distributions with the normal distributions of their means and standard deviations."""
     from scipy.stats import norm
 

@@ -6,8 +6,6 @@ of its name, and those of a GeoPackage from its table ``layer_styles``.
 Matplotlib is imported when a figure is drawn.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import json
@@ -45,7 +43,7 @@ if TYPE_CHECKING:
 BEFORE, AFTER, WATER, REFERENCE = "#b3541e", "#0b5e8a", "#4aa3c7", "#222222"
 
 
-def new_figure(width_in: float = 8.0, height_in: float = 4.5, **grid: Any) -> tuple[Figure, Any]:
+def new_figure(width_in: float = 8.0, height_in: float = 4.5, **grid: Any) -> "tuple[Figure, Any]":
     """Return a figure, drawn without a screen, and its axes, or a grid of them."""
     from matplotlib.figure import Figure
 
@@ -53,7 +51,7 @@ def new_figure(width_in: float = 8.0, height_in: float = 4.5, **grid: Any) -> tu
     return figure, figure.subplots(**grid)
 
 
-def png_of(figure: Figure) -> bytes:
+def png_of(figure: "Figure") -> bytes:
     """Return a figure as a PNG file."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -66,7 +64,7 @@ def png_of(figure: Figure) -> bytes:
 
 def map_figure(
     values: FloatArray, lattice: Lattice, label: str, shade: FloatArray | None = None, **look: Any
-) -> Figure:
+) -> "Figure":
     """Draw a map of values of cells, shape (rows, columns); `shade` is its relief, 0 to 1."""
     west, south, east, north = lattice.bounds_m
     extent_m = west, east, south, north
@@ -91,7 +89,7 @@ class Picture:
     name: str
     title: str
     alt: str
-    figure: Figure
+    figure: "Figure"
 
     @cached_property
     def png(self) -> bytes:

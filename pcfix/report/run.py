@@ -1,7 +1,5 @@
 """The report page of a run: words, pictures and tables on the correction and the adjustment."""
 
-from __future__ import annotations
-
 import platform
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -189,7 +187,7 @@ def _pictures(s: Summary, cameras: Cameras, maps: RunMaps, compared: Plain) -> l
     return pictures
 
 
-def tvu_figure(depth_m: FloatArray, tvu_m: FloatArray, measured: Sequence[Plain]) -> Figure:
+def tvu_figure(depth_m: FloatArray, tvu_m: FloatArray, measured: Sequence[Plain]) -> "Figure":
     """Draw TVU at 95 % of cells over depth, (n,), metres, and the limits of the orders of S-44.
 
     `measured` are the `Comparison.depth_bins` of a reference, in plain values.

@@ -10,8 +10,6 @@ of values in a list, each text in a list, or each count in a dict that is not ze
 report page use the same rows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from string import Formatter
 from textwrap import fill

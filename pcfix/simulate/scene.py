@@ -1,7 +1,5 @@
 """A scene: ground, water, images, and the cloud that software would reconstruct from them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -118,7 +116,7 @@ def simulate_scene(
 
 
 def scene_of(
-    chosen: SceneSettings, site: Site, xyz: FloatArray, truth: FloatArray, views: Views
+    chosen: SceneSettings, site: "Site", xyz: FloatArray, truth: FloatArray, views: Views
 ) -> Scene:
     """Return the scene of a site, with a cloud and its true points, both of shape (n, 3)."""
     terrain, rng = site.terrain, site.rng
@@ -145,7 +143,7 @@ def scene_of(
     )
 
 
-def lay_out(chosen: SceneSettings) -> Site:
+def lay_out(chosen: SceneSettings) -> "Site":
     """Return ground and block of a scene, in local coordinates."""
     # poses and detection have their own random numbers, as they can be switched on
     rng, extent = np.random.default_rng(chosen.seed), chosen.area_m

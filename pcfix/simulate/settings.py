@@ -1,7 +1,5 @@
 """The settings of a simulated scene, checked together, its lens and its ground."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -141,7 +139,7 @@ class Terrain:
     def random(
         cls, kind: BedKind, extent_m: tuple[float, float], water: WaterPlane,
         greatest_depth_m: float, rng: np.random.Generator,
-    ) -> Terrain:  # fmt: skip
+    ) -> "Terrain":  # fmt: skip
         """Make a terrain; a shore gets random rocks."""
         rocks = np.zeros((0, 4))
         if kind == "shore":

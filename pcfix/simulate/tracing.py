@@ -10,8 +10,6 @@ Arrays are flat over the m (point, camera) pairs, sorted by point: metres, shape
 stated otherwise.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from pcfix.model import Cameras, FloatArray, IntArray, Lens, WaterPlane

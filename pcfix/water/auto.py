@@ -12,8 +12,6 @@ exceed the trend: what fades under water is constant on land. Each tile has its 
 products, so that adding or resampling tiles is cheap.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -119,12 +117,12 @@ LEAST_SIGMA_M = 0.015  # least standard error of a waterline: waves, thickness o
 class Scan(NamedTuple):
     """The sums of all cues of a cloud."""
 
-    cues: list[Moments]  # of the slope and of the colour, if they show anything
-    samples: Samples
+    cues: "list[Moments]"  # of the slope and of the colour, if they show anything
+    samples: "Samples"
     heights_m: FloatArray  # (h,), above the origin of the samples
 
 
-def _scanned(samples: Samples) -> Scan:
+def _scanned(samples: "Samples") -> Scan:
     """Return the sums of the cues at all heights; GeometryError ``cloud.flat`` without relief."""
     low, high = np.percentile(samples.smooth_m, [0.5, 99.5])
     if high - low < LEAST_RELIEF_M:
@@ -138,7 +136,7 @@ def _scanned(samples: Samples) -> Scan:
     return _scan_at(samples, np.linspace(low, high, count))
 
 
-def _scan_at(samples: Samples, heights_m: FloatArray) -> Scan:
+def _scan_at(samples: "Samples", heights_m: FloatArray) -> Scan:
     """Sum all cues at the given heights."""
     cues = (SLOPE, RED) if len(samples.redness) else (SLOPE,)
     found = (cue_moments(samples, cue, heights_m) for cue in cues)
@@ -363,7 +361,7 @@ def tile_moments(
 LEAST_TILE_CELLS = 40
 
 
-def cue_moments(samples: Samples, cue: Cue, heights_m: FloatArray) -> Moments | None:
+def cue_moments(samples: "Samples", cue: Cue, heights_m: FloatArray) -> Moments | None:
     """Return the sums of a cue over the tiles that show anything; None without any.
 
     Heights, shape (h,), are evenly spaced above the samples' origin.

@@ -1,7 +1,5 @@
 """Check points and cameras against the water surface."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from dataclasses import dataclass, field
@@ -161,7 +159,9 @@ class WaterMeeting(Sums):
     most_depth_m: float = field(metadata=MOST)
 
     @classmethod
-    def of(cls, apparent: FloatArray, correction: Correction, water: WaterSurface) -> WaterMeeting:
+    def of(
+        cls, apparent: FloatArray, correction: Correction, water: WaterSurface
+    ) -> "WaterMeeting":
         """Return the figures of the apparent points of a chunk, shape (n, 3)."""
         z, unknown = apparent[:, 2], ~correction.water_known
         depth = correction.depth_m[correction.submerged]

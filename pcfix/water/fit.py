@@ -7,8 +7,6 @@ without outliers. The samples are the same every time. (scipy's `least_squares` 
 is only the second half; it needs a start and a scale, and gives every observation a weight.)
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -159,7 +157,7 @@ class _Shore(NamedTuple):
     across_m: float
 
 
-def _choose(shore: _Shore) -> tuple[Model, Regression, list[str]]:
+def _choose(shore: _Shore) -> "tuple[Model, Regression, list[str]]":
     """Return the model with significant tilts only, its fit, and why."""
     from scipy.special import fdtrc
 
@@ -193,7 +191,7 @@ def _choose(shore: _Shore) -> tuple[Model, Regression, list[str]]:
     return model, found, notes
 
 
-def _regression(shore: _Shore, model: Model) -> Regression:
+def _regression(shore: _Shore, model: Model) -> "Regression":
     """Fit the unknowns of a model: level, and rise along and across the points."""
     p, n, along, across = _UNKNOWNS[model], len(shore.z), shore.along_m, shore.across_m
     on_line = (p > 1 and along < _SAME_PLACE_M) or (p > 2 and across < _ON_LINE * along)

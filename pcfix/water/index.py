@@ -1,7 +1,5 @@
 """The refractive index of natural waters, relative to air."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar

@@ -12,8 +12,6 @@ riffles and weirs keep their edges; its weight comes from cross-validation. Rise
 their own (Bollaerts et al. 2006, Statistics in Medicine 25: 1189-1206).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

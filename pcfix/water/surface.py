@@ -7,8 +7,6 @@ touches it. Coordinates inside are relative to the raster's upper left cell, or 
 left corner, so that UTM northings of five million lose no digits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache

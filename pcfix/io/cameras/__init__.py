@@ -7,8 +7,6 @@ and lenses, and collects warnings (`checks.warn`). A module raises an `InputErro
 sentence is clearer. README.md of this folder says how to add a format.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from contextlib import suppress

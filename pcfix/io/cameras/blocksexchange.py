@@ -25,8 +25,6 @@ camera model", "Fisheye camera model"; Bentley developer documentation, "CC Orie
 order of P1 and P2 and the factor pi / 2 follow converters that cite those pages.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import re

@@ -27,8 +27,6 @@ None has the sizes of the images: they are those of the images next to the file,
 smallest that contain all tie points. The files name no CRS.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -8,8 +8,6 @@ in Brown's order, so OpenCV's p1 is ``p2``; ``s1``, ... of thin prisms; and the 
 projection, see `SHAPES`. `pcfix.model.Lens` has the formulas.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 import zipfile

@@ -18,8 +18,6 @@ binary models; images and cameras are numbered from 1 in the order of the block,
 of the tie points.
 """
 
-from __future__ import annotations
-
 import json
 import mmap
 import os

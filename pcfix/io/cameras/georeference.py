@@ -9,8 +9,6 @@ image of 4000 px. A cloud in map coordinates has the same error.
 Heights are transformed only if both sides state their vertical datum. Otherwise they do not change.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -36,7 +34,7 @@ class Frame(NamedTuple):
     in `crs` already. A `topocentric` frame has axes east, north, up at a place.
     """
 
-    crs: CRS
+    crs: "CRS"
     enter: Callable[[FloatArray], FloatArray]
     direct: bool = False
     topocentric: bool = False
@@ -80,7 +78,7 @@ def is_tied(crs: str | None, name: str) -> bool:
     return crs is not None and (systems.is_topocentric(crs) or _on_earth(crs, name) is not None)
 
 
-def _on_earth(crs: str | None, name: str) -> CRS | None:
+def _on_earth(crs: str | None, name: str) -> "CRS | None":
     """Return a CRS that is tied to the earth; None for axes at a place and local frames."""
     parsed = None if crs is None else systems.parse_crs(crs, name)
     return None if parsed is None or systems.is_local(parsed) else parsed
@@ -136,7 +134,7 @@ class Georeference:
 
 def georeference(
     cameras: Cameras,
-    cloud_crs: str | CRS | None,
+    cloud_crs: "str | CRS | None",
     *,
     cameras_crs: str | None = None,
     offset_m: tuple[float, float, float] | None = None,

@@ -25,8 +25,6 @@ References: "Agisoft Metashape User Manual, Professional Edition", appendix "Cam
 ``save_estimated_reference.py`` in github.com/agisoft-llc/metashape-scripts.
 """
 
-from __future__ import annotations
-
 import re
 import zipfile
 from collections import defaultdict
@@ -105,13 +103,13 @@ class Document(NamedTuple):
         relative = element.get("path")
         return None if relative is None else self.path.parent / relative.replace("\\", "/")
 
-    def follow(self, element: Element) -> Document:
+    def follow(self, element: Element) -> "Document":
         """Return the document that an element refers to by its path, or the element itself."""
         path = self.path_to(element)
         return Document(element, self.path) if path is None else Document(read_xml(path), path)
 
     @property
-    def frame(self) -> Document | None:
+    def frame(self) -> "Document | None":
         """The first frame of a chunk, which has the images of every marker and the tie points."""
         first = self.root.find("frames/frame")
         return None if first is None else self.follow(first)

@@ -23,8 +23,6 @@ include/XML_GEN/ParamChantierPhotogram.xml of https://github.com/micmacIGN/micma
 write the formula of each coefficient next to it.
 """
 
-from __future__ import annotations
-
 from pathlib import Path, PurePosixPath
 from typing import Any
 from xml.etree.ElementTree import Element

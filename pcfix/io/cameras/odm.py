@@ -33,8 +33,6 @@ https://opensfm.org/docs; "Outputs" in that of ODM, https://docs.opendronemap.or
 stages `opensfm` and `odm_report` of https://github.com/OpenDroneMap/ODM.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import replace

@@ -19,8 +19,6 @@ matches in 40 bits and their count in 24.
 Reference: Pix4D, "Open Photogrammetry Format Specification" 1.0, https://pix4d.github.io/opf-spec.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import unquote

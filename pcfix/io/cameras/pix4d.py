@@ -18,8 +18,6 @@ References: Pix4D, "What does the Output Params Folder contain?" (support.pix4d.
 202977149), "How are the Internal and External Camera Parameters defined?" (article 202559089).
 """
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from pathlib import Path, PurePath

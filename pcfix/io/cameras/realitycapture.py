@@ -21,8 +21,6 @@ Metadata" (tools/xmpalign). The software's own templates for OpenCV and projecti
 converters of AliceVision and EasyVolcap, agree. No file with measurements was there for a check.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

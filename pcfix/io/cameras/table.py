@@ -30,8 +30,6 @@ https://forums.unrealengine.com/t/different-rotation-of-cameras-in-xmp-and-csv/7
 f, px, py and the order of t1, t2 as in AliceVision's reader.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import math

@@ -4,8 +4,6 @@ The extra dimensions are integers with a scale, so that LAZ packs them well. Fil
 stage take their names, types and units from `COLUMNS`, and a test compares the documentation.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -108,7 +106,7 @@ def changes_of(
     return Changes(steps, correction.uncorrected, values)
 
 
-def fill(points: laspy.ScaleAwarePointRecord, changes: Changes) -> None:
+def fill(points: "laspy.ScaleAwarePointRecord", changes: Changes) -> None:
     """Write the columns of the rows that change; the others keep zero."""
     for column, some, value in changes.values:
         target = points.array[column.name]
@@ -124,8 +122,8 @@ def fill(points: laspy.ScaleAwarePointRecord, changes: Changes) -> None:
 
 
 def convert(
-    points: laspy.ScaleAwarePointRecord, point_format: laspy.PointFormat
-) -> laspy.ScaleAwarePointRecord:
+    points: "laspy.ScaleAwarePointRecord", point_format: "laspy.PointFormat"
+) -> "laspy.ScaleAwarePointRecord":
     """Return the points in another format, which may have more or fewer extra dimensions.
 
     Values that both formats have come over bit for bit; dimensions that are new are zero.
@@ -160,7 +158,7 @@ def convert(
     return new
 
 
-def move(points: laspy.ScaleAwarePointRecord, steps: npt.NDArray[np.int64], path: Path) -> None:
+def move(points: "laspy.ScaleAwarePointRecord", steps: npt.NDArray[np.int64], path: Path) -> None:
     """Move points of a file by whole steps of their scale, shape (3, n).
 
     An `InputError` if a coordinate does not fit 32 bits.

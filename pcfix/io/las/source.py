@@ -5,8 +5,6 @@ for many of them, which lose some bytes when they write; it cuts names that fill
 believes any number of records that a damaged header states.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 from collections.abc import Iterator, Sequence
@@ -173,7 +171,7 @@ class LasSource:
             self._check_header()
             stack.pop_all()
 
-    def __enter__(self) -> LasSource:
+    def __enter__(self) -> "LasSource":
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -302,7 +300,7 @@ def read_xyz(path: File) -> FloatArray:
         return np.vstack([coordinates(points) for points in source.chunks()])
 
 
-def stated_crs(source: LasSource) -> CRS | None:
+def stated_crs(source: LasSource) -> "CRS | None":
     """Return the coordinate system of a cloud, or None; an `InputError` if it cannot be read.
 
     laspy does not read the vertical part of GeoTIFF keys.
@@ -335,7 +333,7 @@ def _geo_keys(source: LasSource) -> dict[int, int]:
     return {key.id: key.value_offset for key in keys}
 
 
-def metric_crs(source: LasSource) -> CRS | None:
+def metric_crs(source: LasSource) -> "CRS | None":
     """Return the coordinate system of a cloud in metres, or None if it states none.
 
     An `InputError` if its coordinates or heights are in degrees, feet or another unit.

@@ -4,8 +4,6 @@ A VLR records what pcfix did and the header before. Points go chunk by chunk int
 which is renamed when it is complete.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import struct
