@@ -27,13 +27,6 @@ def _nothing(*given: object) -> None:
     """Do nothing."""
 
 
-def _available_cores() -> int:
-    """Return the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 @dataclass(frozen=True)
 class Run:
     """Settings of a running command."""
@@ -46,7 +39,9 @@ class Run:
     clouds: dict[Path, list[Any]] | None = None  # points of small clouds that are read repeatedly
 
 
-_RUN = ContextVar("pcfix_run", default=Run(_available_cores()))  # noqa: B039 (frozen)
+# the cores that this process may use
+_CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+_RUN = ContextVar("pcfix_run", default=Run(_CORES))  # noqa: B039 (frozen)
 
 
 def current() -> Run:

@@ -83,8 +83,20 @@ def adjust_cloud(
     length is free, unless all parameters of the unknowns lower the misfit of GNSS and control
     points by more than chance does.
     """
-    _check(block, unknowns)
+    # 1. What needs measured tie points is refused
+    has_gnss, wrong = bool((block.gnss_weights > 0.0).any()), ("", "")
+    if (unknowns.free_network and not has_gnss) or unknowns.poses != "free":
+        wrong = "needs_datum", "the poses must be free, with GNSS positions or control points"
+    elif any(unknowns.water_sigma):
+        wrong = "needs_water", "level, tilt and refractive index must be fixed"
+    elif len(block.surfaces[1]):
+        plane = "no point of --gcps can be on the water or on a plane (waterline, on:NAME)"
+        wrong = "has_conditions", plane
+    if wrong[0]:
+        words = f"Without tie points {wrong[1]}. Change that, or give a model with tie points."
+        raise GeometryError(f"adjust.cloud_{wrong[0]}", words)
 
+    # 2. The largest weight of the cloud with which GNSS and control points fit
     def trial(lens: tuple[str, ...], sigma_px: float) -> Trial | None:
         """Return an adjustment; None if it fails."""
         try:
@@ -100,38 +112,16 @@ def adjust_cloud(
             break
     if chosen is None:
         raise _unsolved("no weight of the cloud gives a solution")
-    if lens != unknowns.lens:
+    if lens != unknowns.lens:  # more of the lens
         more = trial(unknowns.lens, chosen.sigma_px)
     if more is not None:
         extra = (len(unknowns.lens) - len(lens)) * (len(chosen.problem.given.first_lens) - 1)
         gain = (chosen.misfit - more.misfit) / max(chosen.misfit / chosen.redundancy, 1.0)
         chosen = more if gain > chdtri(extra, SURE) else chosen
-    # only GNSS and control points have noise; the precision is about that with tie points of the
+    # 3. Only GNSS and control points have noise; the precision is about that with tie points of the
     # standard deviation of the cloud
     sigma0 = float(np.sqrt(chosen.misfit / chosen.redundancy))
     known = precision_of(chosen.problem, chosen.found, max(sigma0, 1.0))
-    found = adjusted_of(chosen.problem, chosen.found, known, [_note(chosen, unknowns)], "cloud")
-    return replace(found, sigma0=sigma0, redundancy=chosen.redundancy)
-
-
-def _check(block: Block, unknowns: Unknowns) -> None:
-    """Refuse what needs measured tie points."""
-    has_gnss = bool((block.gnss_weights > 0.0).any())
-    if (unknowns.free_network and not has_gnss) or unknowns.poses != "free":
-        code, words = "needs_datum", "the poses must be free, with GNSS positions or control points"
-    elif any(unknowns.water_sigma):
-        code, words = "needs_water", "level, tilt and refractive index must be fixed"
-    elif len(block.surfaces[1]):
-        code = "has_conditions"
-        words = "no point of --gcps can be on the water or on a plane (waterline, on:NAME)"
-    else:
-        return
-    words = f"Without tie points {words}. Change that, or give a model with tie points."
-    raise GeometryError(f"adjust.cloud_{code}", words)
-
-
-def _note(chosen: Trial, unknowns: Unknowns) -> PcfixWarning:
-    """Return what was decided, with a warning if the points represent tie points poorly."""
     count, free = int(chosen.problem.block.start[-1]), chosen.problem.unknowns.lens
     words = (
         f"No tie points: {count:,} images of points of the cloud were used with a standard"
@@ -144,7 +134,9 @@ def _note(chosen: Trial, unknowns: Unknowns) -> PcfixWarning:
         )
     fixed = [name for name in unknowns.lens if name not in free]
     values = {"free": list(free), "fixed": fixed, "sigma_px": chosen.sigma_px}
-    return PcfixWarning("adjust.by_cloud", words, **values)
+    note = PcfixWarning("adjust.by_cloud", words, **values)
+    found = adjusted_of(chosen.problem, chosen.found, known, [note], "cloud")
+    return replace(found, sigma0=sigma0, redundancy=chosen.redundancy)
 
 
 def _trial(
