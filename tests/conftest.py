@@ -21,7 +21,7 @@ settings.load_profile("default")
 # Each of two processes (-n 2 --dist worksteal) begins with one half of the tests. Each half begins
 # with rooms whose kernels the other does not need at once, so that none is compiled twice, and
 # ends with many short tests, which are easily shared out.
-BEGIN = (("adjust", "clean", "grid", "compare", "flow"), ("refract", "port", "label", "water"))
+BEGIN = (("adjust", "points", "grid", "compare", "flow"), ("refract", "port", "water"))
 SHORT = "io"
 
 

@@ -51,6 +51,7 @@ CHECK_DEPTHS, CHECK_NOISE_M = 50, 0.03
 FLOOR_POINTS = 1000
 LEAST_DEPTH_M = 0.2
 SHORE = {"bed": "shore", "lidar_per_m2": 0.0}
+# Names of `pcfix.simulate.settings.SceneSettings`; the rest is its default.
 SETTINGS = {
     "flat": SHORE,
     "oblique": {**SHORE, "obliques_deg": 35.0, "detection": 0.5},
@@ -58,7 +59,6 @@ SETTINGS = {
     "pairs": {**SHORE, "cloud": "pairs"},
     "depth-maps": {**SHORE, "cloud": "depth-maps"},
 }
-"""Names of `pcfix.simulate.settings.SceneSettings`; the rest is its default."""
 REAL = {
     "rendered_a": "rendered_a/cloud.las",
     "rendered_c": "rendered_c/cloud.las",
@@ -282,13 +282,13 @@ SENSITIVITY = {
 }  # fmt: skip
 SEEDS = 5
 LEVEL_M, INDEX = 0.05, 0.005
+# Name, size, settings of the scene, and options of the budget.
 RANDOM = (
     ("image", "0.5 px", {"image_noise": 0.5}, {"sigma_image": 0.5}),
     ("image", "1 px", {"image_noise": 1.0}, {"sigma_image": 1.0}),
     ("centres", "3 cm", {"position_noise_m": 0.03}, {"sigma_centre": 0.03}),
     ("attitude", "0.01 deg", {"attitude_noise_deg": 0.01}, {"sigma_attitude": 0.01}),
 )
-"""Name, size, settings of the scene, and options of the budget."""
 
 
 def sensitivity(name: str, points: int, seed: int) -> list[dict[str, Any]]:

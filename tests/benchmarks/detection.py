@@ -7,8 +7,6 @@ of each cloud with its confidence and the error of the bed, the table of detecte
 types, and how many of the cases of a confidence are right.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections import Counter
@@ -28,13 +26,13 @@ TYPES = dict(
     zip(("tracks", "depth-maps", "pairs", "single-map", "nearest-map"), IN_FRAME, strict=True)
 )
 COARSE = {"sensor_px": (1824, 1216), "area_m": (80.0, 60.0), "lidar_per_m2": 0.0}
+# Images of large pixels, for which few points are nearly as dense as those of matchers.
 BLOCKS = {
     "nadir": COARSE,
     "oblique": {**COARSE, "obliques_deg": 25.0},
     "river": {**COARSE, "bed": "river"},
     "wide": {**COARSE, "focal_mm": 6.0, "forward_overlap": 0.9},
 }
-"""Images of large pixels, for which few points are nearly as dense as those of matchers."""
 LEAST_DEPTH_M = 0.2
 CONFIDENCES = (0.5, 0.8, 0.95, 0.99)
 

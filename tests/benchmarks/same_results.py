@@ -38,13 +38,11 @@ from same_results_commands import pdal_table, table, write_inputs
 ROOT = Path(__file__).parents[2]
 SHARED = Path(os.environ.get("PCFIX_SHARED", ROOT.parent / "shared")).absolute() / "data"
 OUTCOME = "outcome.json"
+# Keys of JSON that hold times, versions, or sizes and checksums of texts that contain them.
 NOT_COMPARED = {"seconds", "pcfix", "made_by", "changed_ns", "bytes", "identity", "sha256"}
-"""Keys of JSON that hold times, versions, or sizes and checksums of texts that contain them."""
-ZERO = 1e-9
-"""Numbers closer to each other than this are equal, whatever their relative difference."""
+ZERO = 1e-9  # numbers closer to each other than this are equal, whatever their relative difference
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.])")
-SHOWN = 12
-"""Differences that are printed of each command; the rest are counted."""
+SHOWN = 12  # differences that are printed of each command; the rest are counted
 
 
 def main():

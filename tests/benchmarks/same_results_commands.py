@@ -5,8 +5,6 @@ their own. In braces: ``shared`` and ``samples``, the data; ``inputs``, what `wr
 or the name of an earlier command and a file that it left.
 """
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import json

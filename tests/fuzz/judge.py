@@ -20,14 +20,13 @@ import pcfix
 from pcfix.model import Cameras, GroundControl, TiePoints, Views
 from tests.fuzz.readers import READERS
 
+# Of processor time, kernels compiled included; else an undamaged seed takes at most 0.2 s.
 LONGEST_S = 60.0
-"""Of processor time, kernels compiled included; else an undamaged seed takes at most 0.2 s."""
+# Of address space that a reading may ask for, beside what the process has.
 MOST_BYTES = 1_500_000_000
-"""Of address space that a reading may ask for, beside what the process has."""
-LONGEST_SENTENCE = 800
-"""Letters, with the path; most have 100 to 250."""
+LONGEST_SENTENCE = 800  # letters, with the path; most have 100 to 250
+# Fields in which NaN says that a number is not known.
 UNKNOWN = ("gnss", "sigma_m", "sigma_px", "sigma_on", "on_sigma_m", "height_m", "water_m")
-"""Fields in which NaN says that a number is not known."""
 
 
 class Finding(Exception):  # noqa: N818  # what is looked for, not what went wrong

@@ -4,12 +4,12 @@ import re
 import struct
 from random import Random
 
+# What stands where a number should.
 NUMBERS = (
     *("nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "-1", "0", "-0.0", "", "1", "1.5"),
     *("2147483648", "4294967296", "99999999999999999999", "9" * 5000, "0x10", "1_000", "1,5"),
     *("\u0663", "null", "true", "abc", "[]", "{}", '"7"', "1e400", "1e16", "180.1"),
 )
-"""What stands where a number should."""
 BINARY = (
     *(struct.pack("<d", value) for value in (float("nan"), float("inf"), 1e308, -1.0)),
     *(struct.pack("<Q", value) for value in (0, 1, 2**31, 2**32, 2**62, 2**63, 2**64 - 1)),

@@ -48,8 +48,8 @@ from tests.utils.blocks import small_block
 from tests.utils.clouds import random_cloud, write_cloud
 from tests.utils.copc import write_copc
 
+# Writes files into a folder, and returns what is given to the reader of them.
 Seed: TypeAlias = "Callable[[Path], Path]"
-"""Writes files into a folder, and returns what is given to the reader of them."""
 
 LABELS = tuple(f"IMG_{i:04d}.jpg" for i in range(4))
 PLACES = np.random.default_rng(3).uniform(

@@ -46,8 +46,7 @@ def extra_dimension(data):
     return put(data, data.index(b"Quality") - 4, "<2xBB", 0, 0)
 
 
-PLACE = struct.pack("<2d", 5e5, 5.2e6)
-"""Of a raster's cells, as GeoTIFF has them."""
+PLACE = struct.pack("<2d", 5e5, 5.2e6)  # of a raster's cells, as GeoTIFF has them
 
 # Faults that fuzzing found: reader, seed, file (and entry of an archive), and the damage.
 FOUND = {

@@ -51,10 +51,10 @@ class AerialCamera(NamedTuple):
 
 
 SWINGLETCAM = AerialCamera("SwingletCAM", 4.3, 4000, 3000, 1.548)
+# Of the paper's second camera only the 100.5 mm are printed; the frame is the UltraCamX's.
 ULTRACAM = AerialCamera("UltraCamX", 100.5, 14430, 9420, 7.2)
-"""Of the paper's second camera only the 100.5 mm are printed; the frame is the UltraCamX's."""
+# Flying heights and overlaps of Figures 5 and 6.
 FLIGHTS = {SWINGLETCAM: ((100.0, 200.0), (0.8,)), ULTRACAM: ((1000.0, 3000.0), (0.6, 0.8))}
-"""Flying heights and overlaps of Figures 5 and 6."""
 
 
 class StereoPair(NamedTuple):

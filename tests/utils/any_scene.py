@@ -1,7 +1,5 @@
 """Scenes as hypothesis thinks them up: points, cameras and water about a local origin."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,8 +10,7 @@ from hypothesis import strategies as st
 from pcfix import Cameras, Lens, WaterPlane
 from tests.utils.clouds import random_cloud
 
-STEP_M = 0.001
-"""All coordinates of points are multiples of it."""
+STEP_M = 0.001  # all coordinates of points are multiples of it
 
 
 @dataclass(frozen=True)
@@ -33,7 +30,7 @@ class Scene:
         a, b, c = self.plane
         return xyz[:, 2] - (a + b * xyz[:, 0] + c * xyz[:, 1])
 
-    def moved(self, turn: float, shift: tuple[float, float, float]) -> Scene:
+    def moved(self, turn: float, shift: tuple[float, float, float]) -> "Scene":
         """Return the scene turned about the vertical, and then shifted; points exactly."""
         cos, sin = math.cos(turn), math.sin(turn)
         turned = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
@@ -48,7 +45,9 @@ class Scene:
         )
         return Scene(self.xyz @ turned.T + shift, cameras, plane)
 
-    def reordered(self, cameras: list[int] | None = None, points: list[int] | None = None) -> Scene:
+    def reordered(
+        self, cameras: list[int] | None = None, points: list[int] | None = None
+    ) -> "Scene":
         """Return the scene with its cameras, and its points, in another order."""
         old, order = self.cameras, range(len(self.cameras)) if cameras is None else cameras
         rows = np.array(order, np.int64)
@@ -135,7 +134,7 @@ def _with_frames(cameras: Cameras, rng: np.random.Generator, off_deg: float) -> 
     return replace(cameras, rotations=rotations, lenses=(lens,) * k)
 
 
+# Scales and offsets that hold every point of a scene exactly.
 ENCODINGS = [((STEP_M,) * 3, (0.0, 0.0, 0.0)), ((STEP_M / 2,) * 3, (1.0, -7.0, 0.25)),
              ((STEP_M / 10,) * 3, (0.0, 0.0, 0.0)), ((STEP_M,) * 3, (-250.0, 40.0, -3.0)),
              ((STEP_M, STEP_M / 4, STEP_M / 5), (12.0, 0.0, 1.0))]  # fmt: skip
-"""Scales and offsets that hold every point of a scene exactly."""

@@ -2,8 +2,8 @@
 
 import pytest
 
+# Points at random, many of them in one frame or none.
 BEYOND_FRAMES = pytest.mark.filterwarnings(
     "ignore:.*in fewer than two frames:pcfix.errors.PcfixWarning"
 )
-"""Points at random, many of them in one frame or none."""
 DEEP = pytest.mark.filterwarnings("ignore:.*deeper than 30 m:pcfix.errors.PcfixWarning")

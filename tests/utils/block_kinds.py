@@ -3,8 +3,6 @@
 Light is traced by `pcfix.simulate.tracing`, which shares nothing with the adjustment.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -82,6 +80,8 @@ def _open(x, y, reach):
     return -0.5 * DEPTH_M * (1.0 + 0.4 * x / reach[0] + 0.3 * y / reach[1])
 
 
+# How each kind is flown, and the height of its ground above the water at n places of an area that
+# reaches so far to either side.
 KINDS = {
     "corridor": (lambda: _strips(2, 12), _river),
     "single strip": (lambda: _strips(1, 14), _shore(0.35)),
@@ -90,8 +90,6 @@ KINDS = {
     "20 % land": (lambda: _strips(4, 6), _shore(0.2)),
     "no land": (lambda: _strips(4, 6), _open),
 }
-"""How each kind is flown, and the height of its ground above the water at n places of an area that
-reaches so far to either side."""
 
 
 class KindBlock:
@@ -179,7 +177,7 @@ class KindBlock:
             )  # fmt: skip
         return replace(found, gnss=None)
 
-    def part(self, rows: slice) -> KindBlock:
+    def part(self, rows: slice) -> "KindBlock":
         """Return the block with some of its points."""
         first, last, _ = rows.indices(len(self.xyz))
         some = object.__new__(KindBlock)

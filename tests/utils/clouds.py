@@ -13,8 +13,7 @@ from pyproj import CRS
 
 from pcfix import Cameras, Lens
 
-WATER_M = 12.40005
-"""No coordinate of `random_cloud` lies on it."""
+WATER_M = 12.40005  # no coordinate of `random_cloud` lies on it
 EAST_M, NORTH_M, SIDE_M = 456_000.0, 5_432_000.0, 120.0
 CAMERA_HEIGHT_M = 75.0
 SCALES, OFFSETS = (0.0013, 0.0007, 0.0011), (455_987.25, 5_431_990.5, -3.7)
@@ -30,12 +29,12 @@ RGB = [("red", "<u2"), ("green", "<u2"), ("blue", "<u2")]
 NIR = [("nir", "<u2")]
 WAVE = [("wave_index", "u1"), ("wave_offset", "<u8"), ("wave_size", "<u4"), ("wave_place", "<u4")]
 WAVE += [("wave_x", "<u4"), ("wave_y", "<u4"), ("wave_z", "<u4")]
+# LAS 1.4 R15, tables 7 to 18. Floats are read as integers, so that bits are compared.
 RECORD = {
     0: OLD, 1: OLD + GPS, 2: OLD + RGB, 3: OLD + GPS + RGB,
     4: OLD + GPS + WAVE, 5: OLD + GPS + RGB + WAVE,
     6: NEW, 7: NEW + RGB, 8: NEW + RGB + NIR, 9: NEW + WAVE, 10: NEW + RGB + NIR + WAVE,
 }  # fmt: skip
-"""LAS 1.4 R15, tables 7 to 18. Floats are read as integers, so that bits are compared."""
 
 EXTRA_TYPES = {1: "u1", 2: "i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4"}
 

@@ -4,8 +4,6 @@ Light takes the shortest optical path (Fermat): length times refractive index, s
 glass and water. The correction uses Snell's law instead, and shares nothing with this file.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

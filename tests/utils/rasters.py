@@ -31,5 +31,5 @@ def write_raster(path: Any, height: np.ndarray, left: float, top: float, cell: f
         target.write(height, 1)
 
 
+# Whether GDAL writes statistics into cloud-optimised rasters.
 HAS_STATISTICS = tuple(map(int, rasterio.__gdal_version__.split(".")[:2])) >= (3, 8)
-"""Whether GDAL writes statistics into cloud-optimised rasters."""

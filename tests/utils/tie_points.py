@@ -3,8 +3,6 @@
 Light is traced by `pcfix.simulate.tracing`, which shares nothing with the adjustment.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,11 +31,9 @@ from pcfix.simulate.scene import (
 from pcfix.simulate.settings import SceneSettings
 
 _CANDIDATES = 4000
-_LEAST_TIES = 8
-"""An image with fewer tie points is excluded from the block."""
+_LEAST_TIES = 8  # an image with fewer tie points is excluded from the block
 
-_CLEAR_M = 0.1
-"""Minimum height difference of control and check points from the water surface."""
+_CLEAR_M = 0.1  # minimum height difference of control and check points from the water surface
 
 
 @dataclass(frozen=True)
@@ -68,7 +64,7 @@ class TieScene:
     noise: TieNoise
     settings: dict[str, Any]
 
-    def measured(self, rng: np.random.Generator) -> TieScene:
+    def measured(self, rng: np.random.Generator) -> "TieScene":
         """Return the scene with other noise; poses, points and start values stay."""
         image_px, k = self.noise.image_px, len(self.cameras)
         image = self.exact_xy + rng.normal(0.0, image_px, self.exact_xy.shape)

@@ -1,7 +1,5 @@
 """Scenes whose clouds were made by simulated dense matchers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -21,8 +19,8 @@ from pcfix.simulate.settings import SceneSettings, Terrain
 from tests.utils.matchers.depth_maps import fuse_depth_maps, keep_single_maps, stereo_models
 from tests.utils.matchers.pairs import SAMPLE, TIES, match_pairs, neighbour_table, openmvs_partners
 
+# Images with which each is matched.
 NEIGHBOURS = {"pairs": 4, "depth-maps": 5, "single-map": 6, "nearest-map": 6}
-"""Images with which each is matched."""
 PAIRS_AT_ONCE = 50_000
 
 

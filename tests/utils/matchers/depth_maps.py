@@ -25,8 +25,6 @@ place is a plane parallel to the bed; and the local water plane of each image (s
 `pcfix.simulate.tracing`) is that at the first estimate of the point.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -43,8 +41,7 @@ LEAST_PARTNERS = 2
 LEAST_FUSED = 3
 LEAST_COVER = 2
 MOST_OFF = 0.3
-COST_NOISE = 0.28
-"""Scale of Gumbel's distribution of one cost; a sum of two varies like one of 0.4."""
+COST_NOISE = 0.28  # scale of Gumbel's distribution of one cost; a sum of two varies like one of 0.4
 
 _STEPS = 20
 _CONVERGED_M = 1e-9

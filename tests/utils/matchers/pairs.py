@@ -5,8 +5,6 @@ pair that shows a point measures it independently, and the point is the median o
 intersections, axis by axis. *Depth maps* are in `tests.utils.matchers.depth_maps`.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -15,13 +13,11 @@ from pcfix.model import FloatArray, IntArray
 from pcfix.simulate.scene import Visible, starts
 from pcfix.simulate.tracing import triangulate
 
-SAMPLE = 1000
-"""Points that overlap and angles are judged by."""
+SAMPLE = 1000  # points that overlap and angles are judged by
 
 OPTIMAL_DEG, SPREAD_BELOW_DEG, SPREAD_ABOVE_DEG = 10.0, 4.0, 10.0
 
-TIES = 4000
-"""Tie points that OpenMVS's choice is made by; ten for each image where that is more."""
+TIES = 4000  # tie points that OpenMVS's choice is made by; ten for each image where that is more
 
 FOUND_AGAIN_DEG = 45.0
 BEST_DEG, BELOW_DEG, ABOVE_DEG, LEAST_WEIGHT = 12.0, 0.38 * 12.0, 0.70 * 12.0, 0.1
