@@ -185,8 +185,8 @@ def adjust_into(
         check_datum(block, unknowns, reason)
         cloud_points = (original, ties.xyz) if by_cloud else None
         adjusted.append(adjust_block(block, unknowns, cloud=cloud_points, choose_lens=chooses_lens))
-    # of two guesses, the one that fits GNSS and control points with a smaller noise of the cloud
-    found = min(adjusted, key=lambda one: (one.block.sigma_px[0], one.sigma0))
+    # of two guesses with as many images, the one that GNSS and control points fit with less noise
+    found = min(adjusted, key=lambda x: (-len(x.cameras), x.block.sigma_px[0], x.sigma0))
 
     # 3. The result
     check_control(found, gcps)

@@ -8,8 +8,11 @@ import pytest
 
 import pcfix
 from pcfix.flow.adjust import adjust_cameras, correct_words
+from pcfix.flow.demo import colmap_vis
 from pcfix.lens.imaging import straight_images
+from pcfix.model import Views
 from pcfix.options.correct import AdjustOptions
+from pcfix.refract.choice import views_in_frame
 from pcfix.running import threads
 from tests.utils.adjust_files import IMAGE_PX, write_block
 from tests.utils.codes import refused
@@ -100,6 +103,22 @@ def test_cloud(files):
     bed, land = home(files, found.cameras)
     assert bed < 0.03
     assert land < 0.02
+
+
+def test_cloud_with_views(files):
+    """A view list counts only where it fits GNSS and control points better than all in frame."""
+    cloud = files.folder / "cloud.las"
+    given = {"cloud": cloud, "gcps": files.folder / "gcps.csv", "lens_unknowns": ("f",)}
+    alone = adjust(files, "bare", **given)
+    xyz = np.array(laspy.read(cloud).xyz)
+    # the first two images of each point, which the original adjustment did not see alone
+    seen = views_in_frame(xyz, alone.block.cameras)
+    first_two = seen.camera[seen.start[:-1, None] + np.arange(2)].ravel()
+    listed = files.folder / "two.ply.vis"
+    listed.write_bytes(colmap_vis(Views(2 * np.arange(len(xyz) + 1), first_two)))
+    found = adjust(files, "bare", views=listed, **given)
+    assert found.cameras.centres == pytest.approx(alone.cameras.centres, abs=1e-9)  # m
+    assert len(found.block.camera) == len(alone.block.camera)
 
 
 def test_level_and_index(files):
