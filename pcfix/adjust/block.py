@@ -32,7 +32,6 @@ LEAST_ANGLE_DEG = 2.0  # between the rays of a tie point; smaller ones hardly de
 LEAST_DETERMINANT = 1e-5  # of the normal matrix of unit rays: two at a third of a degree
 TIE_POINTS = 150_000  # at most; more reduce only the noise, then no longer the largest error
 
-
 NO_CONTROL = GroundControl(
     (), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.bool_), np.zeros(0, np.bool_),
     np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0),

@@ -10,7 +10,7 @@ P as its tangent plane does. As anything changes, P moves along the surface and 
 turns with it; the derivatives are central differences.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,9 +32,7 @@ from pcfix.lens.imaging import image_and_gradients
 from pcfix.model import BoolArray, FloatArray, IntArray
 from pcfix.port.housing import BY_PORT, NO_PORT, Window, through_port
 from pcfix.refract.rays import direction, lay, light_and_gradients, light_path, plane_at, settle
-
-if TYPE_CHECKING:
-    from pcfix.water.surface import Field, Tin
+from pcfix.water.surface import Field, Tin
 
 
 class State(NamedTuple):
@@ -61,8 +59,8 @@ class Given(NamedTuple):
     lens_row: IntArray  # (k,), of the lens table
     group: IntArray  # (k,), sensor of each camera
     # refracting surface
-    tin: "Tin | None"  # a mesh or a raster, instead of the plane in `State.water`
-    field: "Field | None"
+    tin: Tin | None  # a mesh or a raster, instead of the plane in `State.water`
+    field: Field | None
     origin: FloatArray  # (3,), of the block
     curved: bool  # whether d, e, f count
     # unknowns that many points share, counted from the first of them
@@ -307,9 +305,6 @@ def _brown_gradient(c: FloatArray, x: float, y: float, code: int) -> tuple[float
     if code == P1:
         return (r2 + 2.0 * x * x) * more, 2.0 * x * y * more
     return 2.0 * x * y * more, (r2 + 2.0 * y * y) * more
-
-
-# Points on surfaces
 
 
 @device

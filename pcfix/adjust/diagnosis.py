@@ -41,12 +41,6 @@ from pcfix.water.surface import is_submerged, surface_above
 if TYPE_CHECKING:  # not quick to load
     from pcfix.adjust.from_cloud import Undone
 
-# The signs in the order in which they decide.
-ORDER = (
-    *("tie points", "GNSS positions", "measured depths"),
-    *("heights of land", "neighbouring points"),
-)
-
 LEAST_POINTS, LEAST_PLACES = 30, 3  # tie points under water, and places of a survey, at least
 PARTS = 5  # of the area, along x and along y, for the jackknife
 OUTLIERS = 0.05  # share of the tie points that is excluded, those with the worst residuals
@@ -75,7 +69,7 @@ EXPORT = "export tie points, or run 'pcfix cameras FILE --gnss GNSS.csv'"
 class Sign:
     """One statistic."""
 
-    name: str  # one of `ORDER`
+    name: str
     absorbed: bool | None  # whether it says that refraction was absorbed; None if not significant
     words: str  # what was found
     share: float | None = None  # what is compared with a limit, and its standard error
@@ -113,7 +107,7 @@ class Diagnosis:
             return ""
         likely = self.likely_error_m
         error = "" if likely is None else f" The heights are probably off by {likely:.2g} m."
-        have = "seem to have" if self.decided_by.name == ORDER[-1] else "have"
+        have = "seem to have" if self.decided_by.name == "neighbouring points" else "have"
         return (
             f"The poses {have} absorbed the refraction: {self.decided_by.words}.{error} Correcting"
             f" only the cloud makes them worse. Adjust the poses first: {command}"
@@ -138,9 +132,6 @@ def _absorbed_words(share: float, sigma: float) -> str:
         f"{100.0 * share:.0f} % of the refraction is absorbed (standard error"
         f" {100.0 * sigma:.0f} %, limit {100.0 * SHARE:.0f} %)"
     )
-
-
-# Tie points
 
 
 def tie_point_sign(
@@ -174,11 +165,8 @@ def tie_point_sign(
         return np.asarray(np.bincount(block.owner, values.sum(axis=1), len(xyz)), np.float64)
 
     # points under water without outliers; three coordinates of each are estimated
-    straight, refracted, redundancy = (
-        sums(straight_px**2),
-        sums(refracted_px**2),
-        2 * np.diff(block.start) - 3,
-    )
+    straight, refracted = sums(straight_px**2), sums(refracted_px**2)
+    redundancy = 2 * np.diff(block.start) - 3
     worst = np.maximum(straight, refracted) / redundancy
     good = np.isfinite(worst) & np.isfinite(above.height_m)
     if good.any():
@@ -206,9 +194,6 @@ def tie_point_sign(
     )
     absorbed = None if sigma > MOST_SIGMA else _exceeds(share, sigma, SHARE)
     return Sign("tie points", absorbed, words, share, sigma), apparent
-
-
-# GNSS
 
 
 def gnss_sign(cameras: Cameras, gnss: GnssPositions, undone: "Undone") -> Sign:
@@ -327,14 +312,13 @@ def diagnosed(
     tie points; the reference (`pcfix.compare.match.Reference`) is a survey of land and bed. If it
     must be quick (`in_passing`), GNSS positions are used only if nothing else decides.
     """
-    signs = [neighbours]
+    signs = list[Sign | None]()
     if not isinstance(water, WaterDimension):  # which has heights at points of the cloud only
         lenses = cameras.lenses
         if cameras.rotations is not None and lenses and all(one.unit == "px" for one in lenses):
             signs += _signs_of_rays(cameras, water, n, ties, gnss, view, in_passing=in_passing)
         signs += _signs_of_surveys(cameras, water, n, view, control, reference)
-    known = [sign for sign in signs if sign is not None]
-    return Diagnosis(tuple(sorted(known, key=lambda sign: ORDER.index(sign.name))))
+    return Diagnosis(tuple(sign for sign in [*signs, neighbours] if sign is not None))
 
 
 def _signs_of_rays(
@@ -374,7 +358,8 @@ def _signs_of_surveys(
     level = surface_above(water, cameras.centres).height_m
     above = cameras.centres[:, 2] - np.where(np.isfinite(level), level, np.nanmean(level))
     focal = [one.focal if one.unit == "px" else np.inf for one in cameras.lenses or ()]
-    gsd, signs = float(np.mean(above / focal)) if focal else 0.0, list[Sign | None]()
+    gsd = float(np.mean(above / focal)) if focal else 0.0
+    bed, land = None, list[Sign | None]()
     radius = float(np.clip(10.0 * gsd, 0.2, 2.0))
 
     def cloud_z(xyz: FloatArray) -> FloatArray:
@@ -387,14 +372,14 @@ def _signs_of_surveys(
         known = np.isfinite(control.xyz).all(axis=1)
         level = surface_above(water, control.xyz).height_m
         dry = control.xyz[known & ~control.under_water & ~(control.xyz[:, 2] < level)]
-        signs.append(land_sign(cloud_z(dry) - dry[:, 2], gsd))
+        land.append(land_sign(cloud_z(dry) - dry[:, 2], gsd))
         if deep := used_as_dry(control, water):
             words = f"control points {', '.join(deep)} are below the water: mark them under_water"
-            signs.append(Sign("heights of land", None, words))
+            land.append(Sign("heights of land", None, words))
     if reference is not None:
         surveyed = reference.xyz[:: 1 + len(reference.xyz) // SURVEYED_POINTS]
         level, found = surface_above(water, surveyed).height_m, cloud_z(surveyed)
-        land, bed = surveyed[:, 2] > level + LAND_M, surveyed[:, 2] < level
-        signs.append(land_sign((found - surveyed[:, 2])[land], gsd))
-        signs.append(bed_sign((level - found)[bed], (level - surveyed[:, 2])[bed], n))
-    return signs
+        is_land, is_bed = surveyed[:, 2] > level + LAND_M, surveyed[:, 2] < level
+        land.append(land_sign((found - surveyed[:, 2])[is_land], gsd))
+        bed = bed_sign((level - found)[is_bed], (level - surveyed[:, 2])[is_bed], n)
+    return [bed, *land]

@@ -28,7 +28,6 @@ from pcfix.model import FloatArray
 ROUGHLY = 1e-4  # relative gain of a step that ends the first, robust rounds
 OUTLIER_SIGMAS = 4.0  # longer residuals are outliers: three good ones in 10,000
 LEAST_SHARE = 0.5  # share of the observations that must be in front of their cameras and good
-
 OUTLIER_ROUNDS = 3
 
 

@@ -88,8 +88,19 @@ def adjust_block(
         found = adjust_cloud(block, original, apparent, unknowns, choose_lens=choose_lens)
 
     # 3. What its user should know
-    notes += [*_land_notes(found), *found.notes, *undetermined(found.precision)]
-    return replace(found, notes=[*notes, *_bed_notes(found)])
+    above, count = int((found.is_observed & ~found.is_wet).sum()), int(found.is_observed.sum())
+    if water is not None and above < SMALL_WATER:
+        few = f"Only {above} of {count:,} points are above the water"
+        if any(unknowns.water_sigma):
+            words = (
+                f"{few}, so level, tilt and index cannot be separated from the height of the block."
+                " Fix the water."
+            )
+            raise GeometryError("water.no_land", words, land=above, points=count)
+        words = f"{few}, so only GNSS and control points determine the heights of the bed."
+        notes.append(PcfixWarning("water.no_land", words, land=above, points=count))
+    notes += [*found.notes, *undetermined(found.precision), *_bed_notes(found)]
+    return replace(found, notes=notes)
 
 
 # Checks of what goes in
@@ -191,22 +202,6 @@ def check_marks(
 
 
 # Checks of what comes out
-
-
-def _land_notes(found: Adjusted) -> list[PcfixWarning]:
-    """Refuse a free water surface if there is hardly any land; warn if it is fixed."""
-    above, count = int((found.is_observed & ~found.is_wet).sum()), int(found.is_observed.sum())
-    if found.block.water is None or above >= SMALL_WATER:
-        return []
-    few = f"Only {above} of {count:,} points are above the water"
-    if any(found.unknowns.water_sigma):
-        words = (
-            f"{few}, so level, tilt and index cannot be separated from the height of the block."
-            " Fix the water."
-        )
-        raise GeometryError("water.no_land", words, land=above, points=count)
-    words = f"{few}, so only GNSS and control points determine the heights of the bed."
-    return [PcfixWarning("water.no_land", words, land=above, points=count)]
 
 
 def check_control(found: Adjusted, name: str) -> None:

@@ -135,7 +135,6 @@ def linearise_point(
         v[i, i] += weight
         if weight > 0.0:
             rhs[i] += weight * (given.surveyed_xyz[p, i] - state.xyz[p, i])
-    for i in range(3):
         v[i, i] += rule.damping * v[i, i]
     if count == 0 or not inverted(v, SINGULAR):
         return 0, 0
@@ -181,8 +180,10 @@ def _residuals(span: Span, state: State, given: Given, found: FloatArray, work: 
             found[o, 0], found[o, 1] = given.image_xy[o, 0] - u, given.image_xy[o, 1] - v
 
 
-def cost_of(squares: FloatArray, loss: int) -> float:
-    """Return the sum of the loss of weighted squared residuals; NaN ones cost `LOST`."""
+def cost_of(state: State, given: Given, loss: int) -> float:
+    """Return the sum of the loss of the weighted squared residuals; NaN ones cost `LOST`."""
+    used = given.weight > 0.0
+    squares = (residuals(state, given)[used] ** 2).sum(axis=1) * given.weight[used] ** 2
     lost = np.isnan(squares)
     s, c2 = np.where(lost, 0.0, squares), LOSS_SCALE * LOSS_SCALE
     if loss == HUBER:

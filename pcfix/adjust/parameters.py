@@ -103,14 +103,9 @@ def usable_codes(lens: Lens, names: tuple[str, ...]) -> tuple[int, ...]:
 def default_lens(lenses: tuple[Lens, ...]) -> tuple[str, ...]:
     """Return the lens parameters that are free by default: those that the lenses have."""
     more = ("b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
-    used = [
-        name
-        for name in more
-        if any(
-            lens_parameter(lens, code) for lens in lenses for code in usable_codes(lens, (name,))
-        )
-    ]
-    return ("f", "cx", "cy", *used)
+    pairs = [(lens, code) for lens in lenses for code in usable_codes(lens, more)]
+    used = {NAMES[code] for lens, code in pairs if lens_parameter(lens, code)}
+    return ("f", "cx", "cy", *(name for name in more if name in used))
 
 
 def lens_parameter(lens: Lens, code: int) -> float:

@@ -170,8 +170,6 @@ def _point_sigma(problem: Problem, found: Solution, inverse: FloatArray) -> Floa
 
 
 SURE = 0.99  # probability with which equal groups would not differ by as much
-
-
 MOST_TILES, POINTS_PER_TILE, FRAME_TILES = 400, 25, 48
 LEAST_GROUPS = 10  # fewer groups do not give a variance
 

@@ -5,7 +5,7 @@ surveyed points, standard deviations of lens, water and index.
 """
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -41,9 +41,6 @@ from pcfix.model import (
 )
 from pcfix.port.housing import DomePort, FlatPort, Port, window_of
 from pcfix.water.surface import build_fields, build_tin
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_array
 
 NETWORK_SIGMA_M = 1e-4  # standard deviation of the mean of the projection centres in a free network
 CELLS = 400  # of a raster of curved water, along its longer side, which represents 10 cm to 1 um
@@ -126,7 +123,6 @@ def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
     world[[0, *range(PLANES, len(numbers), 3)]] += origin[axis]
     start_values = [lens_parameter(lenses[i], code) for i, code in lens_unknowns]
     row, table = lens_table(lenses)
-    centres = cameras.centres - origin
     surveyed_xyz, surveyed_weight = block.survey
     _, on, on_sigma_m = block.surfaces
     given = Given(
@@ -155,8 +151,8 @@ def prepare(block: Block, unknowns: Unknowns) -> tuple[Problem, Solution]:
     values = np.append(start_values, world[is_free])
     problem = Problem(block, unknowns, origin, given, lens_unknowns, names, values)
     state = State(
-        centres, np.ascontiguousarray(cameras.rotations, np.float64), table, block.xyz - origin,
-        numbers, window_of(block.port),
+        cameras.centres - origin, np.ascontiguousarray(cameras.rotations, np.float64), table,
+        block.xyz - origin, numbers, window_of(block.port),
     )  # fmt: skip
     return problem, Solution(state, lenses, np.zeros(len(names)))
 
@@ -274,7 +270,7 @@ def polynomial(water: FloatArray, x: FloatArray | float, y: FloatArray | float) 
 # Prior knowledge
 
 
-def prior_rows(problem: Problem, found: Solution) -> "tuple[csc_array, FloatArray]":
+def prior_rows(problem: Problem, found: Solution) -> tuple[Any, FloatArray]:
     """Return prior knowledge of poses, lens and water as weighted observations of them.
 
     These are the derivatives by poses and shared unknowns, a sparse array of shape (n, 6 k + g),
@@ -314,9 +310,7 @@ def prior_rows(problem: Problem, found: Solution) -> "tuple[csc_array, FloatArra
 
 def cost_at(problem: Problem, found: Solution, loss: int) -> float:
     """Return the cost of a solution: images, surveyed points and all prior knowledge."""
-    used, weight = problem.used, problem.given.weight
-    r = residuals(found.state, problem.given)[used]
-    return cost_of((r**2).sum(axis=1) * weight[used] ** 2, loss) + survey_cost(problem, found)
+    return cost_of(found.state, problem.given, loss) + survey_cost(problem, found)
 
 
 def survey_cost(problem: Problem, found: Solution) -> float:

@@ -98,28 +98,6 @@ def adjusted_of(
     water = water_of(problem, state)
     none = -np.inf if block.port is None else np.inf  # behind a port everything is under water
     level = np.full(len(xyz), none) if water is None else surface_above(water, xyz).height_m
-    cameras = solved_cameras(problem, now)
-    return Adjusted(
-        block=block,
-        unknowns=problem.unknowns,
-        cameras=cameras,
-        water=water,
-        refractive_index=float(state.water[INDEX]),
-        xyz=xyz,
-        residual_px=r,
-        used=problem.used,
-        is_wet=np.asarray((xyz[:, 2] < level) & block.wet),
-        sigma0=sigma0_of(problem, now),
-        redundancy=redundancy_of(problem),
-        source=source,
-        precision=precision,
-        control=_control_rows(block, xyz, r),
-        notes=notes,
-        port=port_of(block, state.water),
-    )
-
-
-def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlRow]:
     rows, control = list[ControlRow](), block.control
     names = zip(control.names, control.is_check, control.xyz, strict=True)
     for p, (name, check, surveyed) in enumerate(names, block.tie_points):
@@ -130,7 +108,24 @@ def _control_rows(block: Block, xyz: FloatArray, r: FloatArray) -> list[ControlR
         dx, dy, dz = (xyz[p] - surveyed).tolist()
         rms_px, role = float(rms(marks.ravel())), "check" if check else "control"
         rows.append(ControlRow(name, role, dx, dy, dz, rms_px, len(marks)))
-    return rows
+    return Adjusted(
+        block=block,
+        unknowns=problem.unknowns,
+        cameras=solved_cameras(problem, now),
+        water=water,
+        refractive_index=float(state.water[INDEX]),
+        xyz=xyz,
+        residual_px=r,
+        used=problem.used,
+        is_wet=np.asarray((xyz[:, 2] < level) & block.wet),
+        sigma0=sigma0_of(problem, now),
+        redundancy=redundancy_of(problem),
+        source=source,
+        precision=precision,
+        control=rows,
+        notes=notes,
+        port=port_of(block, state.water),
+    )
 
 
 # Plain values

@@ -168,9 +168,6 @@ def solver(matrix: Any) -> Callable[[FloatArray], FloatArray] | None:
     return lambda right: np.asarray(scale @ solve_scaled(scale @ right))
 
 
-# What is undetermined
-
-
 def singular(problem: Problem, solution: Solution) -> GeometryError:
     """Return an error that names the unknowns that the observations leave undetermined.
 

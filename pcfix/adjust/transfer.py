@@ -109,9 +109,6 @@ def _intersect(
     return False
 
 
-# Two models of the same images
-
-
 def transfer_of(original: Cameras, adjusted: Cameras, place: IntArray) -> "CloudTransfer":
     """Return the transfer between two models, given the original row of each adjusted image."""
     row = np.full(len(original), -1)

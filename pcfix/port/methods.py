@@ -239,13 +239,12 @@ def _usable(candidates: IntArray, point: Vector, rig: Rig, through: bool) -> Int
     return usable[:k]
 
 
-# Outcome, shift and rms distance of the rays (m), least cosine at the port, whether converged.
-Solution: TypeAlias = tuple[int, Vector, float, float, bool]
-
-
 @device(allocates=True)
-def _solve(point: Vector, chosen: IntArray, rig: Rig) -> Solution:
-    """Intersect the rays of a point, and search the true point from there."""
+def _solve(point: Vector, chosen: IntArray, rig: Rig) -> tuple[int, Vector, float, float, bool]:
+    """Intersect the rays of a point, and search the true point from there.
+
+    Returns outcome, shift, rms distance of the rays (m), least cosine at the port, and success.
+    """
     sums, least, k = np.zeros(9), 1.0, 0
     for c in chosen:
         r, away = rig.rotations[c], minus(row_of(rig.centres, c), point)

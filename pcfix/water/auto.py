@@ -317,6 +317,7 @@ def gain_of(
     return np.where(own > 1e3 * _TINY, gain, 0.0), amplitude, np.sqrt(found) / own
 
 
+LEAST_TILE_CELLS = 40
 LEAST_SIDE = 8.0  # least sum of weights of the cells of a tile above a height, and below
 
 
@@ -356,9 +357,6 @@ def tile_moments(
     # as many observations of equal weight, less the unknowns of the smooth part
     count[rows] = np.maximum(total[enough] ** 2 / (weight**2).sum(axis=1) - p, 1.0)
     return sums, count
-
-
-LEAST_TILE_CELLS = 40
 
 
 def cue_moments(samples: "Samples", cue: Cue, heights_m: FloatArray) -> Moments | None:
@@ -417,6 +415,8 @@ def sample_cloud(xyz: FloatArray, rgb: npt.NDArray[Any] | None) -> Samples:
 
     Colours, shape (n, 3), are in any unit from zero up; equal ones count as none.
     """
+    from scipy.spatial import cKDTree  # slow to import
+
     origin = xyz.min(axis=0)
     local = xyz - origin
     # cells of about `POINTS_PER_CELL`, at most `MOST_CELLS`; clouds seldom fill their bounding box
@@ -438,24 +438,17 @@ def sample_cloud(xyz: FloatArray, rgb: npt.NDArray[Any] | None) -> Samples:
         logs = np.log(light + 0.004 * white)  # a small part of white keeps black finite
         red, green = (np.bincount(of_point, logs[:, i]) / count for i in (0, 1))
         redness = red - green
-    return Samples(ground, _smoothed(ground), redness, cell_m, origin)
+    # the plane through the neighbours of each cell, by the normal equations: three unknowns, and
+    # half the time
+    near = cKDTree(ground[:, :2]).query(ground[:, :2], k=min(NEIGHBOURS + 1, len(ground)))[1]
+    around = ground[np.asarray(near)[:, 1:]] - ground[:, None]
+    design = np.concatenate([np.ones((*around.shape[:2], 1)), around[..., :2]], axis=2)
+    normal, right = (np.swapaxes(design, 1, 2) @ one for one in (design, around[..., 2:]))
+    plane = np.linalg.pinv(normal, hermitian=True) @ right
+    return Samples(ground, median + plane[:, 0, 0], redness, cell_m, origin)
 
 
 def square_tiles(local: FloatArray, side_m: float) -> IntArray:
     """Return the number of the square of each place, x and y from zero up."""
     column, row = (local[:, :2] / side_m).astype(np.int64).T
     return np.asarray(row * (column.max(initial=0) + 1) + column)
-
-
-def _smoothed(ground: FloatArray) -> FloatArray:
-    """Return the height, at each place, of the plane through its neighbours."""
-    from scipy.spatial import cKDTree  # slow to import
-
-    k = min(NEIGHBOURS, len(ground) - 1)
-    _, near = cKDTree(ground[:, :2]).query(ground[:, :2], k=k + 1)
-    around = ground[np.asarray(near)[:, 1:]] - ground[:, None]
-    design = np.concatenate([np.ones((*around.shape[:2], 1)), around[..., :2]], axis=2)
-    # by the normal equations: three unknowns, and half the time
-    normal, right = (np.swapaxes(design, 1, 2) @ one for one in (design, around[..., 2:]))
-    plane = np.linalg.pinv(normal, hermitian=True) @ right
-    return np.asarray(ground[:, 2] + plane[:, 0, 0])

@@ -72,9 +72,6 @@ class WaterFit(ShoreFit):
         return np.sqrt(np.einsum("ij,jk,ik->i", row, self.covariance, row))
 
 
-_UNKNOWNS: dict[Model, int] = {"level": 1, "along": 2, "plane": 3}
-
-
 def fit_water(
     xyz: FloatArray, *, model: Model = "auto", counts: FloatArray | None = None
 ) -> WaterFit:
@@ -191,9 +188,17 @@ def _choose(shore: _Shore) -> "tuple[Model, Regression, list[str]]":
     return model, found, notes
 
 
+TUKEY = 4.685061  # Tukey's constant for 95 % efficiency
+LEAST_SCALE_M = 0.005  # least scatter of residuals for their weights: no edge of water is sharper
+SUBSETS, SAMPLE = 3000, 400
+_ROUNDS, _CONVERGED_M = 200, 1e-10
+TO_SIGMA = 1.4826  # from the median of absolute values of normal numbers
+
+
 def _regression(shore: _Shore, model: Model) -> "Regression":
-    """Fit the unknowns of a model: level, and rise along and across the points."""
-    p, n, along, across = _UNKNOWNS[model], len(shore.z), shore.along_m, shore.across_m
+    """Fit the p unknowns beta of a model: level, and rise along and across the points."""
+    p, n = {"level": 1, "along": 2, "plane": 3}[model], len(shore.z)
+    X, z, along, across = shore.design[:, :p], shore.z, shore.along_m, shore.across_m
     on_line = (p > 1 and along < _SAME_PLACE_M) or (p > 2 and across < _ON_LINE * along)
     if n < p or on_line:
         raise GeometryError(
@@ -203,14 +208,26 @@ def _regression(shore: _Shore, model: Model) -> "Regression":
             f" {across:.2g} m across). Fit a level, or a tilt along them.",
             points=n, least=p,
         )  # fmt: skip
-    return robust_regression(shore.design[:, :p], shore.z, shore.worth)
-
-
-TUKEY = 4.685061  # Tukey's constant for 95 % efficiency
-LEAST_SCALE_M = 0.005  # least scatter of residuals for their weights: no edge of water is sharper
-SUBSETS, SAMPLE = 3000, 400
-_ROUNDS, _CONVERGED_M = 200, 1e-10
-TO_SIGMA = 1.4826  # from the median of absolute values of normal numbers
+    rows = np.unique(np.linspace(0, n - 1, min(n, SAMPLE)).astype(np.int64))
+    beta = _least_median(X[rows], z[rows])
+    # the scale for Tukey's weights; few observations are fitted too well (Rousseeuw & Leroy 1987,
+    # p. 202)
+    few = 1.0 + 5.0 / max(n - p, 1)
+    scale = few * TO_SIGMA * float(np.median(np.abs(z - X @ beta)))
+    limit = TUKEY * max(scale, LEAST_SCALE_M)
+    for _ in range(_ROUNDS):
+        root = np.sqrt(tukey_weight((z - X @ beta) / limit))
+        better, _, rank, _ = np.linalg.lstsq(X * root[:, None], z * root, rcond=1e-10)
+        if rank < p:  # too few weights are left to determine beta
+            break
+        change, beta = np.abs(X @ (better - beta)).max(), np.asarray(better, np.float64)
+        if change < _CONVERGED_M:
+            break
+    residual = z - X @ beta
+    covariance, sigma = _spread(X, residual, limit)
+    weight = tukey_weight(residual / limit)
+    covariance *= shared(weight, shore.worth, p)
+    return Regression(beta, covariance, sigma, residual, weight)
 
 
 def usable_rows(xyz: FloatArray) -> IntArray:
@@ -227,34 +244,6 @@ class Regression(NamedTuple):
     sigma_m: float  # standard deviation of one accepted observation; NaN without redundancy
     residual_m: FloatArray  # (n,), observed minus fitted
     weight: FloatArray  # (n,), 0 (rejected) to 1
-
-
-def robust_regression(X: FloatArray, z: FloatArray, worth: FloatArray) -> Regression:
-    """Fit z = X beta, which some p of the observations determine.
-
-    The columns of X, shape (n, p), are of similar size; z, shape (n,), is in metres, and `worth` is
-    as of `shared`.
-    """
-    rows = np.unique(np.linspace(0, len(z) - 1, min(len(z), SAMPLE)).astype(np.int64))
-    beta = _least_median(X[rows], z[rows])
-    # the scale for Tukey's weights; few observations are fitted too well (Rousseeuw & Leroy 1987,
-    # p. 202)
-    few = 1.0 + 5.0 / max(len(z) - X.shape[1], 1)
-    scale = few * TO_SIGMA * float(np.median(np.abs(z - X @ beta)))
-    limit = TUKEY * max(scale, LEAST_SCALE_M)
-    for _ in range(_ROUNDS):
-        root = np.sqrt(tukey_weight((z - X @ beta) / limit))
-        better, _, rank, _ = np.linalg.lstsq(X * root[:, None], z * root, rcond=1e-10)
-        if rank < X.shape[1]:  # too few weights are left to determine beta
-            break
-        change, beta = np.abs(X @ (better - beta)).max(), np.asarray(better, np.float64)
-        if change < _CONVERGED_M:
-            break
-    residual = z - X @ beta
-    covariance, sigma = _spread(X, residual, limit)
-    weight = tukey_weight(residual / limit)
-    covariance *= shared(weight, worth, X.shape[1])
-    return Regression(beta, covariance, sigma, residual, weight)
 
 
 def shared(weight: FloatArray, worth: FloatArray, unknowns: float) -> float:

@@ -2,16 +2,13 @@
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, get_args
 
 from pcfix.errors import SettingError
 from pcfix.options.correct import MethodOptions
 from pcfix.options.shared import DEFAULT_REFRACTIVE_INDEX, IndexFormula
 
 Options = TypeVar("Options", bound=MethodOptions)
-
-# Ranges of the formulas (fitted up to 35 PSU; natural seas have a little more).
-SALINITY_PSU, TEMPERATURE_C, WAVELENGTH_UM = (0.0, 40.0), (0.0, 30.0), (0.4, 0.7)
 
 GREEN_UM = 0.53  # peak of the green pixels, where cameras see most through water
 
@@ -64,43 +61,35 @@ def refractive_index(
     >>> round(pcfix.refractive_index(salinity=0.0, temperature_c=20.0, wavelength_um=0.589), 5)
     1.33301
     """
-    for name, value, (low, high), unit in (
-        ("salinity", salinity, SALINITY_PSU, "PSU"),
-        ("temperature", temperature_c, TEMPERATURE_C, "degrees Celsius"),
-        ("wavelength", wavelength_um, WAVELENGTH_UM, "micrometres"),
+    for name, value, low, high, unit in (
+        ("salinity", salinity, 0.0, 40.0, "PSU"),  # fitted up to 35; natural seas have more
+        ("temperature", temperature_c, 0.0, 30.0, "degrees Celsius"),
+        ("wavelength", wavelength_um, 0.4, 0.7, "micrometres"),
     ):
         if not (math.isfinite(value) and low <= value <= high):
             text = f"{name} {value:g} is outside {low:g} to {high:g}. Give it in {unit}."
             raise SettingError("option.range", text, option=name, value=value)
-    if formula not in _FORMULAS:
-        text = f"The index formula '{formula}' is unknown. Use {' or '.join(_FORMULAS)}."
+    if formula not in get_args(IndexFormula):
+        known = " or ".join(get_args(IndexFormula))
+        text = f"The index formula '{formula}' is unknown. Use {known}."
         raise SettingError("option.choice", text, option="index_formula", value=formula)
-    return _FORMULAS[formula](float(salinity), float(temperature_c), float(wavelength_um))
-
-
-def _skarlatos(s: float, t: float, um: float) -> float:
-    """Return the index by Skarlatos & Agrafiotis 2018, eq 13; the wavelength in micrometres."""
+    s, t, um = float(salinity), float(temperature_c), float(wavelength_um)
+    if formula == "quan-fry":  # Quan & Fry 1995, eq 3, with the wavelength in nanometres
+        nm = 1000.0 * um
+        return (
+            1.31405
+            + (1.779e-4 - 1.05e-6 * t + 1.6e-8 * t * t) * s
+            - 2.02e-6 * t * t
+            + (15.868 + 0.01155 * s - 0.00423 * t) / nm
+            - 4382.0 / nm**2
+            + 1.1455e6 / nm**3
+        )
+    # Skarlatos & Agrafiotis 2018, eq 13, with the wavelength in micrometres
     fresh = 1.447824 - 1.8029e-5 * t - 1.6916e-6 * t * t
     fresh += -4.89040e-1 * um + 7.28364e-1 * um**2 - 3.83745e-1 * um**3
     by_salt = 7.9362e-7 * t - 8.0597e-9 * t * t
     by_salt += 4.249e-4 * um - 5.847e-4 * um**2 + 2.812e-4 * um**3
     return fresh + 3.0110e-4 * s - s * by_salt
-
-
-def _quan_fry(s: float, t: float, um: float) -> float:
-    """Return the index by Quan & Fry 1995, eq 3, where the wavelength is in nanometres."""
-    nm = 1000.0 * um
-    return (
-        1.31405
-        + (1.779e-4 - 1.05e-6 * t + 1.6e-8 * t * t) * s
-        - 2.02e-6 * t * t
-        + (15.868 + 0.01155 * s - 0.00423 * t) / nm
-        - 4382.0 / nm**2
-        + 1.1455e6 / nm**3
-    )
-
-
-_FORMULAS = {"skarlatos": _skarlatos, "quan-fry": _quan_fry}
 
 
 def with_index(options: Options) -> Options:

@@ -228,25 +228,26 @@ def _fit_profile(
     their standard errors, all (m,), the weights of the points, (n,), and the standard deviation of
     one accepted point.
     """
+    from scipy.interpolate import BSpline
     from scipy.linalg import solveh_banded
 
     count = int(np.clip(NODES_A_POINT * len(z), 20, MOST_NODES))
     nodes = np.linspace(station[0], station[-1], count)
+    splines: Any = BSpline.design_matrix(station, np.pad(nodes, 1, "edge"), 1)  # linear ones
     # each fold is predicted from the others; its errors count up to a limit, for the outliers
     fold = np.arange(len(z)) % FOLDS
     missed = np.empty((len(PENALTIES), len(z)))
     for row, penalty in enumerate(PENALTIES):
         for k in range(FOLDS):
             rest, out = fold != k, fold == k
-            height = _solve(station[rest], z[rest], nodes, penalty)[0]
+            height = _solve(splines[rest], station[rest], z[rest], nodes, penalty)[0]
             missed[row, out] = np.abs(z[out] - np.interp(station[out], nodes, height))
     limit = TUKEY * max(TO_SIGMA * float(np.median(missed, axis=1).min()), LEAST_SCALE_M)
     best = PENALTIES[int(np.argmin((np.minimum(missed, limit) ** 2).mean(axis=1)))]
-    height, weight, band = _solve(station, z, nodes, best)
+    height, weight, band = _solve(splines, station, z, nodes, best)
     # the covariance of the heights over the variance of a point; its trace on the points counts the
     # unknowns that they determine
     inverse = solveh_banded(band, np.eye(len(nodes)), lower=True)
-    splines = _splines(station, nodes)
     variance = splines.multiply(splines @ inverse).sum(axis=1)
     residual, accepted = z - np.interp(station, nodes, height), weight > 0.0
     spare = accepted.sum() - float((weight * np.asarray(variance).ravel()).sum())
@@ -255,24 +256,17 @@ def _fit_profile(
     return nodes, height, sigma_height, weight, sigma
 
 
-def _splines(station: FloatArray, nodes: FloatArray) -> Any:
-    """Return the linear B-splines of the nodes at stations, a sparse matrix (n, nodes)."""
-    from scipy.interpolate import BSpline
-
-    return BSpline.design_matrix(station, np.pad(nodes, 1, "edge"), 1)
-
-
 def _solve(
-    station: FloatArray, z: FloatArray, nodes: FloatArray, penalty: float
+    splines: Any, station: FloatArray, z: FloatArray, nodes: FloatArray, penalty: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return heights, the points' weights, and the lower band of the normal equations.
 
+    The splines are those of the nodes at the stations, a sparse matrix, shape (n, nodes).
     Iteratively reweighted least squares: bends weigh 1 / |bend|, rises 1 or 0, points first by
     Huber, then by Tukey with the scale of the Huber solution.
     """
     from scipy.linalg import solveh_banded
 
-    splines = _splines(station, nodes)
     squares, products = splines.power(2).T, splines[:, :-1].multiply(splines[:, 1:]).T
     before = np.searchsorted(station, nodes[1:-1])
     stiff = np.minimum(before, len(z) - before) < END_POINTS
