@@ -343,11 +343,8 @@ def write_table(folder: File, cameras: Cameras) -> None:
     comment = f"# CoordinateSystem: {' '.join((cameras.crs or '').split())}\n" if has_crs else ""
     names = ("label", "x", "y", "z", *QUATERNION)
     rows = [[label, *row] for label, row in zip(cameras.labels, poses, strict=True)]
-    contents = {
-        "cameras.csv": comment.encode() + _csv(names, *rows),
-        "sensor.csv": _csv(header, sensor),
-    }
-    checks.write_new(target, contents)
+    listed = comment.encode() + _csv(names, *rows)
+    checks.write_new(target, {"cameras.csv": listed, "sensor.csv": _csv(header, sensor)})
 
 
 def _csv(*rows: Iterable[object]) -> bytes:
