@@ -110,24 +110,23 @@ def _correct(options: CorrectOptions, cloud: PdalCloud, task: "FileTask") -> Don
     from pcfix.io.las.columns import columns_for
 
     results = Results(cloud, columns_for(options.dimensions))
-    plan, tally = plan_correction(read_inputs(options, _view(cloud))), None
+    plan = plan_correction(read_inputs(options, _view(cloud)))
+    tally: Any = None  # known after the first chunk; PDAL runs no stage on no points
     for rows, points in _chunks(cloud, plan.found.surface):
         correction, one = correct_chunk(plan, points, rows.start)
         results.add(rows, correction)
         tally = one if tally is None else tally + one
-    summary = finish(plan, task, tally)  # type: ignore[arg-type]  # PDAL runs no stage on no points
-    return results.dimensions, summary.as_dict()
+    return results.dimensions, finish(plan, task, tally).as_dict()
 
 
 def _label(options: LabelOptions, cloud: PdalCloud, task: "FileTask") -> Done:
     from pcfix.flow.label import check, label_chunk, plan_labelling
 
-    plan, classes, tally = plan_labelling(options, _view(cloud)), cloud.classes.copy(), None
+    plan, classes = plan_labelling(options, _view(cloud)), cloud.classes.copy()
+    tally: Any = None
     for rows, points in _chunks(cloud, plan.water):
         classes[rows], one = label_chunk(plan, points)
         tally = one if tally is None else tally + one
-    if tally is None:
-        return {}, {}
     check(plan, tally)
     summary = {**tally.of_classes(), "labelling": plan.labelling.report(tally)}
     return {"Classification": classes, **cloud.flags()}, summary

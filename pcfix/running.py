@@ -133,11 +133,8 @@ def row_numbers(count: int) -> Array:
 def grouped(number: Array, groups: int, *columns: Array) -> tuple[Array, list[Array]]:
     """Sort columns, (n, ...), by the group number of their rows, (n,), in a stable order.
 
-    Returns
-    -------
-    start : array, shape (groups + 1,)
-        Group i has the rows ``start[i]`` to ``start[i + 1]`` of the sorted columns.
-    sorted : list of array
+    Return `start`, shape (groups + 1,), and the sorted columns, of which group i has the rows
+    ``start[i]`` to ``start[i + 1]``.
     """
     count = len(number)
     counts = np.zeros(groups, np.int64)

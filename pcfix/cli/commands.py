@@ -69,8 +69,7 @@ def correct(
     """Correct a point cloud for refraction at the water surface."""
     from pcfix.report.text import details_text
 
-    work = pcfix.correct_file
-    found = _summarized("Correcting", "correct", quiet, work, input, output, options)
+    found = _summarized("Correcting", "correct", quiet, pcfix.correct_file, input, output, options)
     if verbose:
         say(details_text(found), quiet)
 

@@ -130,30 +130,19 @@ def plugin_table(commands: Mapping[str, Command]) -> str:
     """Return the forms of the `OFFERED` commands as JSON."""
     import json  # slow to import
 
-    forms = [_form(name, commands[name]) for name in OFFERED]
+    forms = list[dict[str, Any]]()
+    always = {"unit": "", "default": None, "needed": True}
+    for title, (call, kind, _, helps) in ((name, commands[name]) for name in OFFERED):
+        places = [
+            {"name": name, "kind": _PLACES.get(name, "cloud"), "help": helps[name], **always}
+            for name, one in inspect.signature(call).parameters.items()
+            if one.kind is one.POSITIONAL_ONLY
+        ]
+        names = [one.name for one in options_of(kind)]
+        fields = [_field(one, replaced=one.instead in names) for one in options_of(kind)]
+        about = {"name": title, "help": inspect.getdoc(call)}
+        forms.append(about | {"places": places, "options": fields})
     return json.dumps({"version": __version__, "commands": forms}, indent=1) + "\n"
-
-
-def _form(name: str, command: Command) -> dict[str, Any]:
-    options = options_of(command.kind)
-    names = [one.name for one in options]
-    return {
-        "name": name,
-        "help": inspect.getdoc(command.call),
-        "places": [
-            {
-                "name": name,
-                "kind": _PLACES.get(name, "cloud"),
-                "help": command.helps[name],
-                "unit": "",
-                "default": None,
-                "needed": True,
-            }
-            for name, one in inspect.signature(command.call).parameters.items()
-            if one.kind is inspect.Parameter.POSITIONAL_ONLY
-        ],
-        "options": [_field(one, replaced=one.instead in names) for one in options],
-    }
 
 
 def _field(one: Option, *, replaced: bool) -> dict[str, Any]:
@@ -186,13 +175,18 @@ def _field(one: Option, *, replaced: bool) -> dict[str, Any]:
 # Progress and summary
 
 
-def _announce_compiling() -> None:
-    """Announce on a terminal that the first command compiles the kernels."""
+def _terminal(quiet: bool) -> Any:
+    """Return the console for progress, None if there is none; announce that kernels compile."""
+    if quiet or not sys.stderr.isatty():
+        return None
+    from rich.console import Console
+
     from pcfix.kernels import cache_folder
 
     folder = cache_folder()
     if folder is None or not any(folder.iterdir()):
         sys.stderr.write("Compiling the kernels; the first command takes about a minute longer.\n")
+    return Console(stderr=True)
 
 
 @contextmanager
@@ -216,12 +210,10 @@ def progress_bar(
 
         yield print_percent
         return
-    if quiet or not sys.stderr.isatty():
+    if (console := _terminal(quiet)) is None:
         yield None
         return
-    _announce_compiling()
     from rich import progress
-    from rich.console import Console
 
     columns = (
         progress.TextColumn("{task.description}"),
@@ -230,7 +222,7 @@ def progress_bar(
         progress.TextColumn("{task.fields[rate]}"),
         progress.TimeRemainingColumn(elapsed_when_finished=True),
     )
-    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with progress.Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(title, total=None, rate="")
         started = time.perf_counter()
 
@@ -245,13 +237,10 @@ def progress_bar(
 @contextmanager
 def status_line(title: str, quiet: bool) -> Iterator[Callable[[Any], None] | None]:
     """Show a status line on a terminal."""
-    if quiet or not sys.stderr.isatty():
+    if (console := _terminal(quiet)) is None:
         yield None
         return
-    _announce_compiling()
-    from rich.console import Console
-
-    with Console(stderr=True).status(title) as status:
+    with console.status(title) as status:
         yield lambda text: status.update(f"{title}: {text}")
 
 

@@ -125,18 +125,10 @@ def inputs_of(cloud: Any) -> list[Any]:
 
 
 def tiles_of(cloud: Clouds) -> Tiles | None:
-    """Return many files as one cloud; None if a path is that of a single file.
+    """Return many files as one cloud, and warn if they overlap; None for a path of a single file.
 
-    Parameters
-    ----------
-    cloud : path, iterable of paths, or Tiles
-        A folder, a glob (``tiles/*.laz``), a text list with a path on each line, or a virtual
-        point cloud (``.vpc``); paths in these two may be relative to their own folder.
-
-    Warns
-    -----
-    PcfixWarning
-        If tiles overlap.
+    A path is that of a folder, a glob (``tiles/*.laz``), a text list with a path on each line, or a
+    virtual point cloud (``.vpc``); paths in these two may be relative to their own folder.
     """
     if isinstance(cloud, Tiles):
         return cloud
@@ -216,10 +208,8 @@ def tiles_from(name: str, paths: Iterable[Path]) -> Tiles:
     pairs = shapely.STRtree(boxes).query(boxes, predicate="intersects").T.tolist()
     found = [(tiles.paths[i].name, tiles.paths[j].name) for i, j in pairs if i < j]
     if found:
-        sentence = (
-            f"{' and '.join(found[0])} overlap, as do {len(found)} pairs. Points in both count"
-        )
-        sentence += " twice; cut off the buffers of the tiles."
+        sentence = f"{' and '.join(found[0])} overlap, as do {len(found)} pairs. Points in both"
+        sentence += " count twice; cut off the buffers of the tiles."
         warn(tiles, "cloud.overlap", sentence, pairs=found)
     return tiles
 
@@ -331,16 +321,9 @@ def read_cloud(
         raise bad_file(path, "cloud.nothing_left", sentence)
     # the plane in the record is exact only if no dimension has the water above each point
     exact = water is not None or not mapped(np.isfinite, water_m).any()
-    return SurveyCloud(
-        str(path),
-        xyz,
-        crs,
-        most - first,
-        shifts[0] if shifts else None,
-        bathymetric,
-        water_m,
-        own if exact and not isinstance(own, WaterDimension) else None,
-    )
+    surface = own if exact and not isinstance(own, WaterDimension) else None
+    shift_m = shifts[0] if shifts else None
+    return SurveyCloud(str(path), xyz, crs, most - first, shift_m, bathymetric, water_m, surface)
 
 
 def own_water(source: LasSource) -> WaterSurface | None:
@@ -417,10 +400,8 @@ def check_same_crs(cloud: str, crs: "CRS | None", reference: str, other: "CRS | 
             bare, name = (cloud, other.name) if other else (reference, crs.name if crs else "")
             warn(bare, "crs.assumed", f"names no CRS; {name} is assumed.", path=bare)
         return
-    for code, one, another in zip(
-        ("crs.differs", "crs.heights_differ"), parts(crs), parts(other), strict=True
-    ):
+    codes = "crs.differs", "crs.heights_differ"
+    for code, one, another in zip(codes, parts(crs), parts(other), strict=True):
         if one is not None and another is not None and not is_same(one, another):
             sentence = f"is in {another.name}, the cloud in {one.name}. Transform it to that first."
-            values = {"crs": another.name, "expected": one.name}
-            raise bad_file(reference, code, sentence, **values)
+            raise bad_file(reference, code, sentence, crs=another.name, expected=one.name)

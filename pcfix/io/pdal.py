@@ -141,9 +141,8 @@ class Results:
     def add(self, rows: slice, correction: Correction) -> None:
         """Add one chunk."""
         out, cloud, scales, moved = self._added, self._cloud, self._scales, correction.moved
-        changes = changes_of(
-            self._columns, correction, cloud.classes[rows], cloud.withheld[rows], scales
-        )
+        before = cloud.classes[rows], cloud.withheld[rows]
+        changes = changes_of(self._columns, correction, *before, scales)
         for i, axis in enumerate("XYZ"):
             # land keeps its bits, negative zero included
             out[axis][rows][moved] += changes.steps[i][moved] * scales[i]

@@ -255,15 +255,10 @@ class Times(NamedTuple):
 
 
 def read_image_times(path: File, labels: Sequence[str]) -> Times:
-    """Find out when images were taken.
+    """Find out when k images were taken, by their names (with or without folder and suffix).
 
-    Parameters
-    ----------
-    path : path
-        A table with the columns ``label`` and ``time`` (ISO 8601), or a folder with the images,
-        whose EXIF data has DateTimeOriginal, and OffsetTimeOriginal for the zone.
-    labels : sequence of str
-        Names of the k images; a folder or an extension may be missing on either side.
+    A table has the columns ``label`` and ``time`` (ISO 8601). A folder has the images, whose EXIF
+    data has DateTimeOriginal, and OffsetTimeOriginal for the zone.
     """
     found = Path(path)
     if not found.is_dir():

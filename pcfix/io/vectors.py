@@ -58,17 +58,11 @@ def is_vector_file(path: File) -> bool:
 
 
 def read_vectors(path: File, *, crs: str | None = None) -> Vectors:
-    """Read one layer of a vector file, in its own CRS.
+    """Read one layer of a vector file, in its own CRS; `crs` replaces the one that it states.
 
-    Parameters
-    ----------
-    path : path
-        ``.gpkg``, ``.shp``, ``.geojson``, ``.json``, ``.kml``, ``.gpx``; ``.csv`` or ``.txt`` with
-        the columns x, y and perhaps z, or easting, northing, height, or longitude, latitude,
-        height. A layer may follow, if there are several, as QGIS writes it:
-        ``river.gpkg|layername=shore``.
-    crs : str, optional
-        The file's CRS, in place of the one that it states. ``local``: the cloud's.
+    A table has the columns x, y and perhaps z, or easting, northing, height, or longitude,
+    latitude, height. If a file has several layers, one follows its path, as QGIS writes it:
+    ``river.gpkg|layername=shore``. The CRS ``local`` is the cloud's.
     """
     file, _, layer = str(path).partition(LAYER_MARK)
     source = check_input(file)
@@ -247,10 +241,9 @@ def read_water_polygons(path: File, cloud_crs: "str | CRS | None" = None) -> Vec
     polygons = parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON]
     crossed = ~shapely.is_valid(polygons)
     if crossed.any():
-        polygons[crossed] = shapely.make_valid(
-            polygons[crossed], method="structure", keep_collapsed=False
-        )
-        count, area_m2 = int(crossed.sum()), float(shapely.area(polygons[crossed]).sum())
+        repaired = shapely.make_valid(polygons[crossed], method="structure", keep_collapsed=False)
+        polygons[crossed] = repaired
+        count, area_m2 = len(repaired), float(shapely.area(repaired).sum())
         sentence = f"{count} of {len(polygons)} polygons crossed themselves. Repaired, they cover"
         sentence += f" {area_m2:.1f} m2."
         warn(vectors.name, "mask.repaired", sentence, count=count, area_m2=area_m2)
@@ -306,8 +299,7 @@ def write_layers(
                 # the table in which QGIS looks for styles, and keeps its own
                 write(
                     temporary, None, [*columns.values()], [*columns], layer="layer_styles",
-                    driver="GPKG",
-                    append=True, crs=None, geometry_type=None,
+                    driver="GPKG", append=True, crs=None, geometry_type=None,
                 )  # fmt: skip
         except RuntimeError as error:
             raise cannot_write(target, error, temporary) from error

@@ -88,18 +88,10 @@ class ViewList:
 
 
 def read_views(path: File, cameras: Cameras, *, to_cloud: Move | None = None) -> ViewList:
-    """Read the view list of a dense cloud.
+    """Read the view list of a dense cloud, for cameras in the cloud's frame.
 
-    Parameters
-    ----------
-    path : path
-        COLMAP's ``fused.ply.vis``, or the dense PLY file of OpenMVS with its ``view_indices``. For
-        COLMAP the ``fused.ply`` will do if the list is next to it. Images are counted as in a
-        sparse model next to the list, or as the cameras are, whichever the geometry confirms.
-    cameras : Cameras
-        In the cloud's frame.
-    to_cloud : callable, optional
-        Takes positions, shape (n, 3), from the list's frame to the cloud's. Default: the same.
+    For COLMAP the ``fused.ply`` will do if the list is next to it. `to_cloud` takes positions,
+    shape (n, 3), from the list's frame to the cloud's; None if they are the same.
     """
     found = check_input(path)
     with found.open("rb") as stream:
@@ -307,9 +299,8 @@ class ViewMatch:
         `first_row` on. One without a match has no cameras.
         """
         views = self.view_list
-        report = ViewReport(
-            f"{views.what} {views.path}", len(views), views.share_seen, self.tolerance_m
-        )
+        source = f"{views.what} {views.path}"
+        report = ViewReport(source, len(views), views.share_seen, self.tolerance_m)
         own_row = np.arange(first_row, first_row + len(xyz))
         row = own_row if views.xyz is None else self._rows(xyz, own_row, views.xyz)
         matched = np.flatnonzero(row >= 0)

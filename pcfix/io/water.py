@@ -158,15 +158,10 @@ MOST_CELLS = 10_000_000  # cells that are read, for the memory
 
 
 def read_water_raster(path: File, cloud_crs: "str | CRS | None" = None) -> WaterRaster:
-    """Read the heights of the water, metres; warn of what is assumed.
+    """Read heights of the water, metres, from any raster that GDAL reads; warn of what is assumed.
 
-    Parameters
-    ----------
-    path : path
-        A raster of any format that GDAL reads, north-up in the cloud's CRS.
-    cloud_crs : str, CRS or None
-        Projected, in metres. If the raster or the cloud names no CRS, that of the other is
-        assumed.
+    It is north-up in the cloud's CRS, which is projected, in metres. If either names no CRS, that
+    of the other is assumed.
     """
     name = str(path)
     with open_raster(path) as source:
@@ -292,9 +287,8 @@ def level_offsets(
         taken = datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M:%S")
         sentence = f"does not cover image {image}, taken at {taken} ({outside.size} of"
         sentence += f" {len(labels)} images are outside). Add rows, or check the zones."
-        raise bad_file(
-            tide.name, "tide.not_covered", sentence, image=image, count=int(outside.size)
-        )
+        values = {"image": image, "count": int(outside.size)}
+        raise bad_file(tide.name, "tide.not_covered", sentence, **values)
     level = np.interp(times.time_s, clock, level_m)
     row = np.clip(np.searchsorted(clock, times.time_s) - 1, 0, len(clock) - 2)
     hours = float(np.diff(clock)[row].max()) / 3600.0

@@ -29,6 +29,7 @@ smallest that contain all tie points. The files name no CRS.
 
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -79,11 +80,8 @@ def read(source: Source) -> Cameras:
         sentence = f"the size of {missing.sum()} images is unknown; {width:.0f} x {height:.0f} px"
         sentence += " is estimated. Put the images next to the file."
         checks.warn(source.path, "cameras.frames_estimated", sentence, size_px=[width, height])
-    lenses = (
-        lens_by_name(given, *size, relative=is_mve, inverse=is_nvm)
-        for given, size in zip(parameters, sizes.tolist(), strict=True)
-    )
-    return replace(cameras, lenses=tuple(lenses))
+    lens = partial(lens_by_name, relative=is_mve, inverse=is_nvm)
+    return replace(cameras, lenses=tuple(map(lens, parameters, *sizes.T.tolist())))
 
 
 def tie_points(source: Source, cameras: Cameras) -> TiePoints:

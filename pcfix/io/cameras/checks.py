@@ -295,12 +295,7 @@ class AffineFrame(NamedTuple):
 # ---- lenses ----
 
 
-SHAPES: Mapping[Projection, str] = {
-    "fov": "omega",
-    "division": "k",
-    "eucm": "alpha beta",
-    "dual": "transition",
-}
+SHAPES = {"fov": "omega", "division": "k", "eucm": "alpha beta", "dual": "transition"}
 LETTERS = {"radial": "k", "denominator": "d", "tangential": "p", "thin_prism": "s"}
 
 

@@ -142,22 +142,15 @@ def georeference(
 ) -> Georeference:
     """Return the transformation to the cloud's CRS, for cameras, tie points and others.
 
-    Parameters
-    ----------
-    cameras : Cameras
-        As a reader gave them, in the frame of their file.
-    cloud_crs : str, CRS or None
-        Projected, in metres. If it is None, the target is the CRS in which the software delivers
-        clouds, mostly that of the cameras.
-    cameras_crs : str, optional
-        Overrides the CRS in the file. ``local``: the numbers do not change. A CRS without heights
-        states that these agree with the cloud's, and so does ``ENU:lat,lon,height``. For a
-        file with geocentric positions it is the CRS in which its software delivers clouds, unless
-        it is geocentric itself.
-    offset_m : tuple of 3 float, optional
-        Added to the centres first, in the axes and the unit of the cameras' frame.
-    name : str
-        Of the file, for messages.
+    The cameras are as a reader gave them, in the frame of the file `name`. The cloud's CRS is
+    projected, in metres. If it is None, the target is the CRS in which the software delivers
+    clouds, mostly that of the cameras.
+
+    `cameras_crs` overrides the CRS in the file. ``local``: the numbers do not change. A CRS without
+    heights states that these agree with the cloud's, and so does ``ENU:lat,lon,height``. For a file
+    with geocentric positions it is the CRS in which its software delivers clouds, unless it is
+    geocentric itself. `offset_m` is added to the centres first, in the axes and the unit of the
+    cameras' frame.
     """
     offset = np.zeros(3) if offset_m is None else np.array(offset_m, np.float64)
     cloud = None if cloud_crs is None else systems.parse_crs(cloud_crs, "the cloud")

@@ -177,10 +177,8 @@ def _frame(files: Files, own: Cameras) -> AffineFrame:
         truth = _projected(crs, origin.to_degrees(own.gnss.xyz))
     still = _projected(crs, origin.to_degrees(own.centres))
     known = np.isfinite(truth).all(axis=1)
-    still_m, moved_m = (
-        np.linalg.norm((guess - truth)[known])
-        for guess in (still, moved.points(own.centres)[:, :2])
-    )
+    still_m = np.linalg.norm((still - truth)[known])
+    moved_m = np.linalg.norm((moved.points(own.centres)[:, :2] - truth)[known])
     return unmoved._replace(project_crs=crs) if still_m < 0.5 * moved_m else moved
 
 
@@ -263,10 +261,8 @@ def _read_shots(files: Files) -> Cameras:
 def _shots(path: Path) -> dict[str, dict[str, Any]]:
     """Return the properties of every feature by file name, with its `geometry`."""
     features = checks.load_json(path)["features"]
-    shots = {
-        str(one["properties"]["filename"]): one["properties"] | {"geometry": one.get("geometry")}
-        for one in features
-    }
+    given = [one["properties"] | {"geometry": one.get("geometry")} for one in features]
+    shots = {str(one["filename"]): one for one in given}
     if not shots or len(shots) < len(features):
         raise damaged(path, f"{len(features)} features have {len(shots)} different filenames")
     return shots

@@ -140,9 +140,8 @@ def convert(
     size = 0
     while names and after[names[0]] == old.dtype.fields[names[0]] and after[names[0]][1] == size:
         size += after[names.pop(0)][0].itemsize
-    array.view(np.uint8).reshape(len(array), -1)[:, :size] = old.view(np.uint8).reshape(
-        len(old), -1
-    )[:, :size]
+    bytes_of = [one.view(np.uint8).reshape(len(one), -1) for one in (array, old)]
+    bytes_of[0][:, :size] = bytes_of[1][:, :size]
     for name in names:
         array[name] = old[name]
     if same:
@@ -166,9 +165,7 @@ def move(points: "laspy.ScaleAwarePointRecord", steps: npt.NDArray[np.int64], pa
     for name, along in zip("XYZ", steps, strict=True):
         moved = points.array[name] + along
         if moved.size and (moved.min() < _INT32.min or moved.max() > _INT32.max):
-            sentence = (
-                f"the scale of {name} is too fine for the result in 32 bits. Write the cloud with a"
-                " coarser scale first."
-            )
+            sentence = f"the scale of {name} is too fine for the result in 32 bits."
+            sentence += " Write the cloud with a coarser scale first."
             raise bad_file(path, "cloud.scale", sentence)
         points.array[name] = moved

@@ -168,7 +168,23 @@ class LasSource:
             reader = laspy.open(self.path.open("rb"), laz_backend=backend(jobs))
             self._reader = stack.enter_context(reader)
             self.header: laspy.LasHeader = reader.header
-            self._check_header()
+            scales, offsets = self.header.scales, self.header.offsets
+            usable = (scales > 0.0) & (scales <= MOST_SCALE_M)
+            # steps below the last digit of the offsets would be lost in coordinates
+            if not (usable & (np.abs(offsets) * np.finfo(np.float64).eps <= scales)).all():
+                sentence = f"the scales {scales.tolist()} of its header are not between 0 and"
+                sentence += f" {MOST_SCALE_M:,.0f}, or too small for its offsets"
+                sentence += f" {offsets.tolist()}. Export the cloud again."
+                raise bad_file(self.path, "cloud.scales", sentence)
+            if len(self) == 0:
+                raise bad_file(self.path, "cloud.empty", "contains no points.")
+            # points that the header does not count would be lost
+            least, most = self._points_held()
+            if not least <= len(self) <= most:
+                held = f"{least:,}" if least == most else f"{least:,} to {most:,}"
+                sentence = f"its header counts {len(self):,} points, but it holds {held}."
+                sentence += " Export it again."
+                raise bad_file(self.path, "cloud.count", sentence, stated=len(self))
             stack.pop_all()
 
     def __enter__(self) -> "LasSource":
@@ -179,25 +195,6 @@ class LasSource:
 
     def __len__(self) -> int:
         return int(self.header.point_count)
-
-    def _check_header(self) -> None:
-        """Refuse unusable scales, an empty cloud, and a count that disagrees with the points."""
-        scales, offsets = self.header.scales, self.header.offsets
-        usable = (scales > 0.0) & (scales <= MOST_SCALE_M)
-        # steps below the last digit of the offsets would be lost in coordinates
-        if not (usable & (np.abs(offsets) * np.finfo(np.float64).eps <= scales)).all():
-            sentence = f"the scales {scales.tolist()} of its header are not between 0 and"
-            sentence += f" {MOST_SCALE_M:,.0f}, or too small for its offsets {offsets.tolist()}."
-            raise bad_file(self.path, "cloud.scales", f"{sentence} Export the cloud again.")
-        stated = len(self)
-        if stated == 0:
-            raise bad_file(self.path, "cloud.empty", "contains no points.")
-        # points that the header does not count would be lost
-        least, most = self._points_held()
-        if not least <= stated <= most:
-            held = f"{least:,}" if least == most else f"{least:,} to {most:,}"
-            sentence = f"its header counts {stated:,} points, but it holds {held}. Export it again."
-            raise bad_file(self.path, "cloud.count", sentence, stated=stated)
 
     def _points_held(self) -> tuple[int, float]:
         """Return the least and the largest number of points that the file may hold.

@@ -77,9 +77,8 @@ def output_header(
         point_format.add_extra_dimension(extra)
         number = _TYPES.index(dtype) + 1
         options, step = (0, 0.0) if scaled is None else (_SCALED, scale)
-        described.append(
-            _EXTRA.pack(number, options, name.encode(), step, 0.0, description.encode())
-        )
+        record = _EXTRA.pack(number, options, name.encode(), step, 0.0, description.encode())
+        described.append(record)
     vlrs, crs = list(source.vlrs), None
     if old.point_format.id < 6 and not old.global_encoding.wkt:  # formats 6 and up want WKT
         crs = stated_crs(source)
@@ -270,8 +269,7 @@ def write_points(
     points = laspy.ScaleAwarePointRecord.zeros(len(xyz), header=header)
     for axis, name in enumerate("XYZ"):
         points.array[name] = np.rint((xyz[:, axis] - header.offsets[axis]) / step_m)
-    points["return_number"][:] = 1
-    points["number_of_returns"][:] = 1
+    points["return_number"][:] = points["number_of_returns"][:] = 1
     if classes is not None:
         points.array["classification"] = classes
     if colours is not None:
