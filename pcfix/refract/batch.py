@@ -31,6 +31,7 @@ NO_CAMERA, ONE_CAMERA = int(Outcome.NO_CAMERA), int(Outcome.ONE_CAMERA)
 PARALLEL, CORRECTED = int(Outcome.PARALLEL_RAYS), int(Outcome.CORRECTED)  # for kernels
 FLAT_DEG = 35.0  # incidence angle beyond which methods differ most; see `reconstructions.LIMITS`
 ALIKE = ("snell", "shan", "butler", "murase", "dietrich")  # all rays of a point count alike
+NOMINAL_FOCAL_PX = 3700.0  # without a lens: a survey drone's of 20 megapixels, 0.27 mrad a pixel
 
 
 class Learned(NamedTuple):
@@ -101,12 +102,18 @@ class Survey:
         learned = self.learned.limit_deg if self.settings.method in ALIKE else None
         return learned if self.settings.limit_deg is None else self.settings.limit_deg
 
-    @property
-    def offset_m(self) -> FloatArray:
-        """`level_offset_m`, with zeros where the water did not move."""
-        if self.level_offset_m is None:
-            return np.zeros(len(self.cameras))
-        return np.ascontiguousarray(self.level_offset_m, np.float64)
+    def rig(self) -> "Rig":
+        """Return the cameras for kernels."""
+        cameras, k = self.cameras, len(self.cameras)
+        axes, focal, offset = np.zeros((k, 3)), np.full(k, NOMINAL_FOCAL_PX), np.zeros(k)
+        if cameras.lenses is not None and cameras.rotations is not None:
+            is_flat = [lens.projection == "perspective" for lens in cameras.lenses]
+            flat = np.flatnonzero(is_flat)
+            axes[flat] = cameras.rotations[flat, 2]
+            focal = np.array([lens.focal_px for lens in cameras.lenses])
+        if self.level_offset_m is not None:
+            offset = np.ascontiguousarray(self.level_offset_m, np.float64)
+        return Rig(np.ascontiguousarray(cameras.centres), offset, axes, focal)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,25 +173,18 @@ class Batch:
 
     def chosen(self) -> "Chosen":
         """Return the points and their cameras, if these are known, for kernels."""
-        survey, views, none = self.survey, self.views, np.zeros(0, np.int64)
+        views, none = self.views, np.zeros(0, np.int64)
         original = self.xyz if self.original_model is None else self.original_model.xyz
         return Chosen(
             xyz=np.ascontiguousarray(self.xyz),
             original_xyz=np.ascontiguousarray(original),
             height=np.ascontiguousarray(self.surface.height_m),
             slope=np.ascontiguousarray(self.surface.slope),
-            centres=np.ascontiguousarray(survey.cameras.centres),
-            offset=survey.offset_m,
+            rig=self.survey.rig(),
             start=none if views is None else np.ascontiguousarray(views.start, np.int64),
             camera=none if views is None else np.ascontiguousarray(views.camera, np.int64),
-            n=survey.settings.refractive_index,
+            n=self.survey.settings.refractive_index,
         )
-
-    def incidence_deg(self) -> FloatArray:
-        """Return the largest incidence angle in air of each point's rays, shape (m,); 0 without."""
-        cosine = np.empty(len(self))
-        in_tiles(_incidence, len(self), self.chosen(), cosine)
-        return np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
 
     def result(
         self,
@@ -197,13 +197,16 @@ class Batch:
         moved, zero = outcome == Outcome.CORRECTED, np.zeros(len(self.xyz))
         used = np.zeros(len(self.survey.cameras), np.bool_)
         used[self.rays.camera[np.repeat(moved, self.counts)]] = True
+        cosine = np.empty(len(self))
+        in_tiles(_incidence, len(self), self.chosen(), cosine)
+        angle = np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
         return Intersection(
             shift_m=np.where(moved[:, None], shift_m, 0.0),
             outcome=outcome,
             ray_count=np.where(moved, self.counts, 0).astype(np.int32),
             ray_miss_m=zero if ray_miss_m is None else np.where(moved, ray_miss_m, 0.0),
             sigma_z_m=zero,
-            incidence_deg=np.where(moved, self.incidence_deg(), 0.0),
+            incidence_deg=np.where(moved, angle, 0.0),
             camera_used=used,
         )
 
@@ -262,7 +265,7 @@ def _incidence(span: Span, points: "Chosen", cosine: FloatArray) -> None:
     for i in range(*span):
         least, normal = 1.0, normal_above(points, i)
         for at in range(points.start[i], points.start[i + 1]):
-            e = minus(row_of(points.centres, points.camera[at]), row_of(points.xyz, i))
+            e = minus(row_of(points.rig.centres, points.camera[at]), row_of(points.xyz, i))
             least = min(least, dot(normal, e) / np.sqrt(dot(e, e)))
         cosine[i] = least
 
@@ -295,6 +298,15 @@ def warn_of_unsolved(beginning: str, found: BoolArray) -> None:
         )
 
 
+class Rig(NamedTuple):
+    """The k cameras, for kernels; metres, world frame."""
+
+    centres: FloatArray  # (k, 3), projection centres
+    offset: FloatArray  # (k,), how much higher the water stood for each
+    axes: FloatArray  # (k, 3), optical axes; zeros for images of nearly equal angles (fisheyes)
+    focal_px: FloatArray  # (k,)
+
+
 class Chosen(NamedTuple):
     """Points, the water above them and the cameras chosen for each, for kernels; see `Batch`."""
 
@@ -302,8 +314,7 @@ class Chosen(NamedTuple):
     original_xyz: FloatArray  # the same in the original model
     height: FloatArray  # (m,), of the water above each point
     slope: FloatArray  # (m, 2)
-    centres: FloatArray  # (k, 3), projection centres
-    offset: FloatArray  # (k,), how much higher the water stood for each camera
+    rig: Rig
     start: IntArray  # the cameras of point i are camera[start[i] : start[i + 1]]
     camera: IntArray
     n: float

@@ -1,7 +1,5 @@
 """Choose the cameras of each point: all whose frames contain it, or those of a view list."""
 
-from typing import NamedTuple
-
 import numpy as np
 import numpy.typing as npt
 
@@ -20,12 +18,10 @@ from pcfix.model import (
 )
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract import tiling
-from pcfix.refract.batch import Batch, Chosen, Survey
+from pcfix.refract.batch import Batch, Chosen, Rig, Survey
 from pcfix.refract.rays import light_near, pierce
 from pcfix.refract.tiling import TILE, three
 from pcfix.water.surface import Field, SurfaceAbove, Tin, build_fields, build_tin
-
-NOMINAL_FOCAL_PX = 3700.0  # without a lens: a survey drone's of 20 megapixels, 0.27 mrad a pixel
 
 # Cameras without a lens have no frame to leave; nobody matches images as flat as this, and a block
 # in another CRS is recognised by it.
@@ -36,45 +32,12 @@ MAX_ANGLE_WITHOUT_FRAMES_DEG = 80.0
 REACH = 0.03
 
 
-class Rig(NamedTuple):
-    """The k cameras, for kernels; metres, world frame."""
-
-    centres: FloatArray  # (k, 3), projection centres
-    offset: FloatArray  # (k,), how much higher the water stood for each
-    axes: FloatArray  # (k, 3), optical axes; zeros for images of nearly equal angles (fisheyes)
-    focal_px: FloatArray  # (k,)
-
-
-class Rule(NamedTuple):
-    """Which rays count, and how they are refracted."""
-
-    least_cosine2: float  # squared cosine of the largest incidence angle
-    ratio: float  # 1 / n
-
-
-def rig_of(survey: Survey) -> Rig:
-    """Return the cameras for kernels."""
-    cameras = survey.cameras
-    axes, focal = np.zeros((len(cameras), 3)), np.full(len(cameras), NOMINAL_FOCAL_PX)
-    if cameras.lenses is not None and cameras.rotations is not None:
-        flat = np.array([lens.projection == "perspective" for lens in cameras.lenses])
-        axes[flat] = cameras.rotations[flat, 2]
-        focal = np.array([lens.focal_px for lens in cameras.lenses])
-    return Rig(np.ascontiguousarray(cameras.centres), survey.offset_m, axes, focal)
-
-
-def rule_of(survey: Survey) -> Rule:
-    """Return the rule for kernels."""
+def least_cosine2_of(survey: Survey) -> float:
+    """Return the squared cosine of the largest incidence angle of a ray."""
     limit = survey.limit_deg
     if limit is None and survey.cameras.lenses is None:
         limit = MAX_ANGLE_WITHOUT_FRAMES_DEG
-    least = 0.0 if limit is None else float(np.cos(np.radians(limit)) ** 2)
-    return Rule(least, 1.0 / survey.settings.refractive_index)
-
-
-def has_varying_slopes(survey: Survey) -> bool:
-    """Whether the rays of a point may pierce the water under different slopes."""
-    return isinstance(survey.water, WaterMesh | WaterRaster) or survey.own_water is not None
+    return 0.0 if limit is None else float(np.cos(np.radians(limit)) ** 2)
 
 
 def shapes_of(survey: Survey) -> tuple[Tin | None, Field | None]:
@@ -99,23 +62,22 @@ def chosen_views(batch: Batch, shift_m: FloatArray | None = None) -> Views:
     survey, views = batch.survey, batch.views
     if not len(survey.cameras):
         return Views(np.zeros(len(batch) + 1, np.int64), np.zeros(0, np.int64))
-    points, rig = (tiling.spatial_order(batch.xyz), batch.chosen()), rig_of(survey)
+    order, points = tiling.spatial_order(batch.xyz), batch.chosen()
     frames = frames_of(survey.cameras) if views is None else listed_frames_of(survey.cameras)
     wide = frames if shift_m is None else frames_of(narrower(survey.cameras, -REACH))
     shift = np.zeros((0, 3)) if shift_m is None else shift_m
     tiles = tiling.tiles_of(batch)
     first, count = np.zeros(tiles + 1, np.int64), np.zeros(len(batch) + 1, np.int64)
     if views is None:
-        in_tiles(_make_room, tiles, points, rig, wide, first)
+        in_tiles(_make_room, tiles, order, points, wide, first)
         begin = np.empty(len(batch), np.int64)
         place = np.empty(np.cumsum(first, out=first)[-1], np.int32)
     else:
         begin = np.asarray(views.start[:-1], np.int64).copy()
         place = np.empty(len(views.camera), np.int32)
-    found = first, begin, count, place
     in_tiles(
-        _choose_all, tiles, points, rig, frames, wide, shift, rule_of(survey), *shapes_of(survey),
-        found,
+        _choose_all, tiles, order, points, frames, wide, shift, least_cosine2_of(survey),
+        *shapes_of(survey), (first, begin, count, place),
     )  # fmt: skip
     start = np.cumsum(count)
     # tiles left gaps between the entries of their points
@@ -130,9 +92,8 @@ def views_in_frame(xyz: FloatArray, cameras: Cameras) -> Views:
     """Return the cameras whose frame holds each point, shape (m, 3), above the water or below."""
     xyz = np.ascontiguousarray(xyz)
     at_themselves = SurfaceAbove(xyz[:, 2].copy(), np.zeros((len(xyz), 2)))
-    return chosen_views(
-        Batch(xyz, at_themselves, Survey(WaterPlane(0.0), cameras, ScienceOptions()))
-    )
+    survey = Survey(WaterPlane(0.0), cameras, ScienceOptions())
+    return chosen_views(Batch(xyz, at_themselves, survey))
 
 
 def near_borders(batch: Batch, shift_m: FloatArray) -> IntArray:
@@ -144,30 +105,29 @@ def near_borders(batch: Batch, shift_m: FloatArray) -> IntArray:
     frames = (frames_of(narrower(survey.cameras, share)) for share in (0.0, -REACH, REACH))
     in_tiles(
         _find_near_borders, tiling.tiles_of(batch), tiling.spatial_order(batch.xyz), batch.chosen(),
-        rig_of(survey), *frames, shift_m, found, points=len(batch),
+        *frames, shift_m, found, points=len(batch),
     )  # fmt: skip
     return np.flatnonzero(found)
 
 
 @kernel(allocates=True)
 def _make_room(
-    span: Span, given: tuple[IntArray, Chosen], rig: Rig, frames: Frames, first: IntArray
+    span: Span, order: IntArray, points: Chosen, frames: Frames, first: IntArray
 ) -> None:
     """Set how many entries each tile may get at most, one place on."""
-    order, points = given
+    centres = points.rig.centres
     low, high = tiling.corners_of(order[span[0] * TILE : span[1] * TILE], points.xyz)
-    every = np.arange(len(rig.centres))
-    around = tiling.near_cameras(every, frames, rig.centres, low, high)
+    around = tiling.near_cameras(np.arange(len(centres)), frames, centres, low, high)
     for t in range(*span):
         rows = order[t * TILE : (t + 1) * TILE]
         low, high = tiling.corners_of(rows, points.xyz)
-        first[t + 1] = rows.size * tiling.near_cameras(around, frames, rig.centres, low, high).size
+        first[t + 1] = rows.size * tiling.near_cameras(around, frames, centres, low, high).size
 
 
 @kernel(allocates=True)
 def _choose_all(
-    span: Span, given: tuple[IntArray, Chosen], rig: Rig, frames: Frames, wide: Frames,
-    shift: FloatArray, rule: Rule, tin: Tin | None, fields: Field | None,
+    span: Span, order: IntArray, points: Chosen, frames: Frames, wide: Frames, shift: FloatArray,
+    least_cosine2: float, tin: Tin | None, fields: Field | None,
     found: tuple[IntArray, IntArray, IntArray, npt.NDArray[np.int32]],
 ) -> None:  # fmt: skip
     """Choose the cameras of each point, a tile at a time.
@@ -177,8 +137,8 @@ def _choose_all(
     i + 1), and the entries. An entry is the number of a camera or, with view lists, that of one of
     their entries.
     """
-    (order, points), (first, begin, count, place) = given, found
-    start, camera = points.start, points.camera
+    first, begin, count, place = found
+    start, camera, rig = points.start, points.camera, points.rig
     low, high = tiling.corners_of(order[span[0] * TILE : span[1] * TILE], points.xyz)
     some = camera[:0] if start.size else np.arange(len(rig.centres))
     around = tiling.near_cameras(some, wide, rig.centres, low, high)
@@ -205,12 +165,14 @@ def _choose_all(
             i = rows[j]
             if start.size:  # the entries of a point stay where they are in the list
                 candidates = camera[start[i] : start[i + 1]]
-                selected = _choose(candidates, None, tile, j, rig, frames, rule, tin, fields)
+                selected = _choose(
+                    candidates, None, tile, j, rig, frames, least_cosine2, tin, fields
+                )
                 for k in range(selected.size):
                     place[begin[i] + k] = start[i] + selected[k]
             else:
                 begin[i] = free
-                selected = _choose(near, marks, tile, j, rig, frames, rule, tin, fields)
+                selected = _choose(near, marks, tile, j, rig, frames, least_cosine2, tin, fields)
                 for k in range(selected.size):
                     place[free + k] = near[selected[k]]
                 free += selected.size
@@ -219,10 +181,11 @@ def _choose_all(
 
 @kernel(allocates=True)
 def _find_near_borders(
-    span: Span, order: IntArray, points: Chosen, rig: Rig, frames: Frames, wide: Frames,
-    inner: Frames, shift: FloatArray, found: BoolArray,
+    span: Span, order: IntArray, points: Chosen, frames: Frames, wide: Frames, inner: Frames,
+    shift: FloatArray, found: BoolArray,
 ) -> None:  # fmt: skip
     """Set which points have an image in other frames than their apparent points."""
+    rig = points.rig
     low, high = tiling.corners_of(order[span[0] * TILE : span[1] * TILE], points.xyz)
     around = tiling.near_cameras(np.arange(len(rig.centres)), wide, rig.centres, low, high)
     for t in range(*span):
@@ -284,14 +247,14 @@ def _mark_images(
 @device(allocates=True)
 def _choose(
     candidates: IntArray, marks: FloatArray | None, tile: FloatArray, j: int, rig: Rig,
-    frames: Frames, rule: Rule, tin: Tin | None, fields: Field | None,
+    frames: Frames, least_cosine2: float, tin: Tin | None, fields: Field | None,
 ) -> npt.NDArray[np.int32]:  # fmt: skip
     """Return the candidates that give a ray to point j of the tile, by their places, in order.
 
     Their frames were tested before if there are marks. On a mesh or raster the incidence angle is
     that at the piercing point.
     """
-    chosen, is_limited = np.empty(candidates.size, np.int32), rule.least_cosine2 > 0.0
+    chosen, is_limited = np.empty(candidates.size, np.int32), least_cosine2 > 0.0
     (x, y, z), upward = three(tile, j), three(tile, 4 * TILE + j)
     k = 0
     for at in range(candidates.size):
@@ -306,7 +269,7 @@ def _choose(
         if h > 0.0 and is_limited and (tin is not None or fields is not None):
             _, normal = pierce(c, tin, fields, lowered, e, h, upward)
             height = max(dot(normal, e), 0.0)
-        if height * height >= rule.least_cosine2 * length2:
+        if height * height >= least_cosine2 * length2:
             chosen[k] = at
             k += 1
     return chosen[:k]

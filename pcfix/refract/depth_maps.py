@@ -208,7 +208,7 @@ def _invert_all(
     if listed and rays.weight is not None:
         weight = rays.weight.astype(np.float64)
     # a point of apparent depth h has its bed about (n - 1) h below itself
-    depth = np.maximum(batch.surface.height_m - z + points.offset.mean(), LEAST_DEPTH_M)
+    depth = np.maximum(batch.surface.height_m - z + points.rig.offset.mean(), LEAST_DEPTH_M)
     first, around = -LIKELY * (points.n - 1.0) * depth, np.full(len(batch), np.nan)
     if bed is not None and not listed and likely is None:
         around = bed.height_at(batch.xyz[:, :2]) - z
@@ -381,12 +381,12 @@ def _look_with_slopes(tile: MapTile, marks: FloatArray, given: MapInputs) -> Non
 def _trace_to_bed(shown: FloatArray, c: int, count: int, tile: MapTile, given: MapInputs) -> None:
     """Trace the ray on which image c shows each point through the water to Q on the bed."""
     points, images, room = given.points, given.images, tile.room
-    centre, original, n = row_of(points.centres, c), row_of(images.centres, c), points.n
+    centre, original, n = row_of(points.rig.centres, c), row_of(images.centres, c), points.n
     for j in range(count):
         normal, bed = three(tile.points, 4 * TILE + j), room[_BED * TILE + j]
         p = three(tile.points, j)
         up, ray = minus(centre, p), minus(original, three(tile.points, _ORIGINAL * TILE + j))
-        above = normal[2] * (tile.points[3 * TILE + j] - (p[2] - points.offset[c]))
+        above = normal[2] * (tile.points[3 * TILE + j] - (p[2] - points.rig.offset[c]))
         # the ray of the original image in the adjusted camera; it passes P at a
         d = in_other(images.original, images.adjusted, c, scaled(-1.0, ray))
         e = scaled(dot(up, d) / dot(d, d), d)
@@ -419,7 +419,7 @@ def _see_from(
     the original model.
     """
     points, images, matcher, room = given.points, given.images, given.matcher, tile.room
-    centre, offset, n = row_of(points.centres, c), points.offset[c], points.n
+    centre, offset, n = row_of(points.rig.centres, c), points.rig.offset[c], points.n
     for j in range(count):
         p, normal = three(tile.points, j), three(tile.points, 4 * TILE + j)
         up = minus(centre, p)
@@ -494,7 +494,7 @@ def _choose_maps(
     tile: MapTile, result: FloatArray, likely: FloatArray, maps: PointMaps, given: MapInputs
 ) -> None:
     """Set the weights of the maps of the group that made each point, or its likely beds."""
-    matcher, before = given.matcher, tile.camera[:0]
+    points, matcher, before = given.points, given.matcher, tile.camera[:0]
     for j in range(tile.rows.size):
         if not tile.going[j]:
             continue
@@ -503,8 +503,18 @@ def _choose_maps(
         # points with the same images share their groups
         if not are_same(images, before):
             find_members(maps, images, matcher, given.listed)
-        before, k = images, images.size
-        _gather_maps(maps, images, j, tile, given)
+        before, k, p = images, images.size, three(tile.points, _ORIGINAL * TILE + j)
+        # what the maps of the point show of its bed, and the weight of each by itself; those that
+        # are only averaged into the maps of a list have none
+        for q in range(k):
+            shown = tile.shown[tile.row[images[q]]]
+            maps.trial[q], maps.slope[q] = shown[_DEPTH * TILE + j], shown[_BY_HEIGHT * TILE + j]
+            maps.share[q] = 0.0
+        for at in range(points.start[i], points.start[i + 1]):
+            # the pixel on the ground grows with the distance
+            up = minus(row_of(given.images.centres, points.camera[at]), p)
+            share = given.weight[at] if given.weight.size else 1.0 / dot(up, up)
+            maps.share[maps.place[points.camera[at]]] += share
         find_rises(maps, k, given.listed)
         if len(likely):
             for seed in range(k):
@@ -513,33 +523,13 @@ def _choose_maps(
             continue
         seed = 0  # the only group of a list
         if matcher.is_nearest and not given.listed:
-            seed = _nearest_map(maps, images, three(tile.points, _ORIGINAL * TILE + j), given)
+            seed = _nearest_map(maps, images, p, given)
         elif not given.listed:
             wanted = given.around[i] - bed
             seed, result[i, _AMBIGUITY] = likely_seed(maps, k, wanted, matcher.width_m)
         set_weights(maps, seed, k, given.listed)
         for q in range(k):
             tile.weights[tile.row[images[q]], j] = maps.weight[q]
-
-
-@device(forceinline=True)
-def _gather_maps(
-    maps: PointMaps, images: IntArray, j: int, tile: MapTile, given: MapInputs
-) -> None:
-    """Set what the maps of point j show of its bed, and the weight of each by itself.
-
-    Maps that are only averaged into those of a list have no weight.
-    """
-    points, p, i = given.points, three(tile.points, _ORIGINAL * TILE + j), tile.rows[j]
-    for q in range(images.size):
-        shown = tile.shown[tile.row[images[q]]]
-        maps.trial[q], maps.slope[q] = shown[_DEPTH * TILE + j], shown[_BY_HEIGHT * TILE + j]
-        maps.share[q] = 0.0
-    for at in range(points.start[i], points.start[i + 1]):
-        # the pixel on the ground grows with the distance
-        up = minus(row_of(given.images.centres, points.camera[at]), p)
-        share = given.weight[at] if given.weight.size else 1.0 / dot(up, up)
-        maps.share[maps.place[points.camera[at]]] += share
 
 
 @device

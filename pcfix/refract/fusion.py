@@ -47,8 +47,7 @@ POINTS_A_CELL, MOST_CELLS = 12.0, 4_000_000
 WIDTH_GSD = 2.0  # standard deviation of the likely beds of a place: relief in a cell, and noise
 OUTLIER = 0.01  # likelihood of a point without a likely bed near it, relative to one with a bed
 BINS, DEVIATIONS = 2.0, 3  # bins per standard deviation of likely beds; deviations to both sides
-# A cell that is farther than this from the median of its neighbours, up to `REACH` cells to each
-# side, gets that median.
+# Largest distance of a cell from the median of its neighbours, and how many of these to each side.
 FAR_OFF_M, REACH = 0.4, 2
 
 
@@ -114,7 +113,15 @@ def bed_of(xy: FloatArray, likely_m: FloatArray, gsd_m: float) -> Bed:
     found, height = np.empty(len(filled)), np.full(rows * columns, np.nan)
     in_tiles(_most_likely, len(found), order, start, likely_m, WIDTH_GSD * gsd_m, found)
     height[filled] = found
-    grid = _without_outliers(height.reshape(rows, columns))
+    grid = height.reshape(rows, columns)
+    # Where only one group of images sees the bed, several heights are equally likely: a cell far
+    # from the median of its surroundings gets that.
+    row, column = np.nonzero(np.isfinite(grid))
+    padded = np.pad(grid, REACH, constant_values=np.nan)
+    down, right = np.mgrid[: 2 * REACH + 1, : 2 * REACH + 1].reshape(2, -1)
+    middle = np.nanmedian(padded[row[:, None] + down, column[:, None] + right], axis=1)
+    far = np.abs(grid[row, column] - middle) > FAR_OFF_M
+    grid[row[far], column[far]] = middle[far]
     return Bed(grid, float(low[0]), float(low[1]), cell)
 
 
@@ -128,20 +135,6 @@ def _cell_m(xy: FloatArray, low: FloatArray, high: FloatArray) -> float:
         filled = len(np.unique(at[:, 1] * (at[:, 0].max() + 1) + at[:, 0]))
         side = max(side * float(np.sqrt(POINTS_A_CELL * filled / len(xy))), least)
     return side
-
-
-def _without_outliers(height: FloatArray) -> FloatArray:
-    """Replace a cell far from the median of its surroundings by that median.
-
-    Where only one group of images sees the bed, several heights are equally likely.
-    """
-    row, column = np.nonzero(np.isfinite(height))
-    padded, smooth = np.pad(height, REACH, constant_values=np.nan), height.copy()
-    down, right = np.mgrid[: 2 * REACH + 1, : 2 * REACH + 1].reshape(2, -1)
-    middle = np.nanmedian(padded[row[:, None] + down, column[:, None] + right], axis=1)
-    far = np.abs(height[row, column] - middle) > FAR_OFF_M
-    smooth[row[far], column[far]] = middle[far]
-    return smooth
 
 
 @kernel(allocates=True)

@@ -37,7 +37,7 @@ from pcfix.refract.batch import (
     optics_of,
     warn_of_unsolved,
 )
-from pcfix.refract.choice import Rig, Rule, rig_of, rule_of, shapes_of
+from pcfix.refract.choice import least_cosine2_of, shapes_of
 from pcfix.refract.rays import line_terms, nearest_point, pierce, ray_distance, refracted
 from pcfix.refract.tiling import TILE, add_three, nine, put, spatial_order, three, tiles_of
 from pcfix.refract.tracks import FOUND, LOST, POINT_RUNS, RAY_RUNS, SEARCHED, STATE, Q, search_tile
@@ -52,9 +52,8 @@ class RayInputs(NamedTuple):
     """All points and cameras, which rays count, and the water if it is no plane, for kernels."""
 
     points: Chosen
-    rig: Rig
     frames: Frames
-    rule: Rule
+    least_cosine2: float  # of the incidence angle
     tin: Tin | None
     fields: Field | None
 
@@ -86,12 +85,12 @@ def consistent(batch: Batch) -> Intersection:
 def _intersected(batch: Batch, optics: Optics | None) -> Intersection:
     survey, views = batch.survey, batch.views
     result, used = np.zeros((len(batch), _WIDTH)), np.zeros(len(survey.cameras), np.bool_)
-    rule, frames = rule_of(survey), frames_of(survey.cameras)
+    least, frames = least_cosine2_of(survey), frames_of(survey.cameras)
     if views is not None:  # the rays are chosen
-        rule, frames = rule._replace(least_cosine2=0.0), no_frames(len(survey.cameras))
+        least, frames = 0.0, no_frames(len(survey.cameras))
     covariance = np.zeros((len(batch) if survey.settings.dimensions == "all" else 0, 6))
     errors = uncertainty.budget_of(survey), uncertainty.level_sigma_of(batch)
-    given = RayInputs(batch.chosen(), rig_of(survey), frames, rule, *shapes_of(survey))
+    given = RayInputs(batch.chosen(), frames, least, *shapes_of(survey))
     in_tiles(
         _intersect, tiles_of(batch), spatial_order(batch.xyz), given, optics, *errors,
         (result, used, covariance), points=len(batch),
@@ -117,8 +116,8 @@ def _intersect(
     level_sigma: FloatArray, found: tuple[FloatArray, BoolArray, FloatArray],
 ) -> None:  # fmt: skip
     """Intersect the rays of the points of each tile, of listed cameras or of those in frame."""
-    points, rig, frames = given.points, given.rig, given.frames
-    centres, start, camera = rig.centres, points.start, points.camera
+    points, frames, centres = given.points, given.frames, given.points.rig.centres
+    start, camera = points.start, points.camera
     result, used, covariance = found
     if optics is not None:  # of all cameras; the system provides what is used
         rays, search = np.empty((len(centres), RAY_RUNS * TILE)), np.empty(POINT_RUNS * TILE)
@@ -146,7 +145,7 @@ def _intersect(
                 search[STATE * TILE + j] = SEARCHED if row[_OUTCOME] == CORRECTED else LOST
                 put(search, Q * TILE + j, vector(row))
             search_tile(
-                search, rays, tile, marks[:seeing], near[:seeing], rig, optics, points.n,
+                search, rays, tile, marks[:seeing], near[:seeing], points, optics,
                 given.tin, given.fields,
             )  # fmt: skip
             for j in range(rows.size):
@@ -158,7 +157,7 @@ def _intersect(
                     row[_DISTANCE] = ray_distance(sums[9 * TILE + j], nine(sums, j), vector(row))
         if len(covariance):
             room = room_of(tile, result, rows)
-            uncertainty.add_errors(room, tile, marks[:seeing], near, rig, given.rule.ratio, budget)
+            uncertainty.add_errors(room, tile, marks[:seeing], near, points, budget)
             uncertainty.finish_tile(covariance, rows, room, tile, level_sigma, budget)
 
 
@@ -175,7 +174,7 @@ def _add_cameras(
 
     The cameras that give a ray, and their marks, are moved to the front; returns how many they are.
     """
-    rig, seeing = given.rig, 0
+    points, least, seeing = given.points, given.least_cosine2, 0
     for k in range(near.size):
         # the row of a camera that gives no ray is used again by the next one
         c, on, some = near[k], marks[seeing], True
@@ -183,8 +182,8 @@ def _add_cameras(
             for j in range(on.size):
                 on[j] = marks[k, j]
         else:
-            some = mark(on, tile, TILE, given.frames, c, rig.centres[c])
-        if some and add_camera(sums, tile, on, rig, c, given.rule, given.tin, given.fields):
+            some = mark(on, tile, TILE, given.frames, c, points.rig.centres[c])
+        if some and add_camera(sums, tile, on, points, c, least, given.tin, given.fields):
             near[seeing] = c
             seeing += 1
     return seeing
@@ -192,8 +191,8 @@ def _add_cameras(
 
 @device
 def add_camera(
-    sums: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, c: int, rule: Rule,
-    tin: Tin | None, fields: Field | None,
+    sums: FloatArray, tile: FloatArray, marks: FloatArray, points: Chosen, c: int,
+    least_cosine2: float, tin: Tin | None, fields: Field | None,
 ) -> int:  # fmt: skip
     """Add one camera's rays to the sums of a tile; return how many.
 
@@ -201,9 +200,8 @@ def add_camera(
     sums are those of `line_terms`, the number of rays, and the least squared cosine of the
     incidence angles.
     """
-    centre, offset = row_of(rig.centres, c), rig.offset[c]
-    least_cosine2, r = rule.least_cosine2, rule.ratio
-    rays = 0
+    centre, offset = row_of(points.rig.centres, c), points.rig.offset[c]
+    r, rays = 1.0 / points.n, 0
     for j in range(marks.size):
         x, y, z = three(tile, j)
         # from the point to the centre; N, H = N.e; h, the height of the water over P

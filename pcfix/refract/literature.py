@@ -39,10 +39,6 @@ _MEAN, _PAIRS, _S_MODEL = range(3)
 def factor(batch: Batch) -> Intersection:
     """Multiply the apparent depth by `depth_factor`, else by the refractive index; only Z moves.
 
-    Every point is corrected, as no ray is needed; see `_without_rays`.
-
-    Notes
-    -----
     n is the limit for cameras straight above, long in use for rivers (Westaway et al. 2001, Woodget
     et al. 2015). At the angle a in air the true depth is larger by (n^2 - 1) tan^2 a / (2 n^2) of
     it: 1.6 % at 15 degrees, 3.3 % at 21 degrees. The factor auto is that of `stereo_factor`.
@@ -55,18 +51,10 @@ def factor(batch: Batch) -> Intersection:
 
 
 def regression(batch: Batch) -> Intersection:
-    """Apply the fitted regression to the apparent depths; only Z moves.
+    """Apply the line fitted to check depths to the apparent depths; only Z moves.
 
-    Every point is corrected, as no ray is needed; see `_without_rays`. Raises SettingError if there
-    is no regression.
-
-    Notes
-    -----
-    Method III of Hsu & Wang ("the empirical relation between the true depth and apparent depth
-    from a limited depth measurement"), option 1 of Mulsow (2024): a line fitted to check depths.
-    With a negative intercept very shallow points would lie above the water; they go to its surface.
-    The slope that they print, 0.9895, is for negative values from an origin at 190 mm; here depths
-    count from the water.
+    Method III of Hsu & Wang, option 1 of Mulsow (2024). With a negative intercept very shallow
+    points would lie above the water; they go to its surface. Raises SettingError without a line.
     """
     line = batch.survey.learned.regression
     if line is None:
@@ -109,12 +97,13 @@ def _solve(
     failed: BoolArray,
 ) -> None:  # fmt: skip
     """Fill in the shift of each point, or that it has none, and its distance from the rays."""
+    centres, offset = points.rig.centres, points.rig.offset
     for i in range(*span):
         cameras = points.camera[points.start[i] : points.start[i + 1]]
         k = cameras.size
-        e = points.centres[cameras] - points.xyz[i]
+        e = centres[cameras] - points.xyz[i]
         # the depth under the water of each camera; 0 above it
-        d = np.maximum(points.height[i] - points.xyz[i, 2] + points.offset[cameras], 0.0)
+        d = np.maximum(points.height[i] - points.xyz[i, 2] + offset[cameras], 0.0)
         rays = _crossings(e, d, np.hypot(e[:, 0], e[:, 1]) / e[:, 2], points.n)
         # how far the true point is aside of the apparent one, and below it
         x, y, down_m, solved = 0.0, 0.0, 0.0, True
@@ -127,7 +116,14 @@ def _solve(
         failed[i] = not solved
         if solved:
             shift[i] = x, y, -down_m
-        distance[i] = _distance(rays, shift[i])
+        # root mean square distance of the true point from the refracted rays: how far aside of each
+        # it is at its own depth, without the part of that along the ray
+        below, u, v, _ = rays
+        aside_x = shift[i, 0] + u * (shift[i, 2] + below)
+        aside_y = shift[i, 1] + v * (shift[i, 2] + below)
+        along = aside_x * u + aside_y * v
+        squares = aside_x * aside_x + aside_y * aside_y - along * along / (1.0 + u * u + v * v)
+        distance[i] = np.sqrt(np.maximum(squares, 0.0).sum() / max(k, 1))
 
 
 @device(allocates=True)
@@ -137,26 +133,12 @@ def _crossings(e: FloatArray, depth: FloatArray, tangent: FloatArray, n: float) 
     return depth * (s - 1.0), -e[:, 0] / (e[:, 2] * s), -e[:, 1] / (e[:, 2] * s), s
 
 
-@device(allocates=True)
-def _distance(rays: Crossings, shift: FloatArray) -> float:
-    """Return the root mean square distance of the true point from refracted rays, metres."""
-    below, u, v, _ = rays
-    # how far aside of the rays the point is at its own depth
-    x, y = shift[0] + u * (shift[2] + below), shift[1] + v * (shift[2] + below)
-    # the part of the offset along a ray does not count
-    along = x * u + y * v
-    squares = np.maximum(x * x + y * y - along * along / (1.0 + u * u + v * v), 0.0)
-    return np.sqrt(squares.sum() / max(below.size, 1))
-
-
 def butler(batch: Batch) -> Intersection:
     """Multiply the apparent depth by tan r / tan i, in the mean over the images; only Z moves.
 
     Points with one ray are corrected too. The rays of a point cross its plumb line at different
     depths; `ray_miss_m` is their distance from the mean.
 
-    Notes
-    -----
     Method I of Hsu & Wang, eq 1: with r the angle from the vertical of the line from the apparent
     point to the projection centre,
 
@@ -184,8 +166,6 @@ def murase(batch: Batch) -> Intersection:
 
     Points whose pairs have almost no parallax are not corrected.
 
-    Notes
-    -----
     Method II of Hsu & Wang, eqs 2 to 4: with X along the base of a pair, r and i the angles of a
     ray from the vertical in air and water, and D the distance of a camera in plan,
 
@@ -239,8 +219,6 @@ def shan(batch: Batch) -> Intersection:
     Points whose refracted rays are nearer to parallel than a tenth of a degree, or for which the
     iteration finds no depth under the water, are not corrected.
 
-    Notes
-    -----
     Shan (1994), "Relief reconstruction using two-media photogrammetry", as Skarlatos & Agrafiotis
     (2018, JMSE 6(3), 77, section 2.1.1, eqs 1-7) give it; their eq 2 lacks the root that eqs 1 and
     7 have. The image of the true point (X, Y) at the depth D is that of a point seen through air on
@@ -330,8 +308,6 @@ def stereo_factor(cameras: Cameras, level_m: float, n: float) -> StereoFactor:
 
     Raises GeometryError if fewer than two images look down, or neighbours do not overlap.
 
-    Notes
-    -----
     Mulsow (2024), "Methods for geometric modelling of refraction in photo-bathymetry", names a
     "correction factor calculated from camera setup (flying height, focal length, base length)" as
     the second practical approach, without a formula. This is how it is worked out here.

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pcfix.model import FloatArray, IntArray, Outcome, WaterPlane
+from pcfix.model import FloatArray, IntArray, Outcome, WaterMesh, WaterPlane, WaterRaster
 from pcfix.refract.batch import Batch, Intersection, Survey
-from pcfix.refract.choice import chosen_views, has_varying_slopes, near_borders
+from pcfix.refract.choice import chosen_views, near_borders
 from pcfix.refract.patches import gsd_m
 from pcfix.refract.tiling import spatial_order
 from pcfix.refract.uncertainty import with_uncertainty
@@ -80,9 +80,11 @@ def _corrected(batch: Batch) -> Intersection:
     def solved(part: Batch) -> Intersection:
         return with_uncertainty(method(part), part)
 
-    learned, chooses = batch.survey.learned, name in (METHODS["snell"], METHODS["consistent"])
+    survey, learned = batch.survey, batch.survey.learned
     takes_all = batch.views is None and learned.occluder is None and learned.matcher is None
-    if chooses and takes_all and not has_varying_slopes(batch.survey):
+    # the rays of a point pierce the water under different slopes
+    is_wavy = isinstance(survey.water, WaterMesh | WaterRaster) or survey.own_water is not None
+    if name in (METHODS["snell"], METHODS["consistent"]) and takes_all and not is_wavy:
         # the kernel chooses among all cameras
         found = solved(batch)
     else:
@@ -188,12 +190,9 @@ def joined(parts: list[Intersection], order: IntArray) -> Intersection:
     """Join the results of batches, in the original order of the points."""
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
-
-    def back(name: str) -> Any:
-        if getattr(parts[0], name) is None:
-            return None
-        return np.concatenate([getattr(part, name) for part in parts]).take(place, axis=0)
-
-    per_point = [name for name in Intersection._fields if name != "camera_used"]
-    used = np.any([part.camera_used for part in parts], axis=0)
-    return Intersection(**{name: back(name) for name in per_point}, camera_used=used)
+    used, known = np.any([part.camera_used for part in parts], axis=0), dict[str, Any]()
+    for name, value in parts[0]._asdict().items():
+        if value is not None and name != "camera_used":
+            known[name] = np.concatenate([getattr(part, name) for part in parts])
+            known[name] = known[name].take(place, axis=0)
+    return parts[0]._replace(**known, camera_used=used)

@@ -78,10 +78,9 @@ def visible_cameras(
     cameras saw it, and the grid is too coarse to show how.
     """
     stays = ~occluded(xyz, centres, views, occluder)
-    owner = np.repeat(np.arange(len(xyz)), np.diff(views.start))
-    left = np.bincount(owner[stays], minlength=len(xyz))
-    stays |= (left < 2)[owner]
-    start = np.concatenate([[0], np.cumsum(np.bincount(owner[stays], minlength=len(xyz)))])
+    left = np.diff(np.concatenate([[0], np.cumsum(stays)])[views.start])
+    stays |= np.repeat(left < 2, np.diff(views.start))
+    start = np.concatenate([[0], np.cumsum(stays)])[views.start]
     weight = None if views.weight is None else views.weight[stays]
     return Views(start, views.camera[stays], weight, views.kind)
 

@@ -30,7 +30,7 @@ candidates gains nothing by fitting noise.
 """
 
 import math
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -61,15 +61,15 @@ SQUARE_PATCHES, MOST_IN_SQUARES = 5.0, 1_000_000  # width of a square in patches
 _MIX = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0xD6E8FEB86659FD93)  # odd numbers of a hash
 _TERMS = 6  # coefficients of a quadratic surface
 
-# Groups of neighbours: the m rows of a batch that are in one, and their places among these rows,
-# shape (p, 32) or (p, 16), patch by patch.
-Patches: TypeAlias = tuple[IntArray, IntArray]
 
-
-def patches_of(batch: Batch, *, at_borders: bool, most: int = PATCHES) -> Patches | None:
+def patches_of(
+    batch: Batch, *, at_borders: bool, most: int = PATCHES
+) -> tuple[IntArray, IntArray] | None:
     """Return patches of neighbours; None where there are too few points, or too sparse ones.
 
-    With `at_borders` those of dense clouds lie where the nearest image changes.
+    Returns the m rows of the batch that are in a patch, and the places of the points of each patch
+    among these, shape (p, 32) or (p, 16). With `at_borders` the patches of dense clouds lie where
+    the nearest image changes.
     """
     from scipy.spatial import cKDTree
 

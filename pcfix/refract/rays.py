@@ -35,10 +35,8 @@ the only root from the left and needs no bracket. Nothing is divided by \|s\|: s
 camera is no special case. The light of a point above the plane goes straight, k = 1 / (H + D); the
 two agree at D = 0.
 
-On a mesh or raster the plane is the tangent plane where the light leaves the water, found by
-iteration.
-
-The plane is N.x = h.
+On a mesh or raster the plane N.x = h is the tangent plane where the light leaves the water, found
+by iteration.
 """
 
 from typing import TypeAlias

@@ -62,7 +62,6 @@ from pcfix.refract.batch import (
     in_other,
     warn_of_unsolved,
 )
-from pcfix.refract.choice import Rig, Rule, rig_of, rule_of
 from pcfix.refract.intersect import add_camera
 from pcfix.refract.rays import MIN_DETERMINANT, light_near, nearest_point, ray_distance
 from pcfix.refract.tiling import TILE, nine, put, slots, three
@@ -89,8 +88,6 @@ class PairInputs(NamedTuple):
 
     points: Chosen
     images: Images
-    rig: Rig
-    rule: Rule
     search: FloatArray  # (m, `_WIDTH`)
     derivative: FloatArray  # (m, 3, 3), B: of Q by the median
     partners: IntArray  # (k, ...), the partners of each image, each pair once
@@ -134,12 +131,9 @@ def invert_pairs(batch: Batch) -> Intersection:
     partner, partners = matcher.matched[image, at], matcher.matched.copy()
     again = (matcher.matched[partner] == image[:, None]).any(axis=1) & (partner < image)
     partners[image[again], at[again]] = -1
-    images, rule = images_of(batch.original_model, survey.cameras), rule_of(survey)
+    images = images_of(batch.original_model, survey.cameras)
     search, derivative = np.zeros((len(batch), _WIDTH)), np.zeros((len(batch), 3, 3))
-    given = PairInputs(
-        batch.chosen(), images, rig_of(survey), rule._replace(least_cosine2=0.0), search,
-        derivative, partners,
-    )  # fmt: skip
+    given = PairInputs(batch.chosen(), images, search, derivative, partners)
     used, rows = np.zeros(len(batch.rays.camera), np.bool_), tiling.spatial_order(batch.xyz)
     for steps in range(0, MAX_STEPS, STEPS):
         in_tiles(
@@ -160,7 +154,7 @@ def invert_pairs(batch: Batch) -> Intersection:
 @kernel(allocates=True)
 def _search(span: Span, order: IntArray, given: PairInputs, first: bool, used: BoolArray) -> None:
     """Search the points of some tiles, the first time from `snell`'s solution, by a few steps."""
-    points, k = given.points, len(given.rig.centres)
+    points, k = given.points, len(given.points.rig.centres)
     ray = np.empty(k, np.int64)
     for t in range(*span):
         rows, runs = order[t * TILE : (t + 1) * TILE], np.empty(10 * TILE)
@@ -178,7 +172,7 @@ def _search(span: Span, order: IntArray, given: PairInputs, first: bool, used: B
             np.empty((len(pairs), 3 * TILE)), np.empty(own.shape[2]),
         )  # fmt: skip
         for q in range(near.size):
-            add_camera(tile.sums, runs, marks[q], given.rig, near[q], given.rule, None, None)
+            add_camera(tile.sums, runs, marks[q], points, near[q], 0.0, None, None)
         if first:
             _start(tile, given, used)
         for _ in range(STEPS):
@@ -239,11 +233,11 @@ def _is_wide(a: int, b: int, j: int, tile: FloatArray, points: Chosen) -> bool:
     The limit is that of `pcfix.refract.rays.nearest_point` for two rays.
     """
     p, normal = three(tile, j), three(tile, 4 * TILE + j)
-    e_a, e_b = minus(row_of(points.centres, a), p), minus(row_of(points.centres, b), p)
+    e_a, e_b = minus(row_of(points.rig.centres, a), p), minus(row_of(points.rig.centres, b), p)
     # sin^2 of the angle between the rays against that of parallel ones
     across, depth = cross(e_a, e_b), tile[3 * TILE + j] - p[2]
-    above = dot(normal, e_a) > max(normal[2] * (depth + points.offset[a]), 0.0)
-    above = above and dot(normal, e_b) > max(normal[2] * (depth + points.offset[b]), 0.0)
+    above = dot(normal, e_a) > max(normal[2] * (depth + points.rig.offset[a]), 0.0)
+    above = above and dot(normal, e_b) > max(normal[2] * (depth + points.rig.offset[b]), 0.0)
     return above and dot(across, across) >= 4.0 * MIN_DETERMINANT * dot(e_a, e_a) * dot(e_b, e_b)
 
 
@@ -310,8 +304,12 @@ def _see(ray: FloatArray, c: int, tile: PairTile, given: PairInputs, plain: Plai
     perspective image, from the centre in other projections.
     """
     points, images, runs = given.points, given.images, tile.points
-    centre, original, optics = row_of(points.centres, c), row_of(images.centres, c), images.original
-    r, lens, offset = optics.rotations[c], optics.lenses[optics.row[c]], points.offset[c]
+    centre, original, optics = (
+        row_of(points.rig.centres, c),
+        row_of(images.centres, c),
+        images.original,
+    )
+    r, lens, offset = optics.rotations[c], optics.lenses[optics.row[c]], points.rig.offset[c]
     axis = row_of(r, 2)
     is_flat = lens[KIND] == PERSPECTIVE
     for j in range(tile.rows.size):

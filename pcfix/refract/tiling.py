@@ -74,10 +74,7 @@ def gather_three(runs: FloatArray, rows: IntArray, values: FloatArray) -> None:
 
 
 def slots(*widths: int) -> tuple[int, ...]:
-    """Return the first slot of quantities with these numbers of values, and the total.
-
-    Runs of `TILE` numbers in one array: the compiler sees that they cannot overlap.
-    """
+    """Return the first slot of quantities with these numbers of values, and the total."""
     return (0, *accumulate(widths))
 
 

@@ -32,8 +32,7 @@ from pcfix.lens.algebra import beyond, dot, minus, row_of, scaled
 from pcfix.lens.formulas import PLAIN
 from pcfix.lens.imaging import Plain, image_and_slopes, image_of, plain_image, plain_lens
 from pcfix.model import FloatArray, IntArray
-from pcfix.refract.batch import Optics
-from pcfix.refract.choice import Rig
+from pcfix.refract.batch import Chosen, Optics, Rig
 from pcfix.refract.rays import light_near, settle
 from pcfix.refract.tiling import TILE, add_three, inverse_of, nine, product_of, put, slots, three
 from pcfix.water.surface import Field, Tin, field_of
@@ -56,14 +55,14 @@ SEARCHED, FOUND, LOST = 0.0, 1.0, 2.0
 @device
 def search_tile(
     room: FloatArray, rays: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray,
-    rig: Rig, optics: Optics, n: float, tin: Tin | None, fields: Field | None,
+    points: Chosen, optics: Optics, tin: Tin | None, fields: Field | None,
 ) -> None:  # fmt: skip
     """Move Q from the start in `room` to where g is zero; its state shows success.
 
     `marks`, a row for each of the cameras `near`, say how often each ray counts. A point that is
     found, or lost, stays where it is, so that the others of its tile do not matter.
     """
-    count = marks.shape[1]
+    count, rig, n = marks.shape[1], points.rig, points.n
     for step in range(STEPS + MOST_STEPS):
         # under waves a search may alternate between two planes: it starts again where it is
         if step == 0 or step == STEPS:

@@ -67,7 +67,6 @@ from pcfix.model import FloatArray, IntArray, Outcome
 from pcfix.options.correct import LEVEL_M
 from pcfix.refract import tiling
 from pcfix.refract.batch import Batch, Chosen, Intersection, Survey
-from pcfix.refract.choice import Rig, rig_of
 from pcfix.refract.rays import MIN_DETERMINANT
 from pcfix.refract.tiling import TILE, add_three, inverse_of, nine, product_of, put, slots, three
 
@@ -108,8 +107,7 @@ def covariances(batch: Batch, shift_m: FloatArray) -> FloatArray:
         return result
     in_tiles(
         _of_lists, tiling.tiles_of(batch), tiling.spatial_order(batch.xyz), batch.chosen(),
-        np.ascontiguousarray(shift_m), rig_of(survey), budget_of(survey), level_sigma_of(batch),
-        result,
+        np.ascontiguousarray(shift_m), budget_of(survey), level_sigma_of(batch), result,
     )  # fmt: skip
     return result
 
@@ -221,7 +219,7 @@ def _add_six(sums: FloatArray, at: int, c: float, m: Symmetric) -> None:
 
 @device
 def _add_rays(
-    room: FloatArray, tile: FloatArray, marks: FloatArray, rig: Rig, k: int, ratio: float,
+    room: FloatArray, tile: FloatArray, marks: FloatArray, points: Chosen, k: int,
     budget: Budget | None,
 ) -> None:  # fmt: skip
     """Add one camera's rays to the sums of a tile's points, with a budget the noise of each ray.
@@ -231,6 +229,7 @@ def _add_rays(
     centre_m^2. A wave of slope tau at the piercing point moves the refracted ray at depth y by
     -y (1 - r H / kappa) (tau + r^2 / kappa^2 d (d.tau)), which adds S delta delta' S in images.
     """
+    rig, ratio = points.rig, 1.0 / points.n
     centre, axis, focal_px = row_of(rig.centres, k), row_of(rig.axes, k), rig.focal_px[k]
     offset = rig.offset[k]
     for j in range(marks.size):
@@ -284,23 +283,24 @@ def _add_rays(
 
 @kernel(allocates=True)
 def _of_lists(
-    span: Span, order: IntArray, points: Chosen, shift: FloatArray, rig: Rig, budget: Budget,
+    span: Span, order: IntArray, points: Chosen, shift: FloatArray, budget: Budget,
     level_sigma: FloatArray, result: FloatArray,
 ) -> None:  # fmt: skip
     """Compute the covariances of points with view lists, a tile at a time."""
+    cameras = len(points.rig.centres)
     for t in range(*span):
         rows = order[t * TILE : (t + 1) * TILE]
         tile = np.empty(7 * TILE)
         tiling.gather(tile, rows, points)
         room = room_of(tile, shift, rows)
-        named, marks = tiling.marks_of_lists(points.start, points.camera, rows, len(rig.centres))
-        add_errors(room, tile, marks, named, rig, 1.0 / points.n, budget)
+        named, marks = tiling.marks_of_lists(points.start, points.camera, rows, cameras)
+        add_errors(room, tile, marks, named, points, budget)
         finish_tile(result, rows, room, tile, level_sigma, budget)
 
 
 @device
 def add_errors(
-    room: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray, rig: Rig, ratio: float,
+    room: FloatArray, tile: FloatArray, marks: FloatArray, near: IntArray, points: Chosen,
     budget: Budget,
 ) -> None:  # fmt: skip
     """Add the rays of cameras to the points of a tile.
@@ -310,9 +310,9 @@ def add_errors(
     for k in range(len(marks)):
         # numba compiles a version of `_add_rays` for each kind of argument
         if budget.by_ray:
-            _add_rays(room, tile, marks[k], rig, near[k], ratio, budget)
+            _add_rays(room, tile, marks[k], points, near[k], budget)
         else:
-            _add_rays(room, tile, marks[k], rig, near[k], ratio, None)
+            _add_rays(room, tile, marks[k], points, near[k], None)
 
 
 @device(allocates=True)
