@@ -54,7 +54,9 @@ def regression(batch: Batch) -> Intersection:
     """Apply the line fitted to check depths to the apparent depths; only Z moves.
 
     Method III of Hsu & Wang, option 1 of Mulsow (2024). With a negative intercept very shallow
-    points would lie above the water; they go to its surface. Raises SettingError without a line.
+    points would lie above the water; they go to its surface. The slope that Hsu & Wang print,
+    0.9895, is for negative values from an origin at 190 mm; here depths count from the water.
+    Raises SettingError without a line.
     """
     line = batch.survey.learned.regression
     if line is None:
