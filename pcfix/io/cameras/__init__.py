@@ -143,19 +143,9 @@ def read_cameras(
 
 
 def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
-    """Read the tie points of a sparse model, in the frame of the file.
+    """Read the tie points of the file or folder that `cameras` was read from, in its frame.
 
-    Parameters
-    ----------
-    path : path
-        The file or folder that `cameras` was read from.
-    cameras : Cameras
-        As `read_cameras` gave them.
-
-    Returns
-    -------
-    TiePoints
-        Without observations that are not finite; such a position is unknown (NaN).
+    Observations that are not finite are skipped; such a position is unknown (NaN).
     """
     source, form = _recognised(path, None, None)
     if not hasattr(reader_of(form), "tie_points"):

@@ -252,14 +252,8 @@ WRITTEN = {k: model for k, model in BY_NAME.items() if k not in ("SIMPLE_FISHEYE
 def write_colmap(folder: File, cameras: Cameras, tie_points: TiePoints | None = None) -> None:
     """Write a block as a binary COLMAP model, positions minus the middle of the block.
 
-    Parameters
-    ----------
-    folder : path
-        Created if it does not exist.
-    cameras : Cameras
-        With rotations and lenses in pixels.
-    tie_points : TiePoints, optional
-        In the frame of the cameras; those without a position or without a view are skipped.
+    The folder need not exist. The tie points are in the frame of the cameras; those without a
+    position or without a view are skipped.
     """
     target = Path(folder)
     turns, lenses = checks.block_to_write(target, cameras)

@@ -17,7 +17,6 @@ import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io import crs as systems
-from pcfix.io.cameras.checks import note
 from pcfix.model import Cameras, FloatArray
 
 if TYPE_CHECKING:
@@ -142,22 +141,15 @@ def georeference(
 ) -> Georeference:
     """Return the transformation to the cloud's CRS, for cameras, tie points and others.
 
-    Parameters
-    ----------
-    cameras : Cameras
-        As a reader gave them, in the frame of their file.
-    cloud_crs : str, CRS or None
-        Projected, in metres. If it is None, the target is the CRS in which the software delivers
-        clouds, mostly that of the cameras.
-    cameras_crs : str, optional
-        Overrides the CRS in the file. ``local``: the numbers do not change. A CRS without heights
-        states that these agree with the cloud's, and so does ``ENU:lat,lon,height``. For a
-        file with geocentric positions it is the CRS in which its software delivers clouds, unless
-        it is geocentric itself.
-    offset_m : tuple of 3 float, optional
-        Added to the centres first, in the axes and the unit of the cameras' frame.
-    name : str
-        Of the file, for messages.
+    The cameras are in the frame of their file, whose name is for messages. The cloud's CRS is
+    projected, in metres. If it is None, the target is the CRS in which the software delivers
+    clouds, mostly that of the cameras. `offset_m` is added to the centres first, in the axes and
+    the unit of the cameras' frame.
+
+    `cameras_crs` overrides the CRS in the file. ``local``: the numbers do not change. A CRS without
+    heights states that these agree with the cloud's, and so does ``ENU:lat,lon,height``. For a file
+    with geocentric positions it is the CRS in which its software delivers clouds, unless it is
+    geocentric itself.
     """
     offset = np.zeros(3) if offset_m is None else np.array(offset_m, np.float64)
     cloud = None if cloud_crs is None else systems.parse_crs(cloud_crs, "the cloud")
@@ -194,7 +186,7 @@ def georeference(
         cloud = frame.crs if is_map or project is None else project
         words = systems.shortened(crs) if frame.topocentric else cloud.name
         sentence = f"the cloud names no CRS; that of the cameras is assumed ({words})."
-        notes.append(note(name, "cloud.crs_assumed", sentence))
+        notes.append(PcfixWarning("cloud.crs_assumed", f"{name}: {sentence}", path=name))
         if is_map:
             return Georeference(name, offset, stated, tuple(notes))
     systems.check_projected_metres(cloud, "the cloud")
@@ -222,7 +214,8 @@ def georeference(
         frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
     )
     notes += [PcfixWarning("crs.transformation", str(one), path=name) for one in of_step]
-    notes += [note(name, "cameras.heights_assumed", assumed)] if assumed else []
+    if assumed:
+        notes.append(PcfixWarning("cameras.heights_assumed", f"{name}: {assumed}", path=name))
     into, found = systems.crs_text(target), tuple(notes)
     if forward is systems.unchanged:
         return Georeference(name, offset, into, found)

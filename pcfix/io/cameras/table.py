@@ -294,15 +294,11 @@ def sensor_file(source: Source) -> Path | None:
 
 
 def read_sensor(path: Path) -> Lens:
-    """Read the lens of all images.
+    """Read the lens of all images: a calibration of Metashape (XML), or a table of one row.
 
-    Parameters
-    ----------
-    path : Path
-        A calibration of Metashape (XML), or a table of one row. Its columns are focal, sensor_x,
-        sensor_y in mm, with the principal point in the centre; or focal_px, width_px, height_px
-        and, if known, OpenCV's cx, cy (pixels from the upper left corner of the image),
-        k1 ... k6, p1, p2.
+    Its columns are focal, sensor_x, sensor_y in mm, with the principal point in the centre; or
+    focal_px, width_px, height_px and, if known, OpenCV's cx, cy (pixels from the upper left corner
+    of the image), k1 ... k6, p1, p2.
     """
     if Source(path).text.lstrip().startswith("<"):
         from pcfix.io.cameras.metashape import read_calibration
@@ -327,15 +323,7 @@ def read_sensor(path: Path) -> Lens:
 
 
 def write_table(folder: File, cameras: Cameras) -> None:
-    """Write ``cameras.csv`` and ``sensor.csv``.
-
-    Parameters
-    ----------
-    folder : path
-        Created if it does not exist.
-    cameras : Cameras
-        With rotations and lenses.
-    """
+    """Write ``cameras.csv`` and ``sensor.csv`` into a folder, which need not exist."""
     target = Path(folder)
     turns, lenses = checks.block_to_write(target, cameras)
     if cameras.crs is not None and is_topocentric(cameras.crs):
