@@ -25,8 +25,6 @@ from pcfix.model import FloatArray
 if TYPE_CHECKING:
     from pyproj import CRS
 
-Heights = Literal["ellipsoidal", "gravity", "unstated"]
-
 METRES = ("metre", "meter")
 
 
@@ -72,7 +70,7 @@ def parts(crs: "CRS") -> "tuple[CRS, CRS | None]":
     return (crs if crs.is_geocentric else crs.to_2d()), None
 
 
-def heights_of(crs: "CRS") -> Heights:
+def heights_of(crs: "CRS") -> Literal["ellipsoidal", "gravity", "unstated"]:
     """Return whether z is above the ellipsoid, above a vertical datum, or not stated."""
     if parts(crs)[1] is not None:
         return "gravity"
@@ -238,16 +236,13 @@ def unchanged(xyz: FloatArray) -> FloatArray:
     return xyz
 
 
-Notes = tuple[PcfixWarning, ...]
-
-
 class HeightsError(InputError):
     """Heights of two systems that cannot be transformed into each other."""
 
 
 def transformation(
     source: "CRS", target: "CRS", at: FloatArray, name: str, *, heights: bool, instead: str = ""
-) -> tuple[Move, Notes]:
+) -> tuple[Move, tuple[PcfixWarning, ...]]:
     """Return PROJ's best transformation that is not a ballpark where that matters, and notes.
 
     It is `unchanged` if points have the same numbers in both CRS. With `heights` it transforms
@@ -298,7 +293,7 @@ def transformation(
         sentence = f"{name}: heights cannot be transformed {names}. {why}{remedy}"
         raise HeightsError("crs.heights", sentence, grids=grids)
     step = next((one for one in real if np.isfinite(one.transform(*at.T)).all()), real[0])
-    notes: Notes = ()
+    notes: tuple[PcfixWarning, ...] = ()
     if "ballpark geographic" in step.description.lower():
         if grids:
             sentence = f"cannot be transformed {names}. {why}."

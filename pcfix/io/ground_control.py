@@ -76,20 +76,11 @@ ODM = ("x", "y", "z", "u", "v", "label", "point")  # fields of ODM's list, the l
 def read_ground_control(path: File, cameras: Cameras, *, crs: str | None = None) -> GroundControl:
     """Read surveyed points and their marks in images, in the CRS of the cameras.
 
-    Stated standard deviations along x and y are used without the rotation between the two CRS;
-    missing ones are `SIGMA_M` and `SIGMA_PX`. Warns of marks in images without a pose, which are
-    skipped, and of an assumed CRS.
-
-    Parameters
-    ----------
-    path : path
-        A table with the columns name, x, y, z, image, u, v, OpenDroneMap's ``gcp_list.txt``, or
-        Metashape's markers (XML, .psx, .psz); see the top of this file. Images may be named with or
-        without folder and extension.
-    cameras : Cameras
-        In the cloud's CRS, with lenses in pixels.
-    crs : str, optional
-        Of the points, instead of that in the file; ``local`` uses the numbers unchanged.
+    The file is one of those at the top of this module; images may be named with or without folder
+    and extension. The cameras have lenses in pixels. `crs` replaces that of the points in the file;
+    ``local`` uses the numbers unchanged. Stated standard deviations along x and y are used without
+    the rotation between the two CRS; missing ones are `SIGMA_M` and `SIGMA_PX`. Warns of marks in
+    images without a pose, which are skipped, and of an assumed CRS.
     """
     table = _read(check_input(path))
     names, roles, wet = table.column("point"), _words(table, "role"), _words(table, "under_water")
@@ -238,27 +229,23 @@ def _read(path: Path) -> Table:
     rows = [(i, fields) for i, fields in numbered[1:] if not fields[0].startswith("#")]
     first = [number(field) for field in rows[0][1][:5]] if rows else []
     if len(first) == 5 and not np.isnan([*first[:2], *first[3:]]).any():  # z may be NaN
-        return _odm_table(path, rows)
+        # ODM's list; points without a name are named by their coordinates
+        named: dict[tuple[float, ...], str] = {}
+        texts = []
+        for i, fields in rows:
+            if len(fields) < len(ODM) - 1:
+                sentence = f"line {i} has {len(fields)} fields. Give x, y, z, u, v, image."
+                raise bad_file(path, "gcps.fields", sentence, line=i)
+            name = named.setdefault(tuple(map(number, fields[:3])), f"GCP {len(named) + 1}")
+            texts.append([*fields, name][: len(ODM)])
+        place = {role: i for i, role in enumerate(ODM)}
+        return Table(path, [*ODM], texts, [i for i, _ in rows], place, crs=named_crs(path))
     if has_header(lines):
         kinds = [("point", *three, "label", "u", "v") for three in AXES]
         return read_table(path, *kinds, spellings=SPELLINGS)
     sentence = "is neither a table of marks nor OpenDroneMap's gcp_list.txt. Line 1 must name"
     sentence += " the columns name, x, y, z, image, u, v, or be a CRS."
     raise bad_file(path, "gcps.format", sentence)
-
-
-def _odm_table(path: Path, rows: list[tuple[int, list[str]]]) -> Table:
-    """Return ODM's list; points without a name are named by their coordinates."""
-    places: dict[tuple[float, ...], str] = {}
-    texts = []
-    for i, fields in rows:
-        if len(fields) < len(ODM) - 1:
-            sentence = f"line {i} has {len(fields)} fields. Give x, y, z, u, v, image."
-            raise bad_file(path, "gcps.fields", sentence, line=i)
-        name = places.setdefault(tuple(map(number, fields[:3])), f"GCP {len(places) + 1}")
-        texts.append([*fields, name][: len(ODM)])
-    place, lines = {role: i for i, role in enumerate(ODM)}, [i for i, _ in rows]
-    return Table(path, [*ODM], texts, lines, place, crs=named_crs(path))
 
 
 def _metashape_table(path: Path) -> Table:
@@ -376,18 +363,12 @@ def read_gnss(path: File, cameras: Cameras, *, crs: str | None = None) -> Camera
 
 
 def gnss_in_frame_of(cameras: Cameras, name: str = "cameras") -> tuple[GnssPositions, str]:
-    """Return the GNSS positions of the file `name` in the frame of the cameras.
+    """Return the GNSS positions of the file `name` in the frame of the cameras, without a CRS.
 
-    The cameras are in a projected CRS in metres, or in the frame of their `gnss`. Positions are NaN
-    for cameras without one, and heights that cannot be compared. Standard deviations east and north
-    are used along x and y, without the meridian convergence.
-
-    Returns
-    -------
-    positions : GnssPositions
-        Without a CRS of their own.
-    reason : str
-        Why heights or all positions are missing; empty if they are not.
+    Return also why heights or all positions are missing, empty if they are not. The cameras are in
+    a projected CRS in metres, or in the frame of their `gnss`. Positions are NaN for cameras
+    without one, and heights that cannot be compared. Standard deviations east and north are used
+    along x and y, without the meridian convergence.
     """
     unknown = np.full((len(cameras), 3), np.nan)
     nothing = GnssPositions(unknown, unknown, None)

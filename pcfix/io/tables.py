@@ -274,14 +274,8 @@ def match_labels(
 ) -> tuple[IntArray, tuple[str, ...]]:
     """Find each name among labels: the complete name, else without its folder or its extension.
 
-    With `one_to_one` no two names may have the same label.
-
-    Returns
-    -------
-    row : array, shape (names,)
-        Of the labels; -1 where there is none or it could be several.
-    ambiguous : tuple of str
-        Names that could be several labels, or share one with another name.
+    Return the row of each in the labels, -1 where there is none or it could be several; and the
+    names that could be several labels or, with `one_to_one`, share one with another name.
     """
     keys: tuple[Callable[[str], str], ...] = str, _file_name, _stem
     row = np.full(len(names), -1, np.int64)

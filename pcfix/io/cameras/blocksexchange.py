@@ -104,7 +104,16 @@ def _photos(path: Path, root: Element) -> tuple[list[Photo], tuple[str, ...]]:
                     continue
                 key, where = (i, text_of(element, "Id")), f"image {label}"
                 centre = _numbers(path, where, pose, CENTRE)
-                turn = _rotation(path, label, pose, axes)
+                turn: FloatArray | None = None  # world to x right, y down, z forward
+                if pose.find(MATRIX[0]) is not None:
+                    turn = axes @ _numbers(path, where, pose, MATRIX).reshape(3, 3)
+                elif pose.find(ANGLES[0]) is not None:
+                    angles = _numbers(path, where, pose, ANGLES).reshape(3, 1)
+                    turn = axes @ from_photogrammetric(from_omega_phi_kappa(*angles))[0]
+                elif pose.find("Rotation/Pitch") is not None:
+                    what = f"the rotation of {label} by yaw (or heading), pitch and roll"
+                    remedy = "Export rotations as matrices"
+                    raise checks.unsupported(path, what, remedy, image=label)
                 metadata, gps, prior = pose.find("Metadata"), element.find("ExifData/GPS"), None
                 if metadata is not None and metadata.find("Center") is not None:
                     place = _numbers(path, f"{where}, Metadata", metadata, CENTRE)
@@ -124,20 +133,6 @@ def _photos(path: Path, root: Element) -> tuple[list[Photo], tuple[str, ...]]:
     chosen = {photo.key for photo in photos}
     unposed += [photo.label for photo in listed if photo.key not in chosen]
     return photos, tuple(unposed)
-
-
-def _rotation(path: Path, label: str, pose: Element, axes: FloatArray) -> FloatArray | None:
-    """Return world to x right, y down, z forward; None if there is no rotation."""
-    where = f"image {label}"
-    if pose.find(MATRIX[0]) is not None:
-        return axes @ _numbers(path, where, pose, MATRIX).reshape(3, 3)
-    if pose.find(ANGLES[0]) is not None:
-        angles = _numbers(path, where, pose, ANGLES).reshape(3, 1)
-        return np.asarray(axes @ from_photogrammetric(from_omega_phi_kappa(*angles))[0])
-    if pose.find("Rotation/Pitch") is not None:
-        what = f"the rotation of {label} by yaw (or heading), pitch and roll"
-        raise checks.unsupported(path, what, "Export rotations as matrices", image=label)
-    return None
 
 
 def _crs_of(path: Path, root: Element, srs_id: str) -> str:

@@ -101,14 +101,10 @@ def unsupported(path: Path, what: str, remedy: str, **values: Any) -> InputError
     return bad_file(path, "cameras.unsupported", f"{what} is not supported. {remedy}.", **values)
 
 
-def note(path: object, code: str, sentence: str, **values: Any) -> PcfixWarning:
-    """Return a warning about a camera file."""
-    return PcfixWarning(code, f"{path}: {sentence}", path=path, **values)
-
-
 def warn(path: object, code: str, sentence: str, **values: Any) -> None:
     """Warn about a camera file; `pcfix.read_cameras` also returns the warning in `notes`."""
-    warnings.warn(note(path, code, sentence, **values), stacklevel=3)
+    note = PcfixWarning(code, f"{path}: {sentence}", path=path, **values)
+    warnings.warn(note, stacklevel=3)
 
 
 def warn_several(path: Path, count: int, images: int) -> None:

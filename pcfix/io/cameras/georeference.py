@@ -17,7 +17,6 @@ import numpy as np
 
 from pcfix.errors import PcfixWarning, bad_file
 from pcfix.io import crs as systems
-from pcfix.io.cameras.checks import note
 from pcfix.model import Cameras, FloatArray
 
 if TYPE_CHECKING:
@@ -187,7 +186,7 @@ def georeference(
         cloud = frame.crs if is_map or project is None else project
         words = systems.shortened(crs) if frame.topocentric else cloud.name
         sentence = f"the cloud names no CRS; that of the cameras is assumed ({words})."
-        notes.append(note(name, "cloud.crs_assumed", sentence))
+        notes.append(PcfixWarning("cloud.crs_assumed", f"{name}: {sentence}", path=name))
         if is_map:
             return Georeference(name, offset, stated, tuple(notes))
     systems.check_projected_metres(cloud, "the cloud")
@@ -215,7 +214,8 @@ def georeference(
         frame.crs, target, frame.enter(at), name, heights=heights, instead=instead
     )
     notes += [PcfixWarning("crs.transformation", str(one), path=name) for one in of_step]
-    notes += [note(name, "cameras.heights_assumed", assumed)] if assumed else []
+    if assumed:
+        notes.append(PcfixWarning("cameras.heights_assumed", f"{name}: {assumed}", path=name))
     into, found = systems.crs_text(target), tuple(notes)
     if forward is systems.unchanged:
         return Georeference(name, offset, into, found)

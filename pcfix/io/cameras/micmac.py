@@ -60,7 +60,19 @@ def _orientation(path: Path) -> tuple[FloatArray, FloatArray, Lens]:
         axes = [numbers(path, tag, root.findtext(f".//RotMatrix/{tag}"), 3) for tag in tags]
         centre = numbers(path, "Center", root.findtext(".//Center"), 3)
         where = path.with_name(f"{PurePosixPath(named).name}{SUFFIX}")
-        return centre, np.array(axes), _calibration_2(where, read_xml(where))
+        inside = read_xml(where)
+        projection = text_of(inside, ".//Projection")
+        if projection != "Stenope":
+            raise _not_held(where, f"projection {projection}")
+        focal = number(where, "F", inside.findtext(".//PerfectProj/F"))
+        principal = numbers(where, "PP", inside.findtext(".//PerfectProj/PP"), 2)
+        size = numbers(where, "NbPix", inside.findtext(".//PixelFrame/NbPix"), 2)
+        terms = [term for part in inside.iterfind(".//Distorsion/*") for term in part]
+        given = {str(term.tag).lower(): number(where, str(term.tag), term.text) for term in terms}
+        if others := sorted(k for k, v in given.items() if v and k not in NAMES):
+            raise _not_held(where, f"terms {', '.join(others)}")
+        frame = np.array([size, principal, principal])
+        return centre, np.array(axes), _lens(where, focal, frame, given)
     conic = _first(path, root, "OrientationConique")
     projection = text_of(conic, "TypeProj") or "eProjStenope"
     outer = _first(path, conic, "Externe")
@@ -137,22 +149,6 @@ def _lens(
     middle = ((cx - x) / focal, (cy - y) / focal)
     more: dict[str, Any] = {"distortion_centre": middle, "inverse": inverse, "sensor": path.stem}
     return checks.lens_by_name(values, width, height, **more)
-
-
-def _calibration_2(path: Path, root: Element) -> Lens:
-    """Return the lens of a calibration of MMVII."""
-    projection = text_of(root, ".//Projection")
-    if projection != "Stenope":
-        raise _not_held(path, f"projection {projection}")
-    focal = number(path, "F", root.findtext(".//PerfectProj/F"))
-    principal = numbers(path, "PP", root.findtext(".//PerfectProj/PP"), 2)
-    size = numbers(path, "NbPix", root.findtext(".//PixelFrame/NbPix"), 2)
-    terms = [term for part in root.iterfind(".//Distorsion/*") for term in part]
-    given = {str(term.tag).lower(): number(path, str(term.tag), term.text) for term in terms}
-    others = sorted(k for k, v in given.items() if v and k not in NAMES)
-    if others:
-        raise _not_held(path, f"terms {', '.join(others)}")
-    return _lens(path, focal, np.array([size, principal, principal]), given)
 
 
 def _not_held(path: Path, what: str) -> InputError:

@@ -96,7 +96,16 @@ def read(source: Source) -> Cameras:
             centres, rotations = (each[rows][posed] for each in (centres, rotations))
     else:
         labels, rotations = names, turns
-        centres = np.array([image.centre for image in images]).reshape(-1, 3) + _offset(files)
+        centres = np.array([image.centre for image in images]).reshape(-1, 3)
+        if (where := files.get("offset")) is None:
+            sentence = "there is no offset.xyz next to it. Give the offset by --cameras-offset."
+            checks.warn(files["parameters"], "cameras.no_offset", sentence)
+        else:  # the file repeats the offset for each group of images
+            lines = [line.replace(",", " ").split() for line in read_lines(where)]
+            offsets = {" ".join(words[-3:]) for words in lines if words}
+            if len(offsets) != 1:
+                raise damaged(where, "it should have one offset x y z")
+            centres = centres + numbers(where, "the offset", offsets.pop(), 3)
     every = dict.fromkeys([*names, *labels])
     labels = [names[i] for i in posed] or labels
     unposed = tuple(name for name in every if name not in set(labels))
@@ -139,19 +148,6 @@ def _tables_in(root: Path) -> list[tuple[Path, str]]:
         for file in sorted(root.glob(f"{inside}*.txt"))
         if (found := TABLE.fullmatch(file.name)) and not found[2]
     ]
-
-
-def _offset(files: dict[str, Path]) -> FloatArray:
-    """Return the offset of the camera parameters; a file repeats it for each group of images."""
-    if (path := files.get("offset")) is None:
-        sentence = "there is no offset.xyz next to it. Give the offset by --cameras-offset."
-        checks.warn(files["parameters"], "cameras.no_offset", sentence)
-        return np.zeros(3)
-    lines = [line.replace(",", " ").split() for line in read_lines(path)]
-    offsets = {" ".join(words[-3:]) for words in lines if words}
-    if len(offsets) != 1:
-        raise damaged(path, "it should have one offset x y z")
-    return numbers(path, "the offset", offsets.pop(), 3)
 
 
 # ---- tables ----
