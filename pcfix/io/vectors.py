@@ -60,9 +60,10 @@ def is_vector_file(path: File) -> bool:
 def read_vectors(path: File, *, crs: str | None = None) -> Vectors:
     """Read one layer of a vector file, in its own CRS; `crs` replaces the one that it states.
 
-    A table has the columns x, y and perhaps z, or easting, northing, height, or longitude,
-    latitude, height. If a file has several layers, one follows its path, as QGIS writes it:
-    ``river.gpkg|layername=shore``. The CRS ``local`` is the cloud's.
+    The file is a GeoPackage, Shapefile, GeoJSON, KML, GPX or a table (``.csv``, ``.txt``) with the
+    columns x, y and perhaps z, or easting, northing, height, or longitude, latitude, height. If it
+    has several layers, one follows its path, as QGIS writes it: ``river.gpkg|layername=shore``. The
+    CRS ``local`` is the cloud's.
     """
     file, _, layer = str(path).partition(LAYER_MARK)
     source = check_input(file)

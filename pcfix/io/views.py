@@ -90,8 +90,10 @@ class ViewList:
 def read_views(path: File, cameras: Cameras, *, to_cloud: Move | None = None) -> ViewList:
     """Read the view list of a dense cloud, for cameras in the cloud's frame.
 
-    For COLMAP the ``fused.ply`` will do if the list is next to it. `to_cloud` takes positions,
-    shape (n, 3), from the list's frame to the cloud's; None if they are the same.
+    It is COLMAP's ``fused.ply.vis``, or the ``fused.ply`` next to it, or the dense PLY of OpenMVS.
+    Images are counted as in a sparse model next to the list, or as the cameras are, whichever the
+    geometry confirms. `to_cloud` takes positions, shape (n, 3), from the list's frame to the
+    cloud's; None if they are the same.
     """
     found = check_input(path)
     with found.open("rb") as stream:
