@@ -16,10 +16,9 @@ import numpy as np
 
 from pcfix.adjust.diagnosis import EXPORT, MOST_STATED_M, Diagnosis, diagnosed, neighbours_sign
 from pcfix.adjust.transfer import CloudTransfer
-from pcfix.errors import InputError, PcfixError, PcfixWarning, bad_file
+from pcfix.errors import InputError, PcfixError, PcfixWarning
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.surfaces import CloudView, Points
-from pcfix.io.files import find_members
 from pcfix.io.ground_control import gnss_in_frame_of, read_ground_control
 from pcfix.model import (
     NOISE_CLASSES,
@@ -187,23 +186,6 @@ def flags_of(given: OptionSet) -> list[str]:
 # Points that are sampled from the cloud, and points under water that are corrected with each
 # member; a thousand is enough, as the errors are smooth.
 SAMPLE_POINTS, BED_POINTS = 20_000, 1000
-
-
-def members_of(path: File | Cameras, cameras: Cameras) -> "Members | None":
-    """Return the members of the adjustment in the folder of its cameras, if there are any.
-
-    Raises InputError if they are damaged, or of other cameras.
-    """
-    found = None if isinstance(path, Cameras) else find_members(path)
-    if found is None:
-        return None
-    where, members = found
-    aligned = members.aligned(cameras)
-    if aligned is None:
-        sentence = "belongs to other cameras, so SigmaZ does not include errors of the poses. Use"
-        sentence += " the cameras that the adjustment wrote, or remove the file."
-        raise bad_file(where, "cameras.poses", sentence)
-    return aligned
 
 
 def pose_errors(
