@@ -273,8 +273,7 @@ def mask_of(path: File | None, cloud_crs: "str | CRS | None") -> WaterMask | Non
 
 def labelling_of(options: Any, view: CloudView) -> Labelling:
     """Return the rules by which points count as submerged, with the mask in the cloud's CRS."""
-    mask = mask_of(options.water_mask, view.crs)
-    return Labelling(options.part(LandRules), mask)
+    return Labelling(options.part(LandRules), mask_of(options.water_mask, view.crs))
 
 
 def paths_in(options: OptionSet, but: tuple[str, ...] = ()) -> list[Path]:

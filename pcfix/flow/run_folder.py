@@ -192,8 +192,7 @@ class RunFolder:
         """The water surface: as recorded in the corrected cloud, else as requested."""
         cloud = self.cloud("corrected")
         with silently(), open_cloud(cloud) as source:
-            stated = own_water(source)
-            return stated or self.options.part(Inputs).surface(view_of(cloud)).surface
+            return own_water(source) or self.options.part(Inputs).surface(view_of(cloud)).surface
 
 
 # The rasters

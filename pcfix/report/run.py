@@ -27,13 +27,11 @@ from pcfix.report.page import (
     new_figure,
     relief,
 )
-from pcfix.report.text import Summary, formal_words, summary_rows
+from pcfix.report.text import Plain, Summary, formal_words, summary_rows
 from pcfix.version import __version__
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Plain = dict[str, Any]
 
 
 class RunMaps(NamedTuple):
