@@ -186,6 +186,7 @@ def flags_of(given: OptionSet) -> list[str]:
 # Points that are sampled from the cloud, and points under water that are corrected with each
 # member; a thousand is enough, as the errors are smooth.
 SAMPLE_POINTS, BED_POINTS = 20_000, 1000
+POINTS_A_CELL, FEWEST = 12, 4  # of the bed, on average, and at least
 
 
 def pose_errors(
@@ -197,6 +198,9 @@ def pose_errors(
     the adjustment of the survey's cameras, in their order, and `transfer` has the original cameras,
     if those of the survey were adjusted since.
     """
+    from scipy.ndimage import distance_transform_edt
+    from scipy.stats import binned_statistic_2d
+
     if transfer is None:
         cameras = survey.cameras
         transfer = CloudTransfer(cameras, cameras, np.arange(len(cameras)))
@@ -207,21 +211,11 @@ def pose_errors(
     rows = rows[:: 1 + len(rows) // BED_POINTS]
     variance_m2 = variances(sample.take(rows), survey, members, transfer)
     known = np.isfinite(variance_m2)
-    return pose_errors_of(step.xyz[rows[known], :2], variance_m2[known]) if known.any() else None
-
-
-POINTS_A_CELL, FEWEST = 12, 4
-
-
-def pose_errors_of(xy: FloatArray, variance_m2: FloatArray) -> PoseErrors:
-    """Return the errors over a bed from variances at n places of it, shapes (n, 2) and (n,).
-
-    A cell has the median of its points: a few of them jump, as a camera comes into their reach or
-    leaves it. One of too few points has that of the nearest which has enough.
-    """
-    from scipy.ndimage import distance_transform_edt
-    from scipy.stats import binned_statistic_2d
-
+    if not known.any():
+        return None
+    # Over the bed, a cell has the median of its points: a few of them jump, as a camera comes into
+    # their reach or leaves it. One of too few points has that of the nearest which has enough.
+    xy, variance_m2 = step.xyz[rows[known], :2], variance_m2[known]
     low = xy.min(axis=0)
     size = np.maximum(np.ptp(xy, axis=0), 1e-3)
     cell_m = float(np.sqrt(size.prod() * POINTS_A_CELL / len(xy)))
