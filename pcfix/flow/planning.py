@@ -8,9 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from pcfix.adjust.transfer import renumbered
 from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError, bad_file, coded
 from pcfix.flow.correction import Plan, batch_of, transferred
-from pcfix.flow.inputs import CameraInputs, Inputs, labelling_of, original_ties, read_blocks
+from pcfix.flow.inputs import CameraInputs, Inputs, both_models, labelling_of, read_blocks
 from pcfix.flow.poses import SAMPLE_POINTS, pose_errors, with_poses
 from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
 from pcfix.io.files import find_members
@@ -246,7 +247,12 @@ def _estimated_from_cloud(plan: Plan) -> Plan:
         survey = replace(survey, learned=survey.learned._replace(occluder=occluder))
     if sample is None:
         return replace(plan, survey=survey)
-    ties = original_ties(plan.inputs, plan.transfer, view.crs)
+    if plan.transfer is None:
+        ties = plan.inputs.tie_points(view.crs)
+    elif (ties := both_models(plan.inputs)[0].tie_points(view.crs)) is not None:
+        # of the original model, numbered as the cameras of the transfer
+        views, entry = renumbered(ties.views, plan.transfer.row)
+        ties = replace(ties, views=views, image_xy=ties.image_xy[entry])
     sample, factor = learning.with_factor(replace(sample, survey=survey))
     notes = [*plan.notes, *coded("cloud.depth_factor", [] if factor is None else [factor])]
     hint = hint_of(plan.options.software or view.software)

@@ -155,7 +155,7 @@ def lay_out(chosen: SceneSettings) -> "Site":
     terrain = Terrain.random(chosen.bed, extent, chosen.water_plane(extent), chosen.depth_m, rng)
     true, true_angles = fly_block(extent, chosen, rng)
     given, given_angles = true, true_angles
-    if not chosen.position_noise_m == chosen.attitude_noise_deg == 0.0:
+    if chosen.position_noise_m or chosen.attitude_noise_deg:
         # noise on every coordinate, and on yaw, pitch and roll
         shape = true_angles.shape
         given_angles = true_angles + of_poses.normal(0.0, chosen.attitude_noise_deg, shape)
