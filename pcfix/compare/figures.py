@@ -95,6 +95,14 @@ def figures_of(
         if reference.sparse:
             after = pairs.after
             residuals = np.column_stack([after.xy, after.reference_m, after.error_m])
+    m3c2 = None
+    if rules.m3c2:  # along normals as far as 1.5 times nearly all of the differences
+        if pairs is None:
+            far = nearest_distance(*match.facing(match.cloud.xyz))
+        else:
+            far = mapped(np.abs, (pairs.before or pairs.after).error_m)
+        reach = max(1.0, 1.5 * float(np.percentile(far, 99)))
+        m3c2 = both(lambda xyz: m3c2_distances(xyz, reference.xyz, reach), match.cloud)
     also = []
     for name, other in others.items():
         to, back = (pair and pair.after for pair in c2c_of(other))
@@ -124,7 +132,7 @@ def figures_of(
         # if water is known: vertical errors of submerged places (bed), of the others (land), and by
         # depth; depth against reference depth; and the uncertainty of all submerged places (tvu)
         **by_depth,
-        m3c2=_m3c2(match, pairs) if rules.m3c2 else None,
+        m3c2=m3c2,
         sections=_sections(match, lines, others),
         settings=rules,
         notes=notes,
@@ -236,16 +244,6 @@ def _by_depth(match: Match, pairs: Figures, notes: list[PcfixWarning]) -> dict[s
     if not wet.all():
         figures["land"] = both(lambda p: statistics_of(subset(~wet, p.error_m)), pairs)
     return figures
-
-
-def _m3c2(match: Match, pairs: Figures | None) -> Figures:
-    """Return M3C2 distances, along normals as far as 1.5 times nearly all of the differences."""
-    if pairs is None:
-        far = nearest_distance(*match.facing(match.cloud.xyz))
-    else:
-        far = mapped(np.abs, (pairs.before or pairs.after).error_m)
-    reach = max(1.0, 1.5 * float(np.percentile(far, 99)))
-    return both(lambda xyz: m3c2_distances(xyz, match.reference.xyz, reach), match.cloud)
 
 
 def _sections(
@@ -361,9 +359,8 @@ def lines_downslope(xyz: FloatArray, count: int) -> tuple[SectionLine, ...]:
     left = np.array([-down[1], down[0]])
     place = mapped(lambda p: (p[:, :2] - origin[:2]) @ np.column_stack([down, left]), xyz)
     (_, right), (_, top) = bounds(place)
-    edges = np.linspace(right, top, count + 1)
     lines = []
-    for low, high in pairwise(edges):
+    for low, high in pairwise(np.linspace(right, top, count + 1)):
         left_of = place[:, 1]
         share = subset((left_of >= low) & (left_of <= high), place)
         (start, _), (stop, _) = bounds(share) if len(share) else np.zeros((2, 2))

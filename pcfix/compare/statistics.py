@@ -115,8 +115,7 @@ def binned(
     for number, first, last in zip(numbers.tolist(), start, start[1:], strict=False):
         found = [statistics_of(one[first:last]) for one in errors]
         ends = {"from_m": number * width_m, "to_m": (number + 1) * width_m}
-        before = None if before_m is None else found[1]
-        bins.append(Figures(**ends, after=found[0], before=before))
+        bins.append(Figures(**ends, after=found[0], before=None if before_m is None else found[1]))
     return bins
 
 

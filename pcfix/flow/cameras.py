@@ -34,13 +34,8 @@ def check_cameras(
 ) -> "CamerasReport":
     """Inspect a camera file: contents, fit to a cloud, absorbed refraction; ``pcfix cameras``.
 
-    Parameters
-    ----------
-    path : path
-        See `pcfix.read_cameras`.
-    options
-        See `pcfix.correct_file`. With a cloud and water it is tested whether the poses have
-        absorbed refraction, see `pcfix.adjust.diagnosis`.
+    With a cloud and water it is tested whether the poses have absorbed refraction, see
+    `pcfix.adjust.diagnosis`.
     """
     given = taken(CamerasCheckOptions, options, keywords, "check_cameras")
     cloud = given.cloud

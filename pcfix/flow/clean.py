@@ -58,7 +58,10 @@ def clean_file(
         last = lambda done, total: progress(((_PASSES - 1) * total + done) // _PASSES, total)  # noqa: E731
     return run_command(
         "clean", input, output, given, plan=partial(_plan_file, given, progress), work=_cleaning,
-        finish=_finish, reads=[given.water], progress=last,
+        finish=lambda plan, task, count: Figures(
+            input=str(task.source), output=str(task.target), **plan.found, seconds=task.seconds
+        ),
+        reads=[given.water], progress=last,
     )  # fmt: skip
 
 
@@ -152,20 +155,10 @@ def _plan_file(options: CleanOptions, progress: Progress | None, task: FileTask)
     return CleanPlan(noise, options.drop, found)
 
 
-def _finish(plan: CleanPlan, task: FileTask, count: int) -> Figures:
-    """Return the summary of a cloud."""
-    files = {"input": str(task.source), "output": str(task.target)}
-    return Figures(**files, **plan.found, seconds=task.seconds)
-
-
 def _cleaning(plan: CleanPlan, source: LasSource) -> FileWork:
     """Return the cleaning of one file: its header with a record of it, and each chunk."""
     content = {name: plan.found[name] for name in ("pcfix", "settings", "water", "reasons")}
     header = output_header(source, "cleaning", {**content, "drop": plan.drop})
-
-    def compute(points: Chunk, row: int) -> tuple[BoolArray, int]:
-        """Return which points of a chunk are noise, and their number."""
-        return plan.noise[row : row + len(points)], len(points)
 
     def apply(points: Chunk, noise: BoolArray) -> Chunk:
         """Flag or drop the noise."""
@@ -176,4 +169,6 @@ def _cleaning(plan: CleanPlan, source: LasSource) -> FileWork:
         new["withheld"][:] = np.asarray(new["withheld"]) | noise
         return new
 
-    return FileWork(header, compute, apply)
+    return FileWork(
+        header, lambda points, row: (plan.noise[row : row + len(points)], len(points)), apply
+    )

@@ -49,7 +49,6 @@ def compare_clouds(
         Or its attributes as keywords: the options of ``pcfix compare``. `section` takes texts
         ``x1,y1,x2,y2`` or `pcfix.compare.figures.SectionLine`, `share` texts or pairs, `also`
         texts, pairs or a dict of paths by name.
-
     """
     started = time.perf_counter()
     given = taken(CompareOptions, options, keywords, "compare_clouds")
@@ -61,8 +60,7 @@ def compare_clouds(
     if given.out_dir is not None:  # refuse what cannot be written before anything is computed
         folder = Path(given.out_dir)
         if folder.is_dir():
-            ours = [*folder.glob("section_*.csv"), folder / "compare.json", folder / DEPTHS]
-            for path in ours:
+            for path in (*folder.glob("section_*.csv"), folder / "compare.json", folder / DEPTHS):
                 check_output(path, overwrite=given.overwrite, inputs=inputs)
         elif folder.exists():
             sentence = f"{folder} is a file. Give a folder."
@@ -113,8 +111,8 @@ def _write(result: Comparison, given: CompareOptions) -> None:
             from pcfix.report.comparison import c2c_figure  # matplotlib is slow to import
             from pcfix.report.page import png_of
 
-            plot = png_of(c2c_figure(result.as_dict()))
-            write_bytes(given.plot, plot, overwrite=given.overwrite)
+            picture = c2c_figure(result.as_dict())
+            write_bytes(given.plot, png_of(picture), overwrite=given.overwrite)
         write_summary(given, result.as_dict())
     if folder is not None:
         for path in folder.glob("section_*.csv"):

@@ -163,9 +163,8 @@ def _write_rasters(
     # numbers of cells: with points, filled, with a height; the heights before filling, their sum
     sums, low, high, done = np.zeros(5), np.inf, -np.inf, 0
     with ExitStack() as files:
-        bands: dict[str, str] = {rules.what: METRE}
         system = crs if rules.what == "height" else plan
-        dsm = files.enter_context(new(paths["dsm"], crs=system, bands=bands))
+        dsm = files.enter_context(new(paths["dsm"], crs=system, bands={rules.what: METRE}))
         if "counts" in paths:
             bands = {"count": "", "spread": METRE}
             counts = files.enter_context(new(paths["counts"], crs=plan, bands=bands))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pcfix.adjust.transfer import CloudTransfer, renumbered, transfer_of
+from pcfix.adjust.transfer import CloudTransfer, transfer_of
 from pcfix.errors import GeometryError, InputError, NoTiePointsError, PcfixWarning, SettingError
 from pcfix.flow.surfaces import CloudView, find_surface
 from pcfix.io.cameras import read_cameras, read_tie_points, takes_sensor
@@ -227,19 +227,6 @@ def _for_some(both: list[Inputs], which: Iterable[bool], *names: str) -> list[In
     return [one if it else replace(one, **nothing) for one, it in zip(both, which, strict=True)]
 
 
-def original_ties(
-    inputs: Inputs, transfer: CloudTransfer | None, cloud_crs: "str | CRS | None"
-) -> TiePoints | None:
-    """Return the tie points of the original model, numbered as the cameras of a transfer."""
-    if transfer is None:
-        return inputs.tie_points(cloud_crs)
-    ties = both_models(inputs)[0].tie_points(cloud_crs)
-    if ties is None:
-        return None
-    views, entry = renumbered(ties.views, transfer.row)
-    return replace(ties, views=views, image_xy=ties.image_xy[entry])
-
-
 def _rows(original: tuple[str, ...], adjusted: tuple[str, ...]) -> IntArray:
     """Return the row in the original labels of each adjusted one."""
     if original == adjusted:  # in the same order, even repeated names are unambiguous
@@ -273,8 +260,7 @@ def mask_of(path: File | None, cloud_crs: "str | CRS | None") -> WaterMask | Non
 
 def labelling_of(options: Any, view: CloudView) -> Labelling:
     """Return the rules by which points count as submerged, with the mask in the cloud's CRS."""
-    mask = mask_of(options.water_mask, view.crs)
-    return Labelling(options.part(LandRules), mask)
+    return Labelling(options.part(LandRules), mask_of(options.water_mask, view.crs))
 
 
 def paths_in(options: OptionSet, but: tuple[str, ...] = ()) -> list[Path]:

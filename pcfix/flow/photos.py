@@ -374,8 +374,7 @@ def _reconstruct(
                 grey = (grey >> 8).astype(np.uint8)
             return Picture(np.ascontiguousarray(grey), blank=blank_in(pixels))
 
-        side = 2.0 * block.gsd_m
-        xyz = stereo_cloud(block.photos, block.scene.ground, side, picture, progress)
+        xyz = stereo_cloud(block.photos, block.scene.ground, 2.0 * block.gsd_m, picture, progress)
         write_points(cloud, xyz, (block.crs, 0.001))
         return
     cloud.unlink(missing_ok=True)

@@ -8,11 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError, coded
+from pcfix.adjust.transfer import renumbered
+from pcfix.errors import GeometryError, InputError, PcfixWarning, SettingError, bad_file, coded
 from pcfix.flow.correction import Plan, batch_of, transferred
-from pcfix.flow.inputs import CameraInputs, Inputs, labelling_of, original_ties, read_blocks
-from pcfix.flow.poses import SAMPLE_POINTS, members_of, pose_errors, with_poses
+from pcfix.flow.inputs import CameraInputs, Inputs, both_models, labelling_of, read_blocks
+from pcfix.flow.poses import SAMPLE_POINTS, pose_errors, with_poses
 from pcfix.flow.surfaces import CloudView, Points, own_water_of, parts_of, sample_of
+from pcfix.io.files import find_members
 from pcfix.io.las.source import CHUNK_POINTS
 from pcfix.io.tables import read_check_depths
 from pcfix.model import NOISE_CLASSES, Cameras, WaterPlane
@@ -154,8 +156,6 @@ def fit_check_depths(path: File, parts: Iterable[Part]) -> DepthRegression:
     The parts are the entire apparent cloud, each point with the water above it; they are read once,
     in bounded memory. Points of noise (classes 7 and 18) do not count.
 
-    Notes
-    -----
     The apparent depth at a check depth is the median of the nearest submerged points, 3 to 16,
     within four times the distance between neighbouring points there. Check depths with fewer are
     excluded, with a note.
@@ -203,14 +203,23 @@ def fit_check_depths(path: File, parts: Iterable[Part]) -> DepthRegression:
 
 
 def _with_pose_errors(plan: Plan) -> Plan:
-    """Return the plan with the errors of adjusted poses, if the adjustment left its members."""
+    """Return the plan with the errors of adjusted poses, if the adjustment left its members.
+
+    A note says if these are damaged, or of other cameras.
+    """
+    path = plan.inputs.cameras
     try:
-        members = members_of(plan.inputs.cameras, plan.cameras)
+        found = None if isinstance(path, Cameras) else find_members(path)
+        if found is None:
+            return plan
+        where, all_members = found
+        if (members := all_members.aligned(plan.cameras)) is None:
+            sentence = "belongs to other cameras, so SigmaZ does not include errors of the poses."
+            sentence += " Use the cameras that the adjustment wrote, or remove the file."
+            raise bad_file(where, "cameras.poses", sentence)
     except InputError as error:
         note = PcfixWarning("cameras.poses", error)
         return replace(plan, input_notes=(*plan.input_notes, note))
-    if members is None:
-        return plan
     rows = np.arange(0, plan.view.points, 1 + plan.view.points // SAMPLE_POINTS)
     sample = sample_of(plan.view, rows, plan.found.surface, plan.match)
     errors = pose_errors(sample, plan.survey, members, plan.transfer)
@@ -238,7 +247,12 @@ def _estimated_from_cloud(plan: Plan) -> Plan:
         survey = replace(survey, learned=survey.learned._replace(occluder=occluder))
     if sample is None:
         return replace(plan, survey=survey)
-    ties = original_ties(plan.inputs, plan.transfer, view.crs)
+    if plan.transfer is None:
+        ties = plan.inputs.tie_points(view.crs)
+    elif (ties := both_models(plan.inputs)[0].tie_points(view.crs)) is not None:
+        # of the original model, numbered as the cameras of the transfer
+        views, entry = renumbered(ties.views, plan.transfer.row)
+        ties = replace(ties, views=views, image_xy=ties.image_xy[entry])
     sample, factor = learning.with_factor(replace(sample, survey=survey))
     notes = [*plan.notes, *coded("cloud.depth_factor", [] if factor is None else [factor])]
     hint = hint_of(plan.options.software or view.software)

@@ -312,12 +312,8 @@ def _flown(cameras: Cameras, file: File, water_m: float | None) -> Finding | Non
 def likely_mistake(centres: FloatArray, low: FloatArray, high: FloatArray) -> str | None:
     """Return how a block does not match its cloud; None if it does.
 
-    Parameters
-    ----------
-    centres : array, shape (k, 3)
-        Projection centres, assumed to be in the cloud's CRS.
-    low, high : array, shape (3,)
-        Corners of the cloud, metres.
+    The projection centres, shape (k, 3), are assumed to be in the cloud's CRS; `low` and `high`,
+    shape (3,), are the corners of the cloud, metres.
     """
     size, middle = (high - low)[:2], np.median(centres, axis=0)
     x, y = (low + high)[:2] / 2.0 - middle[:2]

@@ -16,10 +16,9 @@ import numpy as np
 
 from pcfix.adjust.diagnosis import EXPORT, MOST_STATED_M, Diagnosis, diagnosed, neighbours_sign
 from pcfix.adjust.transfer import CloudTransfer
-from pcfix.errors import InputError, PcfixError, PcfixWarning, bad_file
+from pcfix.errors import InputError, PcfixError, PcfixWarning
 from pcfix.flow.inputs import Inputs
 from pcfix.flow.surfaces import CloudView, Points
-from pcfix.io.files import find_members
 from pcfix.io.ground_control import gnss_in_frame_of, read_ground_control
 from pcfix.model import (
     NOISE_CLASSES,
@@ -187,23 +186,7 @@ def flags_of(given: OptionSet) -> list[str]:
 # Points that are sampled from the cloud, and points under water that are corrected with each
 # member; a thousand is enough, as the errors are smooth.
 SAMPLE_POINTS, BED_POINTS = 20_000, 1000
-
-
-def members_of(path: File | Cameras, cameras: Cameras) -> "Members | None":
-    """Return the members of the adjustment in the folder of its cameras, if there are any.
-
-    Raises InputError if they are damaged, or of other cameras.
-    """
-    found = None if isinstance(path, Cameras) else find_members(path)
-    if found is None:
-        return None
-    where, members = found
-    aligned = members.aligned(cameras)
-    if aligned is None:
-        sentence = "belongs to other cameras, so SigmaZ does not include errors of the poses. Use"
-        sentence += " the cameras that the adjustment wrote, or remove the file."
-        raise bad_file(where, "cameras.poses", sentence)
-    return aligned
+POINTS_A_CELL, FEWEST = 12, 4  # of the bed, on average, and at least
 
 
 def pose_errors(
@@ -215,6 +198,9 @@ def pose_errors(
     the adjustment of the survey's cameras, in their order, and `transfer` has the original cameras,
     if those of the survey were adjusted since.
     """
+    from scipy.ndimage import distance_transform_edt
+    from scipy.stats import binned_statistic_2d
+
     if transfer is None:
         cameras = survey.cameras
         transfer = CloudTransfer(cameras, cameras, np.arange(len(cameras)))
@@ -225,21 +211,11 @@ def pose_errors(
     rows = rows[:: 1 + len(rows) // BED_POINTS]
     variance_m2 = variances(sample.take(rows), survey, members, transfer)
     known = np.isfinite(variance_m2)
-    return pose_errors_of(step.xyz[rows[known], :2], variance_m2[known]) if known.any() else None
-
-
-POINTS_A_CELL, FEWEST = 12, 4
-
-
-def pose_errors_of(xy: FloatArray, variance_m2: FloatArray) -> PoseErrors:
-    """Return the errors over a bed from variances at n places of it, shapes (n, 2) and (n,).
-
-    A cell has the median of its points: a few of them jump, as a camera comes into their reach or
-    leaves it. One of too few points has that of the nearest which has enough.
-    """
-    from scipy.ndimage import distance_transform_edt
-    from scipy.stats import binned_statistic_2d
-
+    if not known.any():
+        return None
+    # Over the bed, a cell has the median of its points: a few of them jump, as a camera comes into
+    # their reach or leaves it. One of too few points has that of the nearest which has enough.
+    xy, variance_m2 = step.xyz[rows[known], :2], variance_m2[known]
     low = xy.min(axis=0)
     size = np.maximum(np.ptp(xy, axis=0), 1e-3)
     cell_m = float(np.sqrt(size.prod() * POINTS_A_CELL / len(xy)))

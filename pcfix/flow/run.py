@@ -305,10 +305,7 @@ class Record:
     """
 
     def __init__(self, run: RunFolder, say: Callable[[str], None], bar: Bar = no_bar) -> None:
-        """Make the folder, or refuse one of another run.
-
-        `say` is called with a line on each step, and `bar` shows the progress of one.
-        """
+        """Make the folder, or refuse one of another run; `say` and `bar` are those of `run`."""
         folder = run.folder
         if not folder.parent.is_dir():
             sentence = f"{folder}: the folder {folder.parent} does not exist. Create it first."
@@ -317,8 +314,7 @@ class Record:
         self._path, self._keys, self._say, self._bar = folder / RECORD, run.keys(), say, bar
         self._content: dict[str, Any] = {"options": run.settings(), "steps": {}}
         self._earlier = read_steps(self._path) if self._path.exists() else {}
-        resumes = self._has(STEPS[0])
-        if not (run.options.overwrite or resumes) and any(folder.iterdir()):
+        if not (run.options.overwrite or self._has(STEPS[0])) and any(folder.iterdir()):
             sentence = f"{folder}: holds a run with other options or input files, or other files."
             sentence += " Add --overwrite to replace them, or give another folder."
             raise SettingError("run.other", sentence, path=folder)
@@ -348,8 +344,7 @@ class Record:
         write_text(self._path, json_text(self._content), overwrite=True)
         result: Plain = done["result"] or {}
         if name != "adjust" or result["model"] is not None:
-            words = text.format(main=main or outputs[0], **result)
-            self._say(f"{name:<9} {how}: {words}")
+            self._say(f"{name:<9} {how}: {text.format(main=main or outputs[0], **result)}")
         return result
 
 
@@ -424,8 +419,7 @@ class RunResults:
     def tables(self) -> "dict[str, DataFrame]":
         """Tables of the comparison by name, metres; empty where there was no reference.
 
-        ``depth_bins``, errors by depth;
-        ``section_01`` and so on, heights along a line.
+        ``depth_bins``, errors by depth; ``section_01`` and so on, heights along a line.
         """
         files = sorted((self.folder / COMPARED).glob("*.csv")) if self.compared else []
         return {one.stem: analysis_library("pandas").read_csv(one) for one in files}

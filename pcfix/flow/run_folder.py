@@ -3,7 +3,6 @@
 import hashlib
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -51,7 +50,7 @@ from pcfix.io.tables import read_check_depths
 from pcfix.io.vectors import Layer, write_layers
 from pcfix.model import BATHYMETRIC_POINT, Cameras, FloatArray, WaterSurface
 from pcfix.options.correct import LEVEL_M, RunOptions
-from pcfix.options.declare import File, options_of
+from pcfix.options.declare import options_of
 from pcfix.options.steps import DistanceOptions, DsmOptions
 from pcfix.report.adjustment import adjustment_sentence
 from pcfix.report.comparison import evaluation
@@ -192,8 +191,7 @@ class RunFolder:
         """The water surface: as recorded in the corrected cloud, else as requested."""
         cloud = self.cloud("corrected")
         with silently(), open_cloud(cloud) as source:
-            stated = own_water(source)
-            return stated or self.options.part(Inputs).surface(view_of(cloud)).surface
+            return own_water(source) or self.options.part(Inputs).surface(view_of(cloud)).surface
 
 
 # The rasters
@@ -294,17 +292,23 @@ def write_map(path: Path, run: RunFolder, corrected: Plain, compared: Plain) -> 
     shapes = rasters.outlines(folder / DEPTH, MOST_CELLS)
     area = shapely.area(np.array(shapes, object)) if shapes else np.zeros(0)
     style = vector_style({"area": Symbol("fill", DARK, 0.5)})
+    layers = [Layer("corrected_area", "Polygon", shapes, {"area_m2": area}, style)]
+    # the depth contours, no finer than the depth is known
+    depth, transform = rasters.preview(folder / DEPTH, MOST_CELLS)
+    path_of_errors = folder / UNCERTAINTY
+    errors = rasters.preview(path_of_errors)[0] if path_of_errors.exists() else np.zeros(0)
+    interval = depth_interval(depth, errors)
+    found = contours(depth, interval)
+    places = [rasters.place_of(transform, *(place.T + 0.5)) for _, place in found]
+    lines = [shapely.linestrings(*xy) for xy in places]
+    level = np.array([level for level, _ in found])
+    values = {"depth_m": level, "interval_m": np.full(len(found), interval)}
+    style = vector_style({"line": Symbol("line", DARK, 0.25)}, label='"depth_m"')
+    layers.append(Layer("depth_contours", "LineString", lines, values, style))
     known = options.sigma_level, (corrected["water_fit"] or {}).get("sigma_level_m"), LEVEL_M
     sigma_m = next(one for one in known if one is not None)
-    # x, y, reference height, and cloud minus reference
-    points = np.array(compared.get("check_points", [])).reshape(-1, 4)
-    sections = compared.get("figures", {}).get("sections", [])
-    layers = [
-        Layer("corrected_area", "Polygon", shapes, {"area_m2": area}, style),
-        _contours(folder),
-        waterline(cloud, run.water, sigma_m),
-    ]
-    if sections:
+    layers.append(waterline(cloud, run.water, sigma_m))
+    if sections := compared.get("figures", {}).get("sections", []):
         ends = [[(one["x1"], one["y1"]), (one["x2"], one["y2"])] for one in sections]
         lines = list(shapely.linestrings(ends))
         names = np.array([f"Cross-section {n}" for n, _ in enumerate(lines, start=1)], object)
@@ -318,23 +322,23 @@ def write_map(path: Path, run: RunFolder, corrected: Plain, compared: Plain) -> 
     symbols = {"used": Symbol("marker", GREEN, 2.0), "not used": Symbol("marker", GREY, 1.6)}
     centres = list(shapely.points(run.cameras.centres))
     layers.append(Layer("cameras", "Point Z", centres, values, vector_style(symbols, "use")))
-    layers += _checks(folder, points, options.check_depths)
+    # surveyed points with the differences of the cloud, or of the map of depths
+    symbol = {"point": Symbol("marker", ORANGE, 2.2, "diamond")}
+    style = vector_style(symbol, label="""format_number("residual_m", 2)""")
+    # x, y, reference height, and cloud minus reference
+    points = np.array(compared.get("check_points", [])).reshape(-1, 4)
+    if len(points):
+        values = {"z_m": points[:, 2], "residual_m": points[:, 3]}
+        surveyed = list(shapely.points(points[:, :3]))
+        layers.append(Layer("check_points", "Point Z", surveyed, values, style))
+    if options.check_depths is not None:
+        checks = read_check_depths(Path(options.check_depths))
+        raster = BED if checks.are_heights else DEPTH
+        more = rasters.values_at(folder / raster, checks.xy) - checks.value_m
+        values = {"measured_m": checks.value_m, "residual_m": more}
+        surveyed = list(shapely.points(checks.xy))
+        layers.append(Layer("check_depths", "Point", surveyed, values, style))
     write_layers(path, layers, view_of(cloud).crs, overwrite=True)
-
-
-def _contours(folder: Path) -> Layer:
-    """Return the depth contours, no finer than the depth is known."""
-    depth, transform = rasters.preview(folder / DEPTH, MOST_CELLS)
-    path = folder / UNCERTAINTY
-    sigma = rasters.preview(path)[0] if path.exists() else np.zeros(0)
-    interval = depth_interval(depth, sigma)
-    found = contours(depth, interval)
-    places = [rasters.place_of(transform, *(place.T + 0.5)) for _, place in found]
-    lines = [shapely.linestrings(*xy) for xy in places]
-    level = np.array([level for level, _ in found])
-    values = {"depth_m": level, "interval_m": np.full(len(found), interval)}
-    style = vector_style({"line": Symbol("line", DARK, 0.25)}, label='"depth_m"')
-    return Layer("depth_contours", "LineString", lines, values, style)
 
 
 def waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Layer:
@@ -363,25 +367,6 @@ def waterline(cloud: Path | Tiles, water: WaterSurface, sigma_m: float) -> Layer
     return Layer("waterline", "LineString", geometries, values, style)
 
 
-def _checks(folder: Path, points: FloatArray, depths: File | None) -> list[Layer]:
-    """Return surveyed points with the differences of the cloud, or of the map of depths."""
-    symbol = {"point": Symbol("marker", ORANGE, 2.2, "diamond")}
-    style = vector_style(symbol, label="""format_number("residual_m", 2)""")
-    layers = []
-    if len(points):
-        values = {"z_m": points[:, 2], "residual_m": points[:, 3]}
-        places = list(shapely.points(points[:, :3]))
-        layers.append(Layer("check_points", "Point Z", places, values, style))
-    if depths is not None:
-        checks = read_check_depths(Path(depths))
-        raster = BED if checks.are_heights else DEPTH
-        more = rasters.values_at(folder / raster, checks.xy) - checks.value_m
-        values = {"measured_m": checks.value_m, "residual_m": more}
-        places = list(shapely.points(checks.xy))
-        layers.append(Layer("check_depths", "Point", places, values, style))
-    return layers
-
-
 # The report page
 
 MOST_PAGE_CELLS = 300_000  # of the map on the page, so that this stays below 4 MB
@@ -397,7 +382,23 @@ def report_run(
     """
     folder, options, summary = run.folder, run.options, Summary(**corrected)
     names = [SURFACE, DEPTH, *([] if summary.uncertainty is None else [UNCERTAINTY])]
-    maps = _read_maps(run, [*names, *([DIFFERENCE] if compared and run.has_surface else [])])
+    names += [DIFFERENCE] if compared and run.has_surface else []
+    # the rasters in cells of theirs, or of several where there are many
+    with rasters.open_raster(folder / SURFACE) as surface:
+        fine = rasters.lattice_of(surface)
+    k = max(1, math.ceil(math.sqrt(fine.width * fine.height / MOST_PAGE_CELLS)))
+    column, row = fine.first_column // k, fine.first_row // k
+    width = (fine.first_column + fine.width - 1) // k - column + 1
+    height = (fine.first_row + fine.height - 1) // k - row + 1
+    lattice = Lattice(k * fine.resolution_m, column, row, width, height)
+    values = {name: rasters.read_onto(folder / name, lattice) for name in names}
+    with open_cloud(run.cloud("cleaned")) as source:
+        crs, heights = crs_words(stated_crs(source))
+    unknown = np.full((height, width), np.nan)
+    maps = RunMaps(
+        lattice, values[SURFACE], values[DEPTH], values.get(UNCERTAINTY, unknown),
+        values.get(DIFFERENCE), crs, heights,
+    )  # fmt: skip
     more: Plain = {"verdict": "", "compared": compared.get("figures", {})}
     if compared:
         more["pictures"], more["tables"] = evaluation(
@@ -434,22 +435,3 @@ def report_run(
         if tile.figures
     )
     return {"in_short": "; ".join(shown)}
-
-
-def _read_maps(run: RunFolder, names: Sequence[str]) -> RunMaps:
-    """Read rasters of a run by name, in cells of theirs, or of several where there are many."""
-    with rasters.open_raster(run.folder / SURFACE) as surface:
-        fine = rasters.lattice_of(surface)
-    k = max(1, math.ceil(math.sqrt(fine.width * fine.height / MOST_PAGE_CELLS)))
-    column, row = fine.first_column // k, fine.first_row // k
-    width = (fine.first_column + fine.width - 1) // k - column + 1
-    height = (fine.first_row + fine.height - 1) // k - row + 1
-    lattice = Lattice(k * fine.resolution_m, column, row, width, height)
-    values = {name: rasters.read_onto(run.folder / name, lattice) for name in names}
-    with open_cloud(run.cloud("cleaned")) as source:
-        crs, heights = crs_words(stated_crs(source))
-    return RunMaps(
-        lattice, values[SURFACE], values[DEPTH],
-        values.get(UNCERTAINTY, np.full((height, width), np.nan)),
-        values.get(DIFFERENCE), crs, heights,
-    )  # fmt: skip

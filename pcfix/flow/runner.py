@@ -174,8 +174,7 @@ def run_command(
         if failed:
             sentence = f"{tiles}: {len(failed)} of {len(tasks)} files failed. The same command"
             sentence += " continues with them; if files have changed, add --overwrite."
-            lines = "\n  ".join([sentence, *failed])
-            raise InputError("tiles.failed", lines, failed=failed)
+            raise InputError("tiles.failed", "\n  ".join([sentence, *failed]), failed=failed)
         # in the order of the files, so that no sum depends on which was first
         tallies = [files.read_tally(one.record)[1] for one in tasks]
         tally = reduce(add, tallies) if tallies[0] is not None else None
@@ -242,21 +241,17 @@ def key_of(
     name: str, options: Any, inputs: Iterable[Path] = (), ignored: Collection[str] = HOW
 ) -> str:
     """Return a checksum of all that the outputs of a command depend on."""
-    names = [one.name for one in options_of(type(options)) if one.name not in ignored]
-    asked = {name: _state(getattr(options, name)) for name in names}
+    asked: dict[str, Any] = {}
+    for option in (one.name for one in options_of(type(options)) if one.name not in ignored):
+        asked[option] = value = getattr(options, option)
+        if isinstance(value, str | PathLike):  # with the size and time of each file of a path
+            path = Path(str(value).partition(LAYER_MARK)[0])
+            found = files.belonging(path) if path.exists() else []
+            asked[option] = [str(value), *map(files.file_state, found)]
     depends = [version.__version__, name, asked, [files.file_state(path) for path in inputs]]
     # objects, such as cameras, are pickled
     text = json.dumps(depends, sort_keys=True, default=lambda one: pickle.dumps(one).hex())
     return sha256(text.encode()).hexdigest()
-
-
-def _state(value: Any) -> Any:
-    """Return the value of an option; for files and folders with the size and time of each file."""
-    if isinstance(value, str | PathLike):
-        path = Path(str(value).partition(LAYER_MARK)[0])
-        found = files.belonging(path) if path.exists() else []
-        return [str(value), *map(files.file_state, found)]
-    return value
 
 
 # Many files, on processes or a cluster

@@ -36,7 +36,6 @@ from pcfix.water.surface import Field, FoundSurface, build_fields, surface_above
 if TYPE_CHECKING:
     from pcfix.io.views import ViewMatch
 
-
 SAMPLE_POINTS = 2_000_000  # points of a cloud that are searched for water, evenly spread
 
 
@@ -118,18 +117,11 @@ def parts_of(chunks: Iterable[Points], water: WaterSurface) -> Iterable[Part]:
 def find_surface(
     water: WaterSurface | float | File, options: WaterOptions, view: CloudView | None
 ) -> FoundSurface:
-    """Read, fit or find the water surface of a cloud.
+    """Read, fit or find the water surface of a cloud; without one only what needs none.
 
-    Parameters
-    ----------
-    water : WaterSurface, float, str or path
-        See `pcfix.read_water`; besides, a vector file of shoreline points or lines, to which a
-        surface is fitted, or ``auto``: the surface is found in the cloud.
-    options : WaterOptions
-        Model of the fit (see `pcfix.water.fit.fit_water` and `pcfix.water.river.fit_river`), and
-        CRS of the shoreline.
-    view : CloudView or None
-        Without a cloud only surfaces that do not need one.
+    The water is what `pcfix.read_water` takes, a vector file of shoreline points or lines, to which
+    a surface is fitted (see `pcfix.water.fit.fit_water` and `pcfix.water.river.fit_river`), or
+    ``auto``: the surface is found in the cloud.
     """
     if not isinstance(water, str | PathLike | float | int):
         return FoundSurface(water)
@@ -222,8 +214,7 @@ def own_water_of(
             " same vertical datum, and 'pcfix calm' the --level of the calm water.",
             path=folder, difference_m=off_m,
         )  # fmt: skip
-    rest = water if isinstance(water, WaterRaster) else None
-    return build_fields(heights, len(cameras), rest)
+    return build_fields(heights, len(cameras), water if isinstance(water, WaterRaster) else None)
 
 
 def _fitted(options: WaterOptions, path: File, view: CloudView | None) -> FoundSurface:

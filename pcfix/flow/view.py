@@ -118,8 +118,7 @@ def view_clouds(
         cameras = inputs.block(first.crs)[0]
         # the lines along optical axes are short against the height above the clouds
         length = 0.06 * max(float(np.median(cameras.centres[:, 2])) - high[2], 1.0)
-        down = np.array([0.0, 0.0, -1.0])
-        axes = down if cameras.rotations is None else cameras.rotations[:, 2]
+        axes = np.array([0.0, 0.0, -1.0]) if cameras.rotations is None else cameras.rotations[:, 2]
         lines["cameras"] = np.stack([cameras.centres, cameras.centres + length * axes], axis=1)
     # coordinates relative to the common centre
     ends = np.vstack([low, high, *(one.reshape(-1, 3) for one in lines.values())])

@@ -36,14 +36,8 @@ def check_water(
 ) -> tuple[FoundSurface, Plain]:
     """Read, fit or find a water surface, and describe it; ``pcfix water``.
 
-    Returns the surface, and what describes it in the types of JSON.
-
-    Parameters
-    ----------
-    spec : WaterSurface, float, str or path
-        See `pcfix.flow.surfaces.find_surface`.
-    options
-        See `pcfix.correct_file`.
+    `spec` is the water of `pcfix.flow.surfaces.find_surface`. Returns the surface, and what
+    describes it in the types of JSON.
     """
     given = taken(WaterCheckOptions, options, keywords, "check_water")
     check_summary(given, paths_in(given))

@@ -133,14 +133,9 @@ def lattice_over(low: FloatArray, high: FloatArray, resolution_m: float, name: s
     Raises SettingError ``option.resolution``, with the `name` of the input, if there are more than
     `MAX_CELLS`.
     """
-
-    def size(side_m: float) -> FloatArray:
-        """Return columns and rows, as floats, which cannot overflow."""
-        first, last = (np.floor((corner + EDGE_M) / side_m) for corner in (low, high))
-        return np.asarray(last - first + 1.0)
-
-    if size(resolution_m).prod() > MAX_CELLS:
-        columns, rows = size(resolution_m)
+    first, last = (np.floor((corner + EDGE_M) / resolution_m) for corner in (low, high))
+    columns, rows = last - first + 1.0  # as floats, which cannot overflow
+    if columns * rows > MAX_CELLS:
         finest = float(f"{1.06 * resolution_m * math.sqrt(columns * rows / MAX_CELLS):.2g}")
         sentence = (
             f"{name}: {columns:,.0f} x {rows:,.0f} cells of {resolution_m:g} m are too many. Use"

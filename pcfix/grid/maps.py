@@ -29,10 +29,9 @@ def stops_of(ramp: str, steps: int = 9) -> list[tuple[float, tuple[int, ...]]]:
     from matplotlib import colormaps
 
     shares = [step / (steps - 1) for step in range(steps)]
-    colours = colormaps[ramp](shares)[:, :3]
     return [
         (share, tuple(round(255 * part) for part in colour))
-        for share, colour in zip(shares, colours.tolist(), strict=True)
+        for share, colour in zip(shares, colormaps[ramp](shares)[:, :3].tolist(), strict=True)
     ]
 
 
@@ -57,9 +56,8 @@ def relief_colours(
         np.where(np.isnan(depth_m), land, np.interp(np.nan_to_num(depth_m), at, ramp))
         for land, ramp in zip(LAND, np.array([colour for _, colour in stops]).T, strict=True)
     ]
-    alpha = np.full(light.shape, 255.0)
     bands = [np.clip(np.rint(band * lit), 0, 255) for band in colours]
-    return np.where(np.isnan(light), 0.0, [*bands, alpha]).astype(np.uint8)
+    return np.where(np.isnan(light), 0.0, [*bands, np.full(light.shape, 255.0)]).astype(np.uint8)
 
 
 def hillshade(height: FloatArray, resolution_m: float) -> FloatArray:

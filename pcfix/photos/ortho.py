@@ -79,9 +79,8 @@ def mosaic(
 ) -> tuple[FloatArray, BoolArray] | None:
     """Return the colours of places on the ground, shape (n, 3), and whether any image sees them.
 
-    Colours have the shape (n, bands); None if no image sees any place.
-
-    `picture` returns the pixels of an image by its place in `photos`.
+    Colours have the shape (n, bands); None if no image sees any place. `picture` returns the pixels
+    of an image by its place in `photos`.
     """
     slopes = []  # tangents of straight rays from nadir; infinite far outside the frame
     for photo in photos:

@@ -232,8 +232,7 @@ class _Shell:
         y = -2.0 * np.pi * np.fft.fftfreq(rows, cell_m)  # rows go south
         every = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
         size = np.hypot(*every.T)
-        longest = cell_m * max(rows, columns)
-        least, most = 2.0 * np.pi / longest, 2.0 * np.pi / (3.0 * cell_m)
+        least, most = (2.0 * np.pi / (cells * cell_m) for cells in (max(rows, columns), 3.0))
         may = (size >= least) & (size <= most)
         self._rows, self._shape = np.flatnonzero(may), (rows, columns)
         self.number, self._size = every[may], size[may]

@@ -66,8 +66,7 @@ class Cloud(NamedTuple):
             for name, (reason, limit, is_beyond) in WEAK.items():
                 value = getattr(rules, limit)
                 if value is not None and name in rays:
-                    weak = corrected & is_beyond(rays[name], value)
-                    self.reasons[rows][weak] |= np.uint8(reason)
+                    self.reasons[rows][corrected & is_beyond(rays[name], value)] |= np.uint8(reason)
         if above is not None:
             self.submerged[rows] = used & is_submerged(xyz[:, 2], above)
 

@@ -146,8 +146,7 @@ def evaluation(
     difference of the surfaces has the shape (rows, columns) of the cells of the lattice.
     """
     pictures, words = [], "histograms with fitted Gaussians; the table has their figures."
-    vertical = errors_of(compared, "vertical")
-    if vertical:
+    if vertical := errors_of(compared, "vertical"):
         figure = _histograms([vertical], "Cloud minus reference, Z (m)", sharex=False)
         title = "Vertical error"
         pictures.append(Picture("histogram_vertical", title, f"{title}: {words}", figure))

@@ -38,7 +38,6 @@ from pcfix.sums import nice_step
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-
 # Colours of different lightness, for readers with colour blindness.
 BEFORE, AFTER, WATER, REFERENCE = "#b3541e", "#0b5e8a", "#4aa3c7", "#222222"
 
@@ -207,7 +206,6 @@ def map_json(lattice: Lattice, height_m: FloatArray, layers: Sequence[Layer]) ->
 
     Layers are differences of 16-bit integers, compressed by zlib, in base 64.
     """
-    shade = relief(height_m, lattice.resolution_m) * 254.0
     data: dict[str, Any] = {
         "rows": lattice.height,
         "columns": lattice.width,
@@ -215,7 +213,7 @@ def map_json(lattice: Lattice, height_m: FloatArray, layers: Sequence[Layer]) ->
         "north": lattice.top_m,
         "cell": lattice.resolution_m,
         "noData": _NO_DATA,
-        "shade": _packed(np.nan_to_num(shade)),
+        "shade": _packed(np.nan_to_num(relief(height_m, lattice.resolution_m) * 254.0)),
         "layers": [_of_layer(layer) for layer in layers],
         "interval": 0,
         "contours": [],

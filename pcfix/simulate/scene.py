@@ -120,8 +120,7 @@ def scene_of(
 ) -> Scene:
     """Return the scene of a site, with a cloud and its true points, both of shape (n, 3)."""
     terrain, rng = site.terrain, site.rng
-    area_m2 = terrain.length_m * terrain.width_m
-    lidar = points_on(terrain, round(area_m2 * chosen.lidar_per_m2), rng)
+    lidar = points_on(terrain, round(terrain.length_m * terrain.width_m * chosen.lidar_per_m2), rng)
     lidar[:, 2] += rng.normal(0.0, chosen.lidar_noise_m, len(lidar))
     cameras = cameras_in_world(site.given)
     return Scene(
@@ -153,10 +152,15 @@ def lay_out(chosen: SceneSettings) -> "Site":
         side = float(np.sqrt(chosen.cameras * base * spacing * length / width))
         across = chosen.cameras * base * spacing / side - 1.5 * spacing
         extent = max(side - 1.5 * base, base), max(across, spacing / 2.0)
-    plane = chosen.water_plane(extent)
-    terrain = Terrain.random(chosen.bed, extent, plane, chosen.depth_m, rng)
+    terrain = Terrain.random(chosen.bed, extent, chosen.water_plane(extent), chosen.depth_m, rng)
     true, true_angles = fly_block(extent, chosen, rng)
-    given, given_angles = misplaced(true, true_angles, chosen, of_poses)
+    given, given_angles = true, true_angles
+    if chosen.position_noise_m or chosen.attitude_noise_deg:
+        # noise on every coordinate, and on yaw, pitch and roll
+        shape = true_angles.shape
+        given_angles = true_angles + of_poses.normal(0.0, chosen.attitude_noise_deg, shape)
+        centres = true.centres + of_poses.normal(0.0, chosen.position_noise_m, shape)
+        given = replace(true, centres=centres, rotations=from_yaw_pitch_roll(*given_angles.T))
     fall_m = chosen.water_tilt * float(np.hypot(*extent)) / 2.0
     return Site(
         terrain, true, true_angles, given, given_angles, chosen.optics,
@@ -207,17 +211,6 @@ def fly_block(
         lenses=(chosen.optics.lens,) * len(centres),
     )
     return cameras, attitude
-
-
-def misplaced(
-    cameras: Cameras, attitude: FloatArray, chosen: SceneSettings, rng: np.random.Generator
-) -> tuple[Cameras, FloatArray]:
-    """Return cameras and angles with noise on every coordinate, and on yaw, pitch and roll."""
-    if chosen.position_noise_m == chosen.attitude_noise_deg == 0.0:
-        return cameras, attitude
-    angles = attitude + rng.normal(0.0, chosen.attitude_noise_deg, attitude.shape)
-    centres = cameras.centres + rng.normal(0.0, chosen.position_noise_m, attitude.shape)
-    return replace(cameras, centres=centres, rotations=from_yaw_pitch_roll(*angles.T)), angles
 
 
 def _plan(extent_m: tuple[float, float], chosen: SceneSettings) -> tuple[FloatArray, FloatArray]:

@@ -2,9 +2,8 @@
 
 The piercing point follows from Fermat's principle: it is the root of Snell's law along the line
 between the feet of object and camera, found by a safeguarded Newton iteration. Nothing here is
-shared with the correction, which traces in the other direction by other mathematics.
-
-The surface is a plane, level or tilted.
+shared with the correction, which traces in the other direction by other mathematics. The surface is
+a plane, level or tilted.
 
 Arrays are flat over the m (point, camera) pairs, sorted by point: metres, shape (m, 3), unless
 stated otherwise.
