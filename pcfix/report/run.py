@@ -4,7 +4,7 @@ import platform
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from pcfix.report.page import (
 )
 from pcfix.report.text import Plain, Summary, formal_words, summary_rows
 from pcfix.version import __version__
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class RunMaps(NamedTuple):
@@ -177,24 +180,31 @@ def _pictures(s: Summary, cameras: Cameras, maps: RunMaps, compared: Plain) -> l
             f" limits of the orders of IHO S-44. {formal_words(s)}.{dots}"
             " S-44 has requirements other than the TVU: position, features and coverage."
         )
-        depth_m, tvu_m = maps.depth_m[known], maps.uncertainty_m[known]
-        figure, axes = new_figure()
-        axes.plot(depth_m, tvu_m, ".", markersize=1, color=WATER, label="predicted, each cell")
-        within = [one["after"]["within_95_m"] for one in bins]
-        if bins:
-            at = [0.5 * (one["from_m"] + one["to_m"]) for one in bins]
-            axes.plot(at, within, "o", color=REFERENCE, label="measured")
-        deepest, most = max(float(depth_m.max()), 1e-3), max(np.percentile(tvu_m, 99), *within, 0.2)
-        depths = np.linspace(0.0, deepest, 100)
-        for order, style in zip(ORDERS, ("-", "--", "-.", ":"), strict=True):
-            largest = largest_tvu_m(order, depths)
-            if largest[0] < 1.3 * most:
-                axes.plot(depths, largest, style, color=BEFORE, label=f"IHO S-44 {order.name}")
-        axes.set(xlim=(0.0, deepest), ylim=(0.0, 1.3 * most))
-        axes.set(xlabel="Depth (m)", ylabel="TVU at 95 % (m)")
-        axes.legend(loc="best")
+        figure = tvu_figure(maps.depth_m[known], maps.uncertainty_m[known], bins)
         pictures.append(Picture("uncertainty", "Vertical uncertainty", alt, figure))
     return pictures
+
+
+def tvu_figure(depth_m: FloatArray, tvu_m: FloatArray, measured: Sequence[Plain]) -> "Figure":
+    """Draw TVU at 95 % of cells over depth, (n,), metres, and the limits of the orders of S-44.
+
+    `measured` are the `Comparison.depth_bins` of a reference, in plain values.
+    """
+    figure, axes = new_figure()
+    axes.plot(depth_m, tvu_m, ".", markersize=1, color=WATER, label="predicted, each cell")
+    within = [one["after"]["within_95_m"] for one in measured]
+    if measured:
+        at = [0.5 * (one["from_m"] + one["to_m"]) for one in measured]
+        axes.plot(at, within, "o", color=REFERENCE, label="measured")
+    deepest = max(float(depth_m.max()), 1e-3)
+    depths, most = np.linspace(0.0, deepest, 100), 1.3 * max(np.percentile(tvu_m, 99), *within, 0.2)
+    for order, style in zip(ORDERS, ("-", "--", "-.", ":"), strict=True):
+        largest = largest_tvu_m(order, depths)
+        if largest[0] < most:
+            axes.plot(depths, largest, style, color=BEFORE, label=f"IHO S-44 {order.name}")
+    axes.set(xlim=(0.0, deepest), ylim=(0.0, most), xlabel="Depth (m)", ylabel="TVU at 95 % (m)")
+    axes.legend(loc="best")
+    return figure
 
 
 def accuracy_tile(s: Summary, compared: Plain) -> Tile:
