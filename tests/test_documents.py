@@ -46,8 +46,8 @@ def test_links():
                 assert not anchor or anchor in anchors(target), (path, link)
 
 
+# Parts of a line that is not a command, such as ``INPUT [OPTION]``.
 PATTERN = re.compile(r"[\[\]|]|\.\.\.|(?<!\S)[A-Z_]{3,}(?!\S)")
-"""Parts of a line that is not a command, such as ``INPUT [OPTION]``."""
 
 
 def commands():
@@ -76,11 +76,11 @@ def test_commands():
             pytest.fail(f"{path.name}: {line}: {error}")
 
 
+# Words of the project's former idiom, which readers did not understand.
 IDIOM = re.compile(
     r"\b(anew|mend(s|ed|ing)?|bent|so many|by itself|told|tells|kept|came|said|beside|stands|lies"
     r"|goes by|leaves? out|left out|in sight|doubts?|steep(er|est)?)\b", re.I
 )  # fmt: skip
-"""Words of the project's former idiom, which readers did not understand."""
 
 
 def help_text():

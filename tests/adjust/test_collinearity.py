@@ -45,8 +45,8 @@ LENSES = {
     "plain": PLAIN, "Brown": BROWN, "fisheye": FISHEYE, "inverse": INVERSE, "rational": RATIONAL,
 }  # fmt: skip
 WATERS = {"level": (-60.0, 0.0, 0.0, 1.34), "tilted": (-60.0, 0.03, -0.05, 1.34)}
+# Relative to the largest of a row: central differences of 0.1 mm steps are good to 1e-7 or so.
 NEAR = 2e-6
-"""Relative to the largest of a row: central differences of 0.1 mm steps are good to 1e-7 or so."""
 
 
 def given_of(**changes):

@@ -17,8 +17,7 @@ from tests.utils.unaware_blocks import unaware
 SMALL = {"area_m": (50, 40), "greatest_depth_m": 5, "position_noise_m": 0.5,
          "attitude_noise_deg": 0.3}  # fmt: skip
 
-HOME_M = 1e-6
-"""Exact data: Newton's steps end below 1e-7 m."""
+HOME_M = 1e-6  # exact data: Newton's steps end below 1e-7 m
 
 
 @cache

@@ -14,8 +14,7 @@ from tests.utils.tie_blocks import adjusted, block_of, clear_of_the_waterline
 
 FREE = np.inf
 SHAPED = Unknowns(lens=(), surface={"level": FREE, "tilt": FREE, "shape": FREE})
-CURVATURE = np.array([1.2e-4, -6e-5, -9e-5])
-"""1/m: 6 cm at 25 m from the middle, as before a weir."""
+CURVATURE = np.array([1.2e-4, -6e-5, -9e-5])  # 1/m: 6 cm at 25 m from the middle, as before a weir
 
 
 def curved(points):

@@ -16,8 +16,7 @@ from tests.utils.tie_points import simulate_tie_points
 FREE = np.inf
 
 
-HOME_M = 1e-6
-"""Without noise: Newton's steps end where the cost is rounding, 1e-9 m or better."""
+HOME_M = 1e-6  # without noise: Newton's steps end where the cost is rounding, 1e-9 m or better
 
 SMALL = {"area_m": (50, 40), "greatest_depth_m": 5, "position_noise_m": 0.5,
          "attitude_noise_deg": 0.3}  # fmt: skip

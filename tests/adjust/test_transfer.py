@@ -11,8 +11,7 @@ from pcfix.model import Cameras, Lens, Views
 from tests.utils.consistent_twin import image_in, triangulated_straight
 
 DOWN = np.diag([1.0, -1.0, -1.0])
-STEP_M = 1e-6
-"""Of the last step of the iteration, whose error is far below it."""
+STEP_M = 1e-6  # of the last step of the iteration, whose error is far below it
 
 
 def lens_of(focal=1500.0, k1=-0.05):

@@ -17,8 +17,8 @@ from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
 
 ALL_POINTS = {"max_gap": 1000.0}  # no point is too far outside the other cloud
+# Those of which Skarlatos & Agrafiotis 2018 give the share, at Amathounta and at Agia Napa.
 BANDS = [(0.6, 1.0), (3.0, 6.0)]
-"""Those of which Skarlatos & Agrafiotis 2018 give the share, at Amathounta and at Agia Napa."""
 
 
 @pytest.fixture(scope="module")

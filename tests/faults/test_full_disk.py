@@ -46,6 +46,7 @@ def survey(inputs):
 CAMERAS = ("--cameras", "cameras.csv", "--water", "0.37", "--method", "snell")
 CORRECT = ("correct", "cloud.laz", *CAMERAS, "--jobs", "1")
 COMPARE = ("compare", "corrected.laz", "lidar.laz")
+# Arguments by name; DISK is the folder that fills up.
 COMMANDS = {
     "correct": (*CORRECT, "DISK/c.laz", "--summary", "DISK/c.json"),
     "correct, LAS": (*CORRECT, "DISK/c.las"),
@@ -56,7 +57,6 @@ COMMANDS = {
             "DISK/k.tif", "--style", "--summary", "DISK/d.json"),
     "compare": (*COMPARE, "--out-dir", "DISK/of", "--plot", "DISK/p.png", "--summary", "DISK/s"),
 }  # fmt: skip
-"""Arguments by name; DISK is the folder that fills up."""
 
 
 def resize(disk, pages):

@@ -12,8 +12,8 @@ import pcfix
 from pcfix.io.files import temporary_output
 from tests.utils.codes import refused
 
+# After its first file a command gets a signal at the latest; it has ended by then, or nearly.
 LONGEST_S = 0.1
-"""After its first file a command gets a signal at the latest; it has ended by then, or nearly."""
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,7 @@ pytestmark = pytest.mark.filterwarnings("default::pcfix.errors.PcfixWarning")
 FREE, free = needs("rendered_a_free")
 TRUE, true = needs("rendered_a")
 WATER_M, FOCAL_PX = 0.37, 1500.0
-TIES = 3000
-"""Enough for these bounds; all of them take a minute."""
+TIES = 3000  # enough for these bounds; all of them take a minute
 
 
 @free

@@ -20,8 +20,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::pcfix.errors.PcfixWarning")
 FORMATS = st.integers(0, 10)
 SUFFIXES = st.sampled_from([".las", ".laz"])
 WITH_RAYS = ("snell", "consistent", "shan", "butler", "murase", "dietrich")
+# Methods that take each point by itself, when every ray counts.
 OF_A_POINT = ("snell", "shan", "butler", "murase", "dietrich", "factor")
-"""Methods that take each point by itself, when every ray counts."""
 NANOMETRE = 1e-9
 
 

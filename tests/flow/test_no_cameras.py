@@ -57,6 +57,7 @@ def test_with_and_without_cameras(folder, method):
     assert (bare.cameras, bare.absorbed) == (0, None)
 
 
+# Options about cameras, and of the regression, that do not go together.
 REFUSED = (
     {"method": "snell"},
     {},
@@ -68,7 +69,6 @@ REFUSED = (
     {"method": "factor", "check_depths": "c.csv"},
     {"method": "regression"},
 )
-"""Options about cameras, and of the regression, that do not go together."""
 
 
 @pytest.mark.parametrize("options", REFUSED, ids=str)

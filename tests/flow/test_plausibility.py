@@ -66,12 +66,12 @@ FAULTS = {
     "yaw + 180": lambda b: turned(b, 180),
     "40 m beside": lambda b: moved(b, 40, 0, 0),
 }
+# Of the sample scene, which has neither tie points nor GNSS positions.
 DOUBTED = {
     "47 m too low": "cameras.no_overlap",
     "yaw + 180": "cameras.yaw",
     "radians": "cameras.yaw",
 }
-"""Of the sample scene, which has neither tie points nor GNSS positions."""
 UNCHECKED = {
     "47 m too high": "heights (no tie points; cameras 129 m above the cloud)",
     "feet": "heights (no tie points; cameras 26",
@@ -149,6 +149,7 @@ def test_shoreline_of_the_cloud(off_m, found_m):
     assert [problem.values["off_m"] for problem in problems] == pytest.approx(found_m, abs=0.005)
 
 
+# Cameras and clouds that belong together, and the water if there is a shore.
 REAL = {
     "river": ("river/cameras.csv", "river/points.las", None),
     "a as table": ("rendered_a/cameras.csv", "rendered_a/cloud.las", LEVEL_M),
@@ -161,7 +162,6 @@ REAL = {
         None,
     ),
 }
-"""Cameras and clouds that belong together, and the water if there is a shore."""
 
 
 @rendered

@@ -48,8 +48,7 @@ def three_cameras():
     )
 
 
-UNKNOWNS = 21
-"""Turn and centre of each camera, focal length, level and index."""
+UNKNOWNS = 21  # turn and centre of each camera, focal length, level and index
 N, LEVEL_M = 1.34, 0.2
 
 

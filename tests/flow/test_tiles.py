@@ -27,8 +27,8 @@ from tests.utils.tiles import SCENE, cut, figures, finished, records, tiles_in, 
 
 CAMERAS = SCENE / "cameras.csv"
 WORDS = ("--cameras", CAMERAS, "--water", "0.37")
+# A correction that weighs nothing: for tests of files.
 PLAIN = {"method": "snell", "dimensions": "minimal"}
-"""A correction that weighs nothing: for tests of files."""
 PLAIN_WORDS = [word for name, value in PLAIN.items() for word in (f"--{name}", value)]
 
 
@@ -244,8 +244,8 @@ def test_refused_outputs(cloud, tmp_path):
 
 # Clean and compare
 
+# A good part of the points is noise by these.
 MANY = {"deviations": 0.5, "fences": 0.2, "below": 0.01, "floating": 0.01}
-"""A good part of the points is noise by these."""
 
 
 @pytest.fixture(scope="module")

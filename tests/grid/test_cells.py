@@ -17,8 +17,8 @@ pytestmark = pytest.mark.quick_but("test_every_cell")
 
 METHODS = ("mean", "median", "min", "max", "tin")
 
+# Heights reach 30 m; half the distance of neighbouring float32 numbers there is 1e-6 m.
 FLOAT32_M = 2e-6
-"""Heights reach 30 m; half the distance of neighbouring float32 numbers there is 1e-6 m."""
 
 
 @pytest.fixture(scope="module")

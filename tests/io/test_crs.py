@@ -49,11 +49,11 @@ def test_texts(text, code):
     assert parse_crs(text, "cameras.xml").to_epsg() == code
 
 
+# A code with a line break is in what PROJ writes of it, and PROJ cannot read that.
 NO_CODE = (
     'PROJCS["",GEOGCS["",DATUM["",SPHEROID["",7,9[""]]TOWGS84[0,0,0,0,0,0,0][""]][""[""]]'
     '[""""]]PROJECTION[""[""""]][""][""[""]]AUTHORITY["G","2\n0"]]'
 )
-"""A code with a line break is in what PROJ writes of it, and PROJ cannot read that."""
 
 
 @pytest.mark.parametrize(

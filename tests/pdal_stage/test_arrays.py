@@ -125,6 +125,7 @@ def test_report(cloud, tmp_path):
 
 
 GOOD = {"cameras": "cameras.csv", "water": WATER_M, "max_angle": 80.0}
+# Options, and the code of the error where it is one of this room.
 MISTAKES = [
     ({**GOOD, "watre": 1}, None),
     ({"water": 1.0}, "option.missing"),
@@ -141,7 +142,6 @@ MISTAKES = [
     ({**GOOD, "water": -40}, None),
     ({**GOOD, "summary": "cameras.csv", "overwrite": True}, None),
 ]
-"""Options, and the code of the error where it is one of this room."""
 
 
 @pytest.mark.parametrize(("options", "code"), MISTAKES)

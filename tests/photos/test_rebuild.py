@@ -20,8 +20,8 @@ from tests.photos.test_mapping import GSD_M, photo, relief
 from tests.utils.codes import refused
 from tests.utils.renderer import Texture, rendered
 
+# Of the cloud that each round's command writes; the first one is 2 m deep.
 DEPTHS_M = (2.5, 2.66, 2.71, 2.73)
-"""Of the cloud that each round's command writes; the first one is 2 m deep."""
 
 COMMAND = """
 import pathlib, sys, laspy, numpy as np

@@ -25,8 +25,7 @@ from tests.utils.clouds import (
 )
 from tests.utils.codes import refused
 
-MANY = {"deviations": 0.5, "fences": 0.2}
-"""On a cloud of white noise, a third of the points."""
+MANY = {"deviations": 0.5, "fences": 0.2}  # on a cloud of white noise, a third of the points
 OURS = (b"pcfix", 2)
 
 

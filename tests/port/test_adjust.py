@@ -25,8 +25,8 @@ from tests.utils.port_scenes import simulate_port
 pytestmark = pytest.mark.filterwarnings("default::pcfix.errors.PcfixWarning")
 
 FLAT, DOME = FlatPort(0.02, 0.008), DomePort(0.05, 0.0, 1.49, (0.003, 0.0, 0.004))
+# Of the positions, as total stations and frames with scale bars give them under water.
 SIGMA_M = 0.005
-"""Of the positions, as total stations and frames with scale bars give them under water."""
 
 
 def write_scene(folder, port):

@@ -59,8 +59,7 @@ CASES = {
     "depth maps": {"method": "consistent", "camera_set": "mvs", "matcher": "depth-maps"},
     "pairs": {"method": "consistent", **PAIRS},
 }
-OF_ALL = ("depth maps", "pairs")
-"""Matchers depend on all points."""
+OF_ALL = ("depth maps", "pairs")  # matchers depend on all points
 
 
 def corrected(points, cameras, *, water=0.0, **how):

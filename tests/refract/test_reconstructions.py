@@ -31,8 +31,8 @@ def detected(*given):
     return survey.settings, verdicts[0] if verdicts else None
 
 
+# A cloud as dense as those of matchers, about 5 pixels from point to point.
 COARSE = {"points": 40_000, "sensor_px": (1824, 1216)}
-"""A cloud as dense as those of matchers, about 5 pixels from point to point."""
 CLOUDS = {
     "tracks": {},
     "depth-maps": {},
@@ -130,13 +130,13 @@ def test_real_cloud():
     assert verdict.chosen is IN_FRAME[1] and verdict.is_sure
 
 
+# Clouds of semi-global matching: the largest RMSE of the bed in GSD of 5 cm, and the type.
 SGM = {
     "rendered_a_sgm/multi.laz": (1.3, IN_FRAME[3]),
     "rendered_a_sgm/steepest.laz": (1.0, IN_FRAME[4]),
     "rendered_c_sgm/multi.laz": (2.0, IN_FRAME[3]),
     "rendered_c_sgm/steepest.laz": (1.3, IN_FRAME[4]),
 }
-"""Clouds of semi-global matching: the largest RMSE of the bed in GSD of 5 cm, and the type."""
 
 
 @rendered

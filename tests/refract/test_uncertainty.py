@@ -43,9 +43,9 @@ SOURCES = {
 }
 LEVEL = WaterPlane(0.0)
 VARIANCES = [0, 3, 5]
+# Smaller standard errors (those in plan by level and index, which hardly move a point sideways) are
+# not held to 10 %: that is the rounding of a LAS file.
 SIZEABLE_M = 0.001
-"""Smaller standard errors (those in plan by level and index, which hardly move a point sideways)
-are not held to 10 %: that is the rounding of a LAS file."""
 
 
 def scene(tilt_deg, points=12, seed=0):

@@ -19,8 +19,8 @@ from tests.utils.shared import ROOT
 
 FOCAL, HEIGHT, LEVEL = 1000.0, 50.0, 0.5
 EAST, NORTH = 320000.0, 3842000.0
+# World to camera of a camera that looks straight down, its upper edge in the north.
 DOWN = np.diag([1.0, -1.0, -1.0])
-"""World to camera of a camera that looks straight down, its upper edge in the north."""
 
 
 def lens(focal=FOCAL):
@@ -40,8 +40,8 @@ def cameras(focal=FOCAL, shift=(0.0, 0.0, 0.0)):
 
 
 AFTER = cameras(1002.0, (0.0, 0.0, 0.3))
+# Adjusted centres minus GNSS positions.
 OFF_M = np.array([[0.01, 0.02, 0.03], [0.05, -0.02, 0.09], [np.nan] * 3])
-"""Adjusted centres minus GNSS positions."""
 
 
 def points(m=24):

@@ -19,8 +19,7 @@ def iapws_1997(temperature_c, wavelength_um, density_kg_m3):
     return ((1.0 + 2.0 * right) / (1.0 - right)) ** 0.5
 
 
-AIR = 1.000274
-"""Index of air at 15 degrees and sea level; it varies by 2e-5 with the weather."""
+AIR = 1.000274  # index of air at 15 degrees and sea level; it varies by 2e-5 with the weather
 
 
 PURE = [(0.0, 999.84), (10.0, 999.70), (20.0, 998.21), (30.0, 995.65)]

@@ -17,8 +17,8 @@ pytestmark = pytest.mark.quick_but(
 
 ENU, enu = needs("cameras", "blocksexchange", "goodale_enu_one_photo", "AT_one_photo.xml")
 
+# World to x right, y down, z forward of a camera that looks nearly down.
 TURN = Rotation.from_euler("XYZ", (178.0, 3.0, 40.0), degrees=True).as_matrix().T
-"""World to x right, y down, z forward of a camera that looks nearly down."""
 GROUP = """<Name>wide</Name>
 <ImageDimensions><Width>6000</Width><Height>4000</Height></ImageDimensions>
 <FocalLength>24</FocalLength><SensorSize>36</SensorSize>

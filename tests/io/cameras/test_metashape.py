@@ -20,8 +20,7 @@ pytestmark = pytest.mark.quick_but(
 
 
 ONE = "1 0 0 {} 0 1 0 {} 0 0 1 {} 0 0 0 1"
-QUARTER = "0 -1 0 1 0 0 0 0 1"
-"""A quarter turn about z: (x, y, z) goes to (-y, x, z)."""
+QUARTER = "0 -1 0 1 0 0 0 0 1"  # a quarter turn about z: (x, y, z) goes to (-y, x, z)
 
 UTM30 = CRS("EPSG:25830").to_wkt("WKT1_GDAL")
 UTM30 = UTM30.replace('AUTHORITY["EPSG","6258"]', 'TOWGS84[0,0,0,0,0,0,0],AUTHORITY["EPSG","6258"]')

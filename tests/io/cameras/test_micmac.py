@@ -124,12 +124,13 @@ CALIBRATION_2 = """<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>
 <PerfectProj><F>{f}</F><PP>{x} {y}</PP></PerfectProj>
 <Distorsion>{terms}</Distorsion></InternalCalibration></Data></Root>"""
 FILE_2 = "Calib-PerspCentral-Foc-28000_Cam-PENTAX_K5.xml"
+# The calibration of the same image by version 1: pixels, radial about the principal point.
 BY_V1 = {
     "f": 2112.04115765381403, "x": 856.865441648138244, "y": 577.614006671525772,
     "k": (-2.13187449928481487e-08, 1.7226374299904674e-15, 5.49746079672967297e-21,
           -2.41801731114306416e-27),
 }  # fmt: skip
-"""The calibration of the same image by version 1: pixels, radial about the principal point."""
+# Image places and points by which version 1 checks its file of that pose (its `Verif`).
 SEEN_BY_V1 = [
     ((796.228448867797738, 622.67246246337902), (2.342012894, 1.18060072005993355, 1.5238954104)),
     ((1333.43151855468409, 435.223903656006939), (-0.8743145176, 1.1176173229, 2.44423536554699)),
@@ -137,7 +138,6 @@ SEEN_BY_V1 = [
     ((1700.28139114184114, 47.3248143208406162), (0.4589538174, 0.2551497878, 3.16255323043381)),
     ((1544.98360061627091, 738.844093322710933), (0.1693280845, 1.7953410696, 2.85824590322565)),
 ]
-"""Image places and points by which version 1 checks its file of that pose (its `Verif`)."""
 
 
 def version_2(folder, terms="", f=F, x=PP[0], y=PP[1], pose=POSE_2):

@@ -21,8 +21,8 @@ pytestmark = pytest.mark.quick_but("test_refused", "test_tracks_fall_where_the_i
 RADIAL, T1, T2 = (-0.05, 0.02, -0.003), 0.004, -0.002
 POLYNOMIAL, AFFINE = (0.01, 1.0, 0.02, -0.1), (1810.0, 3.0, -2.0, 1800.0)
 SIZE = (4000, 3000)
+# Of a pixel coordinate below 4096, and of points some tens of metres from their node.
 FLOAT32_PX = 3e-4
-"""Of a pixel coordinate below 4096, and of points some tens of metres from their node."""
 
 
 def seen(kind, angles_deg, centre, point):
