@@ -242,7 +242,7 @@ def _bed_notes(found: Adjusted) -> list[PcfixWarning]:
     if gsd < BED_GSD:
         return []
     words = (
-        f"The heights of the bed have a standard error of {sigma_m:.2f} m ({gsd:.1f} ground"
+        f"The heights of the bed have a median standard error of {sigma_m:.2f} m ({gsd:.1f} ground"
         " pixels). Give control points, GNSS positions of more images that are not on one line,"
         " or a calibrated lens."
     )

@@ -19,7 +19,7 @@ _FACTS: RowTable = (
      " (RMS)", "moved"),
     ("", "centres known to {precision[centre_mean_m]:z.4f} m (X, Y, Z), angles to"
      " {precision[angle_mean_deg]:z.4f} deg (mean standard errors)", "is_precise"),
-    ("Bed", "heights known to {bed_m:.3f} m (standard error{bed_if})", "bed_m"),
+    ("Bed", "heights known to {bed_m:.3f} m (standard error, RMS{bed_if})", "bed_m"),
     ("Observations", "{o[used]:,} {kind} used, {o[excluded]:,} excluded ({o_share})", "o"),
     ("Fit", "sigma0 {sigma0:.3f}, redundancy {redundancy:,}", "images"),
     ("GNSS", "{gnss[images]:,} images. Centres minus GNSS (east, north, up): mean"
@@ -94,7 +94,7 @@ def _facts(d: Plain) -> Rows:
         "poses_words": f"free{network}" if is_free else "fixed", "o": o, "kind": kinds[d["source"]],
         "o_share": share(o["excluded"], o["used"] + o["excluded"]),
         "moved": is_free and d["poses"]["moved_rms_m"], "is_precise": is_free,
-        "bed_if": "" if is_free else ", if the fixed poses are right",
+        "bed_if": "" if is_free else "; if the fixed poses are right",
         "bed_m": (d["residuals"]["water"]["sigma_xyz_m"] or [None])[-1],
         "surveyed": [
             {"role": role.capitalize(), "count": len(d[role]["points"]), **d[role]}
