@@ -13,6 +13,8 @@ import pytest
 from hypothesis import settings
 from numba.core import event
 
+from pcfix.running import threads
+
 # By day each run has the same examples, so that a change fails and not luck; at night others.
 settings.register_profile("default", max_examples=20, deadline=None, derandomize=True)
 settings.register_profile("nightly", max_examples=250, deadline=None, derandomize=False)
@@ -48,6 +50,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     two += [item for others in rooms.values() for item in others]
     middle = max(0, len(items) // 2 - len(one))
     items[:] = [*one, *short[:middle], *two, *short[middle:]]
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Small blocks lose more by waking a second thread than they gain."""
+    with threads(1):
+        yield
 
 
 class NoCompilation(event.Listener):

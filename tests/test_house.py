@@ -74,10 +74,6 @@ def trees() -> dict[str, ast.Module]:
     return {name_of(path): ast.parse(path.read_text("utf-8")) for path in HOUSE.rglob("*.py")}
 
 
-def is_package(name: str) -> bool:
-    return (HOUSE.parent.joinpath(*name.split(".")) / "__init__.py").exists()
-
-
 def imported(name: str, node: ast.AST) -> set[str]:
     """Return the full names that one statement imports, a file where it names one."""
     if isinstance(node, ast.Import):
@@ -86,7 +82,8 @@ def imported(name: str, node: ast.AST) -> set[str]:
         return set()
     base = node.module or ""
     if node.level:
-        parts = name.split(".")[: None if is_package(name) else -1]
+        is_package = HOUSE.parent.joinpath(*name.split("."), "__init__.py").exists()
+        parts = name.split(".")[: None if is_package else -1]
         parts = parts[: len(parts) - node.level + 1]
         base = ".".join([*parts, *base.split(".")] if base else parts)
     whole = {f"{base}.{alias.name}" for alias in node.names}

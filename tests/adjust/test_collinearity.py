@@ -63,19 +63,15 @@ def pose(seed: int):
     return rng.uniform(-5.0, 5.0, 3), DOWN @ turn.as_matrix()
 
 
-def state_of(q, centre, rotation, lens, water, port=None):
-    numbers = np.pad(np.asarray(water, float), (0, PLANES - len(water)))
-    port = window_of(port_of(SimpleNamespace(port=port), numbers))
-    return State(centre[None], rotation[None], lens[None], q[None], numbers, port)
-
-
 def at(q, centre, rotation, lens, water, given, port=None):
     return gradients(q, centre, rotation, lens, water, given, port)[0]
 
 
 def gradients(q, centre, rotation, lens, water, given, port=None):
     work, out = workspace(given), np.zeros((2, WIDTH))
-    state = state_of(q, centre, rotation, lens, water, port)
+    numbers = np.pad(np.asarray(water, float), (0, PLANES - len(water)))
+    port = window_of(port_of(SimpleNamespace(port=port), numbers))
+    state = State(centre[None], rotation[None], lens[None], q[None], numbers, port)
     uv = image_and_all_gradients(state, given, 0, 0, work, out)
     return np.array(uv), out[:, : SURFACE + len(water)], work.ahead
 

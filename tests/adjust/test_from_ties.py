@@ -37,10 +37,10 @@ def codes(found):
     return [note.code for note in found.notes]
 
 
-def with_gross_errors(data, share=0.05):
-    """Return tie points of which some are 5 to 50 px off, and which."""
+def with_gross_errors(data):
+    """Return tie points of which 5 % are 5 to 50 px off, and which."""
     rng = np.random.default_rng(4)
-    bad = rng.random(len(data.views.camera)) < share
+    bad = rng.random(len(data.views.camera)) < 0.05
     angle, length = rng.uniform(0.0, 2.0 * np.pi, len(bad)), rng.uniform(5.0, 50.0, len(bad))
     error = np.where(bad, length, 0.0)[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
     return replace(data.ties, image_xy=data.ties.image_xy + error), bad

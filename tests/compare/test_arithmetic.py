@@ -14,14 +14,6 @@ pytestmark = pytest.mark.quick
 EAST_M, NORTH_M = 456_000.0, 5_432_000.0
 
 
-def scattered(count, seed, side_m=40.0):
-    """Return points over a wavy bed, UTM-like coordinates."""
-    rng = np.random.default_rng(seed)
-    xy = rng.uniform(0.0, side_m, (count, 2))
-    z = -3.0 + 0.4 * np.sin(xy[:, 0] / 5.0) + 0.05 * xy[:, 1] + rng.normal(0.0, 0.02, count)
-    return np.column_stack([xy[:, 0] + EAST_M, xy[:, 1] + NORTH_M, z])
-
-
 def test_nearest_height_without_plane():
     """Neighbours on a line, places far outside, and coincident points."""
     line = np.column_stack([np.arange(20.0), np.zeros(20), np.arange(20.0)])
@@ -81,7 +73,11 @@ def test_bins():
 
 
 def test_section():
-    cloud = scattered(4000, 16)
+    """Points over a wavy bed, in UTM-like coordinates."""
+    rng = np.random.default_rng(16)
+    xy = rng.uniform(0.0, 40.0, (4000, 2))
+    z = -3.0 + 0.4 * np.sin(xy[:, 0] / 5.0) + 0.05 * xy[:, 1] + rng.normal(0.0, 0.02, 4000)
+    cloud = np.column_stack([xy[:, 0] + EAST_M, xy[:, 1] + NORTH_M, z])
     line = parse_line(f"{EAST_M + 5},{NORTH_M + 5},{EAST_M + 35},{NORTH_M + 25}")
     layers = {"corrected": cloud, "reference": np.add(cloud, (0, 0, 1.5))}
     section = section_along(line, layers, 2.0)

@@ -15,7 +15,6 @@ from tests.utils.clouds import WATER_M, write_cloud
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
 
-LONG = "9" * 300
 NOT_UTF8 = os.fsdecode(b"h\xf6he")
 
 
@@ -60,7 +59,7 @@ def label(cloud="cloud.las", output="out.las", water=str(WATER_M)):
 
 KINDS = {
     "loop": "one",
-    "long name": f"{LONG}.x",
+    "long name": "9" * 300 + ".x",
     "folder": "folder",
     "pipe": "pipe",
     "device": os.devnull,

@@ -13,19 +13,14 @@ from pcfix.lens.imaging import straight_images
 from pcfix.model import Views
 from pcfix.options.correct import AdjustOptions
 from pcfix.refract.choice import views_in_frame
-from pcfix.running import threads
 from tests.utils.adjust_files import IMAGE_PX, write_block
 from tests.utils.codes import refused
 from tests.utils.program import run_pcfix
 
-pytestmark = pytest.mark.filterwarnings("default::pcfix.errors.PcfixWarning")
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """So small a block loses more by waking a second thread than it gains."""
-    with threads(1):
-        yield
+pytestmark = [
+    pytest.mark.filterwarnings("default::pcfix.errors.PcfixWarning"),
+    pytest.mark.usefixtures("one_thread"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -52,23 +47,17 @@ def centre_rms_m(files, cameras):
     return float(np.sqrt((off * off).mean()))
 
 
-def heights_rms_m(files, cloud):
-    """Return the errors of the cloud's heights, bed and land."""
-    z, truth = np.array(laspy.read(cloud).z), files.truth[:, 2]
-    wet = truth < files.water
-    return [float(np.sqrt(np.mean((z - truth)[rows] ** 2))) for rows in (wet, ~wet)]
-
-
-SNELL = {"method": "snell", "max_angle": None}
-
-
 def home(files, new, **more):
+    """Return the rms errors of the heights of the corrected cloud, bed and land."""
     out = files.folder / "home.las"
     pcfix.correct_file(
         files.folder / "cloud.las", out, cameras=new, adjusted_from=files.folder / "model",
-        overwrite=True, **{"water": files.water, **SNELL, **more},
+        overwrite=True,
+        **{"water": files.water, "method": "snell", "max_angle": None, **more},
     )  # fmt: skip
-    return heights_rms_m(files, out)
+    z, truth = np.array(laspy.read(out).z), files.truth[:, 2]
+    wet = truth < files.water
+    return [float(np.sqrt(np.mean((z - truth)[rows] ** 2))) for rows in (wet, ~wet)]
 
 
 def test_tie_points(files, written):

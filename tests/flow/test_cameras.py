@@ -80,19 +80,7 @@ def test_heights_off_by_the_geoid(tmp_path):
 
 
 LENS = Lens(3650.0, 5472.0, 3648.0, 2736.0, 1824.0, radial=(-0.02,), sensor="S")
-
-
-def sensors_with(lenses):
-    """Return the sensors of images that have these lenses."""
-    k = len(lenses)
-    cameras = Cameras(
-        tuple(f"{i}.jpg" for i in range(k)), np.zeros((k, 3)), np.tile(np.eye(3), (k, 1, 1)), lenses
-    )
-    return sensors_of(cameras, np.full(k, 80.0))
-
-
 SERIES = [replace(LENS, focal=3650.0 + i) for i in range(177)]
-OTHER = replace(LENS, focal=3700.0, sensor="T")
 
 
 @pytest.mark.parametrize(
@@ -100,11 +88,14 @@ OTHER = replace(LENS, focal=3700.0, sensor="T")
     [
         (SERIES, [177], [177]),  # a calibration for each image
         ([replace(one, sensor=f"{i % 3}") for i, one in enumerate(SERIES)], [59] * 3, [59] * 3),
-        ([LENS] * 5 + [OTHER] * 5, [5, 5], [1, 1]),
+        ([LENS] * 5 + [replace(LENS, focal=3700.0, sensor="T")] * 5, [5, 5], [1, 1]),
     ],
 )  # fmt: skip
 def test_groups_of_lenses(lenses, images, different):
-    sensors = sensors_with(tuple(lenses))
+    k = len(lenses)
+    labels, rotations = tuple(f"{i}.jpg" for i in range(k)), np.tile(np.eye(3), (k, 1, 1))
+    cameras = Cameras(labels, np.zeros((k, 3)), rotations, tuple(lenses))
+    sensors = sensors_of(cameras, np.full(k, 80.0))
     assert [sensor["images"] for sensor in sensors] == images
     assert [sensor["lenses"] for sensor in sensors] == different
     most = [max(one.focal for one in lenses if sensor["name"] == one.sensor)

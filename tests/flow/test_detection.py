@@ -31,15 +31,11 @@ def scene_of(cloud="tracks", points=12_000, **settings):
     return matched_scene(points, cloud=cloud, **{**BLOCK, **settings})
 
 
-def wet(scene):
-    """Return points that were made, and are under water before and after."""
+def covered(scene, found):
     made = np.diff(scene.views.start) > 1
     deep = scene.depth_m(scene.true_xyz) > 0.2
-    return made & deep & (scene.depth_m(scene.apparent_xyz) > 0.0)
-
-
-def covered(scene, found):
-    rows = np.flatnonzero(wet(scene) & found.corrected)
+    wet = made & deep & (scene.depth_m(scene.apparent_xyz) > 0.0)
+    rows = np.flatnonzero(wet & found.corrected)
     error = found.xyz[rows, 2] - scene.true_xyz[rows, 2]
     return float(np.mean(np.abs(error) <= 1.96 * found.sigma_z_m[rows]))
 

@@ -24,9 +24,6 @@ from tests.utils.program import run_pcfix
 
 shapely = pytest.importorskip("shapely")
 
-LAKE = shapely.box(EAST_M + 20, NORTH_M + 10, EAST_M + 90, NORTH_M + 100)
-ISLAND = shapely.box(EAST_M + 40, NORTH_M + 40, EAST_M + 60, NORTH_M + 70)
-
 
 @pytest.fixture
 def path(tmp_path):
@@ -36,28 +33,16 @@ def path(tmp_path):
 @pytest.fixture
 def mask(tmp_path):
     """Return a lake with an island, in the CRS of `random_cloud`."""
-    return write_area(tmp_path / "lake.geojson", LAKE.difference(ISLAND))
+    lake = shapely.box(EAST_M + 20, NORTH_M + 10, EAST_M + 90, NORTH_M + 100)
+    island = shapely.box(EAST_M + 40, NORTH_M + 40, EAST_M + 60, NORTH_M + 70)
+    return write_area(tmp_path / "lake.geojson", lake.difference(island))
 
 
-def write_area(path, area, srid=32633):
+def write_area(path, area):
     pytest.importorskip("pyogrio")
-    crs = {"type": "name", "properties": {"name": f"urn:ogc:def:crs:EPSG::{srid}"}}
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32633"}}
     path.write_text(json.dumps({**shapely.geometry.mapping(area), "crs": crs}))
     return path
-
-
-def metadata(las):
-    """Return what PDAL says of a cloud, its CRS included."""
-    found = metadata_of(las.header)
-    wkt = las.header.parse_crs().to_wkt()
-    found["children"][0]["children"].append({"name": "comp_spatialreference", "value": wkt})
-    return found
-
-
-def inside(x, y):
-    east, north = np.asarray(x) - EAST_M, np.asarray(y) - NORTH_M
-    lake = (east >= 20) & (east <= 90) & (north >= 10) & (north <= 100)
-    return lake & ~((east > 40) & (east < 60) & (north > 40) & (north < 70))
 
 
 @pytest.mark.parametrize("point_format", [1, 3, 5, 6, 8, 10])
@@ -69,7 +54,10 @@ def test_rest_kept(tmp_path, mask, point_format, suffix):
     before, after = read_raw(path), read_raw(target)
     old, new = fields(before), fields(after)
     source = laspy.read(path)
-    wet = (np.asarray(source.z) < WATER_M) & inside(source.x, source.y)
+    east, north = np.asarray(source.x) - EAST_M, np.asarray(source.y) - NORTH_M
+    lake = (east >= 20) & (east <= 90) & (north >= 10) & (north <= 100)
+    island = (east > 40) & (east < 60) & (north > 40) & (north < 70)
+    wet = (np.asarray(source.z) < WATER_M) & lake & ~island
     assert after.version == (1, 4)
     assert result.submerged == wet.sum() > 100
     np.testing.assert_array_equal(new.pop("class"), np.where(wet, 40, old.pop("class")))
@@ -104,21 +92,22 @@ CHOICES = [
 ]
 
 
-def options_of(choices):
-    pairs = [(f"--{name.replace('_', '-')}", value) for name, value in choices.items()]
-    return [w for name, value in pairs for w in ([name] if value is True else [name, str(value)])]
-
-
 @pytest.mark.parametrize("choices", CHOICES)
 def test_label_doors(path, tmp_path, mask, choices, monkeypatch):
     las = laspy.read(path)
-    words = ["--water", WATER_M, "--water-mask", mask, *options_of(choices)]
+    words = ["--water", WATER_M, "--water-mask", mask]
+    for name, value in choices.items():
+        words += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
     summary = tmp_path / "s.json"
     done = run_pcfix("label", path, tmp_path / "a.las", *words, "--summary", summary)
     assert done.returncode == 0
     found = np.asarray(laspy.read(tmp_path / "a.las").classification)
-    outs, report = run("label", arrays_of(las), metadata(las), water=WATER_M,
-                       water_mask=str(mask), **choices)  # fmt: skip
+    metadata = metadata_of(las.header)
+    wkt = las.header.parse_crs().to_wkt()
+    metadata["children"][0]["children"].append({"name": "comp_spatialreference", "value": wkt})
+    outs, report = run(
+        "label", arrays_of(las), metadata, water=WATER_M, water_mask=str(mask), **choices
+    )
     np.testing.assert_array_equal(found, outs["Classification"])
     written = json.loads(summary.read_text())
     assert report["children"][0]["value"] == written["submerged"]

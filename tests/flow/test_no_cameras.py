@@ -28,17 +28,10 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def fitted(folder):
-    return {"method": "regression", "check_depths": folder / "checks.csv"}
-
-
-def asked(folder, method):
-    return {"method": "factor"} if method == "factor" else fitted(folder)
-
-
 @pytest.mark.parametrize("method", WITHOUT_CAMERAS)
 def test_with_and_without_cameras(folder, method):
-    options = {**NONE, **asked(folder, method)}
+    checks = {"check_depths": folder / "checks.csv"} if method == "regression" else {}
+    options = {**NONE, "method": method, **checks}
     bare = pcfix.correct_file(folder / "cloud.las", folder / "bare.las", **options)
     pcfix.correct_file(
         folder / "cloud.las", folder / "with.las", cameras=folder / "cameras.csv", **options

@@ -62,20 +62,16 @@ def scene():
     return bed, points + PLACE
 
 
-def raster_of(heights):
-    """Return a raster of a function of places, from `PLACE`."""
-    at = np.arange(-HALF_M + CELL_M / 2, HALF_M, CELL_M)
-    x, y = np.meshgrid(at, at[::-1])
-    values = heights(np.column_stack([x.ravel(), y.ravel()])) + np.zeros(x.size)
-    left, top = PLACE[0] - HALF_M, PLACE[1] + HALF_M
-    return WaterRaster(values.reshape(x.shape), left, top, (CELL_M, CELL_M))
-
-
 def write(folder, heights):
-    """Write a raster of each image."""
+    """Write a raster for each image, of a function of places from `PLACE`."""
     folder.mkdir(parents=True)
+    side = np.arange(-HALF_M + CELL_M / 2, HALF_M, CELL_M)
+    x, y = np.meshgrid(side, side[::-1])
     for number, one in enumerate(heights):
-        write_water_raster(folder / f"DJI_{number}.tif", raster_of(one), None)
+        values = one(np.column_stack([x.ravel(), y.ravel()])) + np.zeros(x.size)
+        corner = PLACE[0] - HALF_M, PLACE[1] + HALF_M
+        raster = WaterRaster(values.reshape(x.shape), *corner, (CELL_M, CELL_M))
+        write_water_raster(folder / f"DJI_{number}.tif", raster, None)
     return folder
 
 

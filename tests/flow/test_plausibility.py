@@ -44,10 +44,6 @@ def turned(block, degrees):
     return replace(block.cameras, rotations=block.cameras.rotations @ turn.T)
 
 
-def in_feet(block):
-    return replace(block.cameras, centres=block.cameras.centres / [1.0, 1.0, 0.3048])
-
-
 def in_radians(block):
     """The table with its angles in radians, read as degrees."""
     up = np.diag([1.0, -1.0, -1.0])
@@ -60,7 +56,7 @@ def in_radians(block):
 FAULTS = {
     "47 m too high": lambda b: moved(b, 0, 0, 47),
     "47 m too low": lambda b: moved(b, 0, 0, -47),
-    "feet": in_feet,
+    "feet": lambda b: replace(b.cameras, centres=b.cameras.centres / [1.0, 1.0, 0.3048]),
     "radians": in_radians,
     "yaw + 90": lambda b: turned(b, 90),
     "yaw + 180": lambda b: turned(b, 180),

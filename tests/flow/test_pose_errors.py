@@ -17,35 +17,18 @@ from pcfix.io.files import ENSEMBLE, write_members
 from pcfix.model import Cameras, Lens, Views, WaterPlane
 from pcfix.options.correct import ScienceOptions
 from pcfix.refract.batch import Survey
-from pcfix.running import threads
 from pcfix.simulate.tracing import project, triangulate
 from tests.utils.bed_rays import piercing_points
 from tests.utils.beyond_frames import BEYOND_FRAMES
 from tests.utils.clouds import WATER_M, cameras_csv, framed_block, write_cloud
 
-pytestmark = BEYOND_FRAMES
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Blocks so small lose more by waking a second thread than they gain."""
-    with threads(1):
-        yield
-
+pytestmark = [BEYOND_FRAMES, pytest.mark.usefixtures("one_thread")]
 
 LENS = Lens(1500.0, 1600.0, 1200.0, 800.0, 600.0)
 EXACT = ScienceOptions(
     method="consistent", camera_set="all", max_angle=None, sigma_image=0.0, sigma_level=0.0,
     sigma_index=0.0,
 )  # fmt: skip
-
-
-def three_cameras():
-    centres = np.array([[-18.0, -3.0, 62.0], [2.0, 9.0, 60.0], [17.0, -6.0, 61.0]])
-    tilts = Rotation.from_rotvec([[0.02, 0.15, 0.3], [-0.1, 0.03, 0.1], [0.05, -0.2, -0.2]])
-    return Cameras(
-        ("a", "b", "c"), centres, tilts.as_matrix() @ np.diag([1.0, -1.0, -1.0]), (LENS,) * 3
-    )
 
 
 UNKNOWNS = 21  # turn and centre of each camera, focal length, level and index
@@ -81,22 +64,13 @@ class SlowTwin:
         return fsolve(miss, near.ravel(), xtol=1e-10).reshape(-1, 3)
 
 
-def members_with(covariance, cameras):
-    """Return members whose mean square is a covariance of the unknowns of the twin, exactly."""
-    steps = np.sqrt(UNKNOWNS) * np.linalg.cholesky(covariance).T
-    poses, lens = steps[:, :18].reshape(-1, 3, 6), np.repeat(steps[:, None, 18:19], 3, axis=1)
-    nothing = np.zeros(UNKNOWNS)
-    return Members(
-        cameras.labels, np.full(3, LENS.focal), poses[:, :, :3],
-        np.einsum("kij,mkj->mki", cameras.rotations, poses[:, :, 3:]), ("f",), lens,
-        np.column_stack([steps[:, 19], nothing, nothing, steps[:, 20], *[nothing] * 3]),
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize("moved", [False, True], ids=["adjusted before", "adjusted since"])
 def test_same_as_twin(moved):
     rng = np.random.default_rng(5)
-    new = three_cameras()
+    centres = np.array([[-18.0, -3.0, 62.0], [2.0, 9.0, 60.0], [17.0, -6.0, 61.0]])
+    tilts = Rotation.from_rotvec([[0.02, 0.15, 0.3], [-0.1, 0.03, 0.1], [0.05, -0.2, -0.2]])
+    down = np.diag([1.0, -1.0, -1.0])
+    new = Cameras(("a", "b", "c"), centres, tilts.as_matrix() @ down, (LENS,) * 3)
     turn = Rotation.from_rotvec(rng.normal(0.0, 2e-3, (3, 3))).as_matrix()
     old = replace(
         new, centres=new.centres + rng.normal(0.0, 0.1, (3, 3)), rotations=turn @ new.rotations
@@ -106,7 +80,6 @@ def test_same_as_twin(moved):
     sigma = np.array([1e-4, 1e-4, 1e-4, 0.02, 0.02, 0.03] * 3 + [0.5, 0.01, 0.001])
     mix = rng.normal(size=(UNKNOWNS, 2 * UNKNOWNS))
     correlation = np.corrcoef(mix)
-    covariance = correlation * sigma * sigma[:, None]
 
     image, _ = project(np.repeat(xyz, 3, axis=0), old, np.arange(12) % 3, LENS)
     twin, zero = SlowTwin(new, image), np.zeros(UNKNOWNS)
@@ -116,7 +89,16 @@ def test_same_as_twin(moved):
     )
     wanted = np.einsum("an,ab,bn->n", by, correlation, by)
 
-    members = members_with(covariance, new)
+    # members whose mean square is exactly the covariance of the unknowns of the twin
+    covariance = correlation * sigma * sigma[:, None]
+    steps = np.sqrt(UNKNOWNS) * np.linalg.cholesky(covariance).T
+    poses, lens = steps[:, :18].reshape(-1, 3, 6), np.repeat(steps[:, None, 18:19], 3, axis=1)
+    nothing = np.zeros(UNKNOWNS)
+    members = Members(
+        new.labels, np.full(3, LENS.focal), poses[:, :, :3],
+        np.einsum("kij,mkj->mki", new.rotations, poses[:, :, 3:]), ("f",), lens,
+        np.column_stack([steps[:, 19], nothing, nothing, steps[:, 20], *[nothing] * 3]),
+    )  # fmt: skip
     views = Views(np.arange(0, 13, 3), np.arange(12) % 3)
     sample = Points(xyz, None, np.zeros(4, np.uint8), views=views)
     survey = Survey(WaterPlane(LEVEL_M), new, replace(EXACT, index=N))

@@ -130,9 +130,8 @@ def test_auto_without_datum(scene, tmp_path):
     one, other = (laspy.read(tmp_path / name) for name in ("out/corrected.laz", "plain.laz"))
     np.testing.assert_array_equal(one.points.array, other.points.array)
     assert not (tmp_path / "out" / "adjusted").exists()
-    lines = [line for line in printed if line.startswith("adjust")]
-    assert len(lines) == 1
-    assert lines[0].startswith("adjust    skipped: the camera file has no GNSS positions")
+    (line,) = [line for line in printed if line.startswith("adjust")]
+    assert line.startswith("adjust    skipped: the camera file has no GNSS positions")
     assert "not adjusted: the camera file has no GNSS positions" in page.read_text()
 
 

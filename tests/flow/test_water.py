@@ -18,22 +18,6 @@ LEVEL_M = 0.37
 CRS = "EPSG:32633"
 
 
-def shoreline(scene, seed, count=30, noise_m=0.01, outliers=0.2):
-    """Return points on two banks, and the rows of the fifth that are decimetres off."""
-    rng, (low, high) = np.random.default_rng(seed), bounds(scene)
-    x = rng.uniform(low[0], high[0], count)
-    y = np.where(rng.random(count) < 0.5, low[1], high[1])
-    xy = np.column_stack([x, y + rng.uniform(-1.0, 1.0, count)])
-    z = height_at(scene.water, xy) + rng.normal(0.0, noise_m, count)
-    wrong = rng.permutation(count)[: round(outliers * count)]
-    z[wrong] += rng.choice([-1.0, 1.0], len(wrong)) * rng.uniform(0.3, 2.0, len(wrong))
-    return np.column_stack([xy, z]), wrong
-
-
-def bounds(scene):
-    return scene.apparent_xyz[:, :2].min(axis=0), scene.apparent_xyz[:, :2].max(axis=0)
-
-
 def height_at(water, xy):
     return water.a + xy @ [water.b, water.c]
 
@@ -56,9 +40,17 @@ def write_points(path, xyz, names="x,y,z"):
 
 def test_tilted_river(tmp_path):
     scene = pcfix.simulate_scene(3000, seed=11, tilt_percent=0.5)
-    points, wrong = shoreline(scene, seed=5)
+    low, high = scene.apparent_xyz[:, :2].min(axis=0), scene.apparent_xyz[:, :2].max(axis=0)
+    # points on two banks, of which a fifth is decimetres off
+    rng = np.random.default_rng(5)
+    x = rng.uniform(low[0], high[0], 30)
+    y = np.where(rng.random(30) < 0.5, low[1], high[1])
+    xy = np.column_stack([x, y + rng.uniform(-1.0, 1.0, 30)])
+    z = height_at(scene.water, xy) + rng.normal(0.0, 0.01, 30)
+    wrong = rng.permutation(30)[:6]
+    z[wrong] += rng.choice([-1.0, 1.0], 6) * rng.uniform(0.3, 2.0, 6)
+    points = np.column_stack([xy, z])
     fit = check_water(write_points(tmp_path / "shore.csv", points))[0]
-    low, high = bounds(scene)
     corners = low + np.array([[x, y] for x in (0, 1) for y in (0, 1)]) * (high - low)
     places = np.column_stack([corners, corners[:, :1]])
     miss = surface_above(fit.surface, places).height_m - height_at(scene.water, corners)

@@ -120,7 +120,7 @@ def pix4d_params(folder: Path) -> Path:
         parameters=pix4d.HEADER + pix4d.block(label, (10.5, 20.25, 30.0)),
         offset="500000.000 4000000.000 100.000\n",
         external=pix4d.external((label, 500_010.5, 4_000_020.25, 130.0, 0, 0, 0)),
-        wkt=pix4d.utm_wkt(),
+        wkt=pix4d.WKT,
         bingo="a b H_12_8\n1 10.5 -20.5\n2 3.25 4\n-99\n",
         gcps="g1 500000 4000000 10 500000.1 4000000.1 10.1\n",
     )

@@ -62,22 +62,16 @@ def test_no_seams(awkward_cloud, tmp_path, monkeypatch, method, fill):
             np.testing.assert_array_equal(one, other, err_msg=name)
 
 
-def with_sigma(path, xyz, sigma):
-    """Write a cloud with the dimension that a correction leaves, in tenths of a millimetre."""
-    las = laspy.read(write(path, xyz, classes=40))
-    las.add_extra_dim(
-        laspy.ExtraBytesParams("SigmaZ", "uint16", scales=np.array([1e-4]), offsets=np.zeros(1))
-    )
-    las["SigmaZ"] = sigma
-    las.write(path)
-    return path
-
-
 def test_uncertainty(tmp_path):
     xyz = scattered(4000, 20.0, 15.0)
     sigma = np.round(np.random.default_rng(1).uniform(0.01, 0.3, 4000), 4)
     sigma[xyz[:, 0] < EAST + 8.0] = 0.0  # land
-    path = with_sigma(tmp_path / "cloud.las", xyz, sigma)
+    path = write(tmp_path / "cloud.las", xyz, classes=40)
+    las = laspy.read(path)
+    tenths_mm = {"scales": np.array([1e-4]), "offsets": np.zeros(1)}  # as a correction writes it
+    las.add_extra_dim(laspy.ExtraBytesParams("SigmaZ", "uint16", **tenths_mm))
+    las["SigmaZ"] = sigma
+    las.write(path)
     with pytest.raises(InputError):  # no dimension WaterDepth
         grid_dsm(path, tmp_path / "d.tif", what="depth")
     summary = grid_dsm(path, tmp_path / "d.tif", resolution=1.0, what="uncertainty")

@@ -68,24 +68,18 @@ def test_standard_error(beach, tmp_path, off_m):
         assert length == pytest.approx(line.length)
 
 
-def island_and_pool(count=60_000, noise_m=0.02):
-    """Return points of a beach at x = 10 with an island of radius 6 m and a pool of 4 m."""
+@pytest.mark.parametrize("most", [2_000_000, 20_000])
+def test_islands_and_pools(monkeypatch, most):
+    """A beach at x = 10 with an island of radius 6 m and a pool of 4 m."""
+    monkeypatch.setattr(maps, "MOST_POINTS", most)
     rng = np.random.default_rng(5)
-    x, y = rng.uniform(0.0, (100.0, 60.0), (count, 2)).T
+    x, y = rng.uniform(0.0, (100.0, 60.0), (60_000, 2)).T
     island = 0.2 * (6.0 - np.hypot(x - 60.0, y - 30.0))
     above = np.maximum(0.1 * (10.0 - x), island)
     pool = 0.2 * (np.hypot(x - 30.0, y - 20.0) - 4.0)
     spit = 0.2 * (8.0 - np.hypot(x - 30.0, y - 20.0))  # the land about the pool
-    above = np.maximum(above, np.minimum(pool, spit))
-    return np.column_stack([x, y, above + rng.normal(0.0, noise_m, count)])
-
-
-@pytest.mark.parametrize("most", [2_000_000, 20_000])
-def test_islands_and_pools(monkeypatch, most):
-    monkeypatch.setattr(maps, "MOST_POINTS", most)
-    points = island_and_pool()
-    moved, above = points + np.array([4e5, 4e6, 0.0]), points[:, 2]
-    columns = np.column_stack([moved, above, np.zeros(len(points))])
+    above = np.maximum(above, np.minimum(pool, spit)) + rng.normal(0.0, 0.02, len(x))
+    columns = np.column_stack([x + 4e5, y + 4e6, above, above, np.zeros(len(x))])
     lines = waterlines(np.array_split(columns, 7), 0.01)
     expected = [60.0, 16.0 * math.pi, 12.0 * math.pi, 8.0 * math.pi]
     assert [one.length_m for one in lines] == pytest.approx(expected, rel=0.05)

@@ -86,17 +86,14 @@ def write_ply(path, xyz, lists=None, weights=None, order="<", count="uint8", pos
     return path
 
 
-def rows_of(views):
-    return [views.camera[a:b].tolist() for a, b in zip(views.start, views.start[1:], strict=False)]
-
-
 def given(match, xyz, chunk=150):
     """Return the cameras of each point of a cloud in chunks, their weights, and the counts."""
     match = match.with_image_order(xyz[:chunk])
     found = [match.views_of(xyz[i : i + chunk], i) for i in range(0, len(xyz), chunk)]
     parts, report = [views for views, _ in found], reduce(operator.add, [one for _, one in found])
     weights = None if parts[0].weight is None else np.concatenate([one.weight for one in parts])
-    return [row for p in parts for row in rows_of(p)], weights, report
+    rows = [row.tolist() for one in parts for row in np.split(one.camera, one.start[1:-1])]
+    return rows, weights, report
 
 
 def match_of(path, cameras, points=None, **more):
@@ -272,18 +269,15 @@ def test_damaged_model(tmp_path, cameras, scene):
 # --- tie points ------------------------------------------------------------------------------
 
 
-def tie_points(xyz, lists):
-    start = np.concatenate([[0], np.cumsum([len(one) for one in lists])])
-    camera = np.array([c for one in lists for c in one])
-    return TiePoints(xyz, Views(start, camera), np.zeros((len(camera), 2)))
-
-
 def test_nearest_track(cameras, scene):
     xyz, lists = scene
     sparse = xyz.copy()
     sparse[5] = np.nan
     again = [[*reversed(one), one[0]] for one in lists]  # out of order, one image twice
-    views = track_views(Path("m"), tie_points(sparse, again), cameras)
+    start = np.concatenate([[0], np.cumsum([len(one) for one in again])])
+    tracks = Views(start, np.concatenate(again))
+    ties = TiePoints(sparse, tracks, np.zeros((len(tracks.camera), 2)))
+    views = track_views(Path("m"), ties, cameras)
     match = ViewMatch(views, cameras)
     near = np.delete(xyz, 5, axis=0) + np.array([0, 0, 0.02])
     found, _, report = given(match, near)

@@ -27,7 +27,7 @@ def cloud(tmp_path):
     return path, arrays_of(laspy.read(path)), metadata_of(laspy.read(path).header)
 
 
-def arrays_of(las, added=None):
+def arrays_of(las):
     ins = {axis: np.array(las[axis.lower()]) for axis in "XYZ"}
     ins["Classification"] = np.array(las.classification)
     ins["ClassFlags"] = (
@@ -36,7 +36,7 @@ def arrays_of(las, added=None):
         | np.array(las.withheld) << 2
         | np.array(las.overlap) << 3
     ).astype(np.uint8)
-    for word in (added or add_dimension(COLUMNS)).split(","):
+    for word in add_dimension(COLUMNS).split(","):
         name, kind = word.split("=")
         ins[name] = np.zeros(len(las), DTYPES[kind])
     return ins

@@ -13,27 +13,18 @@ K = 12
 FEW, OUTLIERS = 15_000, 75
 
 
-def _clustered(n: int = 500) -> np.ndarray:
+def test_neighbours_of_all_pairs() -> None:
     """Clusters of many densities in UTM, with one point at the origin of the coordinates."""
     rng = np.random.default_rng(2)
     centres = rng.uniform(0.0, 50.0, (9, 3))
     spread = 10.0 ** rng.uniform(-1.5, 1.0, (9, 1))
-    which = rng.integers(0, 9, n)
-    xyz = centres[which] + rng.normal(size=(n, 3)) * spread[which] + (410_200.0, 4_650_300.0, 0.0)
-    xyz[n // 2] = 0.0
-    return np.asarray(xyz)
-
-
-def _pairs(xyz: np.ndarray, axes: int) -> np.ndarray:
-    """The distance of every point from every other."""
-    difference = xyz[:, None, :axes] - xyz[None, :, :axes]
-    return np.sqrt((difference**2).sum(axis=-1))
-
-
-def test_neighbours_of_all_pairs() -> None:
-    xyz = _clustered()
+    which = rng.integers(0, 9, 500)
+    xyz = centres[which] + rng.normal(size=(500, 3)) * spread[which]
+    xyz += (410_200.0, 4_650_300.0, 0.0)
+    xyz[250] = 0.0
     for axes in (2, 3):
-        twin = np.sort(_pairs(xyz, axes), axis=1)[:, :K]
+        every = np.linalg.norm(xyz[:, None, :axes] - xyz[None, :, :axes], axis=2)
+        twin = np.sort(every, axis=1)[:, :K]
         for points in (2, 20, 90, 400, 1_000_000):
             cut = make_tiles(xyz, points=points)
             near, found = Neighbours(cut, axes), np.empty(twin.shape)

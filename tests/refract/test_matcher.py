@@ -21,17 +21,6 @@ def test_simulated_partners(obliques):
     assert share_found(found, partners) > 0.85  # 0.95 and 0.92 of larger blocks with more points
 
 
-def real_block():
-    local, cameras = block_of(RENDERED)
-    rows = {name.rpartition(".")[0]: i for i, name in enumerate(local.labels)}
-    partners = {}
-    for line in (RENDERED / "neighbours.txt").read_text().splitlines():
-        if not line.startswith("#"):
-            mine, *others = (rows[name.rpartition(".")[0]] for name in line.split())
-            partners[mine] = others
-    return local, cameras, partners
-
-
 def share_found(matched, partners):
     found = sum(len(set(matched[i].tolist()) & set(row)) for i, row in partners.items())
     return found / sum(map(len, partners.values()))
@@ -39,7 +28,13 @@ def share_found(matched, partners):
 
 @rendered
 def test_real_partners():
-    local, cameras, partners = real_block()
+    local, cameras = block_of(RENDERED)
+    rows = {name.rpartition(".")[0]: i for i, name in enumerate(local.labels)}
+    partners = {}
+    for line in (RENDERED / "neighbours.txt").read_text().splitlines():
+        if not line.startswith("#"):
+            mine, *others = (rows[name.rpartition(".")[0]] for name in line.split())
+            partners[mine] = others
     of_places = matcher_of(cameras, cloud_of(RENDERED / "cloud.las")[::60])
     # 147 of 160; the software went by tie points, and the cloud is denser where texture is good
     assert share_found(of_places.matched, partners) >= 0.88

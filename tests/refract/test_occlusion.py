@@ -16,15 +16,11 @@ RENDERED, rendered = needs("rendered_a")
 UTM = np.array([512_345.678, 4_987_654.321, 0.0])
 
 
-def to_all(n, k):
-    """Return the views in which each of n points has all of k cameras."""
-    return Views(np.arange(n + 1) * k, np.tile(np.arange(k), n))
-
-
 def hidden_of(xyz, centres, occluder):
     """Return whether each camera is hidden from each point, shape (n, k)."""
     n, k = len(xyz), len(centres)
-    return occluded(xyz, centres, to_all(n, k), occluder).reshape(n, k)
+    of_all = Views(np.arange(n + 1) * k, np.tile(np.arange(k), n))
+    return occluded(xyz, centres, of_all, occluder).reshape(n, k)
 
 
 def ring(incidence_deg, away_m=100.0, k=8):

@@ -60,11 +60,6 @@ def run(xyz, views, learned, original_model, kind="depth-maps"):
     return correct(batch_of(xyz, *given, learned=learned, original_model=original_model))
 
 
-def some_points():
-    rng = np.random.default_rng(9)
-    return np.column_stack([rng.uniform(-12, 12, (60, 2)), rng.uniform(-6, 0.0, 60)])
-
-
 @pytest.mark.parametrize(
     ("maps", "metric"), [((5,), "angles"), (NADIR, "angles"), (MIXED, "angles"), (MIXED, "pixels")]
 )
@@ -108,7 +103,8 @@ def test_transformed_block(kind):
     original = replace(
         CAMERAS, centres=elsewhere(CAMERAS.centres), rotations=CAMERAS.rotations @ turned.T
     )
-    xyz = some_points()
+    rng = np.random.default_rng(9)
+    xyz = np.column_stack([rng.uniform(-12, 12, (60, 2)), rng.uniform(-6, 0.0, 60)])
     views = listed([MIXED] * 60) if kind == "list" else None
     matching = "pairs" if kind == "pairs" else "depth-maps"
     bed = Bed(np.full((1, 1), -5.0), -20.0, -20.0, 50.0)

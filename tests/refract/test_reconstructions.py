@@ -41,14 +41,13 @@ CLOUDS = {
     "nearest-map": COARSE,
     "river of tracks": {"bed": "river"},
 }
-EVERY_NIGHT = mostly_nightly(CLOUDS, "tracks", "depth-maps", "single-map")
 
 
 def scene_of(kind, points=12_000, **choices):
     return simulated(points, cloud=kind, seed=1, lidar_per_m2=0.0, **choices)
 
 
-@pytest.mark.parametrize("name", EVERY_NIGHT)
+@pytest.mark.parametrize("name", mostly_nightly(CLOUDS, "tracks", "depth-maps", "single-map"))
 def test_simulated_cloud(name):
     kind, is_single = name.rpartition(" ")[2], CLOUDS[name] is COARSE
     scene = scene_of(kind, **CLOUDS[name])

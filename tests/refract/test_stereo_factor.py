@@ -41,17 +41,12 @@ def test_traced_light():
         assert 0.05 / apparent == pytest.approx(found[i, j], rel=2e-4)
 
 
-def measured(scene):
-    """Return true by apparent depth of a simulated cloud, on average."""
-    apparent, true = (scene.depth_m(xyz) for xyz in (scene.apparent_xyz, scene.true_xyz))
-    wet = (np.diff(scene.views.start) > 1) & (apparent > 0.5)
-    return float(np.mean(true[wet] / apparent[wet]))
-
-
 def test_simulated_block(scene):
     found = stereo_factor(scene.cameras, scene.water.a, N)
+    apparent, true = (scene.depth_m(xyz) for xyz in (scene.apparent_xyz, scene.true_xyz))
+    wet = (np.diff(scene.views.start) > 1) & (apparent > 0.5)
     # 1.4427 and 1.433: the points of the cloud have more images than a pair
-    assert found.factor == pytest.approx(measured(scene), rel=0.01)
+    assert found.factor == pytest.approx(np.mean(true[wet] / apparent[wet]), rel=0.01)
     assert found.height_m == pytest.approx(80.0, abs=0.5)
     assert (found.images, found.aside) == (40, 0)
     assert found.base_m == pytest.approx(15.77, abs=0.005)

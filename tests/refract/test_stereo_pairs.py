@@ -43,13 +43,6 @@ def under_water(scene):
     return np.flatnonzero(wet & (np.diff(scene.views.start) > 1))
 
 
-def with_pairs(scene, rows):
-    """Correct points with the images in their pairs and the partners that were matched."""
-    known = matcher_of(scene.cameras, scene.apparent_xyz)._replace(matched=scene.neighbours)
-    views = replace(scene.views, kind="pairs").take(rows)
-    return corrected(scene, rows, views, learned=Learned(matcher=known))
-
-
 def corrected(scene, rows, views, *, method="consistent", learned=None, **choices):
     xyz, n = scene.apparent_xyz[rows], scene.refractive_index
     settings = ScienceOptions(index=n, method=method, dimensions="none", **choices)
@@ -69,7 +62,10 @@ def errors_m(scene, rows, result):
 def test_pairs_without_noise(name):
     scene = scene_of(name, 0.0)
     rows = under_water(scene)
-    error = errors_m(scene, rows, with_pairs(scene, rows))
+    known = matcher_of(scene.cameras, scene.apparent_xyz)._replace(matched=scene.neighbours)
+    views = replace(scene.views, kind="pairs").take(rows)
+    result = corrected(scene, rows, views, learned=Learned(matcher=known))
+    error = errors_m(scene, rows, result)
     # images are taken as linear about each ray, which tells in narrow pairs of obliques: 9e-6 m
     # at most in 4400 points down to 12 m; the search itself ends 2e-6 m off
     assert np.abs(error).max() < 5e-5

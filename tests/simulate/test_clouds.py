@@ -67,15 +67,12 @@ class Twin:
 POSES = {"position_noise_m": 0.03, "attitude_noise_deg": 0.02}
 
 
-def views_of(scene, i):
-    return scene.views.camera[scene.views.start[i] : scene.views.start[i + 1]]
-
-
 def test_tracks_twin():
     scene = pcfix.simulate_scene(60, image_noise=0.0, tilt_percent=1.0, detection=0.7, **POSES)
-    twin = Twin(scene)
+    twin, start = Twin(scene), scene.views.start
     for i in range(0, 60, 10):
-        slow = twin.straight(views_of(scene, i), twin.truth[i], twin.xyz[i] + 0.1)
+        of_point = scene.views.camera[start[i] : start[i + 1]]
+        slow = twin.straight(of_point, twin.truth[i], twin.xyz[i] + 0.1)
         assert twin.xyz[i] == pytest.approx(slow, abs=1e-5)  # scipy stops at 1e-8 of a focal length
 
 

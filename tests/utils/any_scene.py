@@ -87,7 +87,8 @@ def scenes(draw, on_surface: bool = False) -> Scene:
     )
     land = draw(st.sampled_from([0.0, 0.3, 0.9]))
     slope = st.floats(-0.045, 0.045)
-    tilt = draw(st.just((0.0, 0.0)) | st.tuples(slope, slope).filter(_is_flat))
+    tilted = st.tuples(slope, slope).filter(lambda tilt: math.hypot(*tilt) < 0.045)
+    tilt = draw(st.just((0.0, 0.0)) | tilted)
     plane = (draw(st.sampled_from([0.0, 0.37])), *tilt)
     plan = rng.uniform(-side, side, (n, 2))
     height = np.where(
@@ -110,10 +111,6 @@ def scenes(draw, on_surface: bool = False) -> Scene:
     if draw(st.booleans()):
         cameras = _with_frames(cameras, rng, draw(st.sampled_from([0.0, 5.0, 35.0])))
     return Scene(xyz, cameras, plane)
-
-
-def _is_flat(tilt: tuple[float, float]) -> bool:
-    return math.hypot(*tilt) < 0.045
 
 
 def _with_frames(cameras: Cameras, rng: np.random.Generator, off_deg: float) -> Cameras:

@@ -50,10 +50,6 @@ def _strips(count, images, heading=ALONG, height=HEIGHT_M, spacing=STRIP_M):
     return np.column_stack([x, y, np.full(x.size, height), heading + 180.0 * (row % 2)])
 
 
-def _cross():
-    return np.vstack([_strips(3, 6), _strips(3, 6, ACROSS)])
-
-
 def _two_heights():
     return np.vstack([_strips(3, 6, height=60.0, spacing=24.0), _strips(2, 5, height=90.0)])
 
@@ -85,7 +81,7 @@ def _open(x, y, reach):
 KINDS = {
     "corridor": (lambda: _strips(2, 12), _river),
     "single strip": (lambda: _strips(1, 14), _shore(0.35)),
-    "cross strips": (_cross, _shore(0.3)),
+    "cross strips": (lambda: np.vstack([_strips(3, 6), _strips(3, 6, ACROSS)]), _shore(0.3)),
     "two heights": (_two_heights, _shore(0.3)),
     "20 % land": (lambda: _strips(4, 6), _shore(0.2)),
     "no land": (lambda: _strips(4, 6), _open),

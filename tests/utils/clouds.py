@@ -188,10 +188,15 @@ def random_cloud(
         header.global_encoding.wkt = True
     las = laspy.LasData(header)
     las.points = laspy.ScaleAwarePointRecord.zeros(count, header=header)
-    _fill(las.points.array, rng)
+    array = las.points.array
+    # random bits in every field; floats that a header may count stay finite
+    array[:] = np.frombuffer(rng.bytes(array.nbytes), array.dtype)
+    for name in ("gps_time", "Precise", "Normal"):
+        if name in array.dtype.names:
+            array[name] = rng.normal(0.0, 1e5, array[name].shape)
     xyz = rng.uniform((EAST_M, NORTH_M, 4.0), (EAST_M + SIDE_M, NORTH_M + SIDE_M, 30.0), (count, 3))
     for axis, name in enumerate("XYZ"):
-        las.points.array[name] = np.rint((xyz[:, axis] - offsets[axis]) / scales[axis])
+        array[name] = np.rint((xyz[:, axis] - offsets[axis]) / scales[axis])
     if las.header.version.minor >= 4 and not plain:
         las.evlrs = VLRList(
             [
@@ -222,14 +227,6 @@ def _add_records(header: laspy.LasHeader, rng: np.random.Generator) -> None:
     header.add_crs(CRS.from_epsg(32633))
     header.vlrs.append(laspy.VLR("Inventor & Co", 42, "", b""))
     header.vlrs.append(laspy.VLR("Someone", 65535, "an exactly full description 31c", b"\0\1\2"))
-
-
-def _fill(array: np.ndarray, rng: np.random.Generator) -> None:
-    """Fill every field with random bits; floats that a header may count stay finite."""
-    array[:] = np.frombuffer(rng.bytes(array.nbytes), array.dtype)
-    for name in ("gps_time", "Precise", "Normal"):
-        if name in array.dtype.names:
-            array[name] = rng.normal(0.0, 1e5, array[name].shape)
 
 
 def write_cloud(path: Path, point_format: int, **choices: object) -> Path:
@@ -281,12 +278,12 @@ def block(side: int = 3) -> Cameras:
     return Cameras(tuple(f"c{i}" for i in range(len(centres))), centres)
 
 
-def framed_block(side: int = 3) -> Cameras:
+def framed_block() -> Cameras:
     """Return the same cameras looking straight down.
 
     Their frames reach half their height to east and west, a fifth to north and south.
     """
-    plain = block(side)
+    plain = block()
     rotations = np.broadcast_to(np.diag([1.0, -1.0, -1.0]), (len(plain), 3, 3)).copy()
     lens = Lens(focal=24.0, width=24.0, height=9.6, principal_x=12.0, principal_y=4.8)
     return Cameras(plain.labels, plain.centres, rotations, (lens,) * len(plain))
@@ -332,10 +329,10 @@ def add_waveforms(path: Path, packets: bytes) -> Path:
     return path
 
 
-def occluder_of(xyz, classes=None):
+def occluder_of(xyz):
     """Return the surface of points that are the whole cloud; see `OccluderBuilder.add`."""
     from pcfix.refract.occlusion import OccluderBuilder
 
     builder = OccluderBuilder(xyz[:, :2].min(axis=0), xyz[:, :2].max(axis=0), len(xyz))
-    builder.add(xyz, classes)
+    builder.add(xyz)
     return builder.build()

@@ -49,17 +49,6 @@ def plane_of(plane):
     return np.array([[0.0, 0.0, a]]), normal[None]
 
 
-def leaves_water(q, centre, plane, n):
-    """Return where the light from q to a camera leaves the water."""
-    return piercing_points_of_planes(q[None], centre[None], *plane_of(plane), n)[0]
-
-
-def on_bed(centre, towards, plane, bed, n):
-    """Return what a camera sees of a bed in the direction of a place."""
-    way = (towards - centre)[None]
-    return bed_points(centre[None], way, plane_of(plane), plane_of(bed), n)[0]
-
-
 def costs_of(p, u, q, cameras, partners, planes, n, metric, before=None):
     """Return for each partner its squared residual, px^2, as a function of the way t beyond p.
 
@@ -69,7 +58,9 @@ def costs_of(p, u, q, cameras, partners, planes, n, metric, before=None):
 
     def one(j):
         centre, focal = before.centres[j], before.lenses[j].focal
-        there = pixel(cameras, j, leaves_water(q, cameras.centres[j], planes[j], n))
+        now = cameras.centres[j][None]
+        piercing = piercing_points_of_planes(q[None], now, *plane_of(planes[j]), n)[0]
+        there = pixel(cameras, j, piercing)
         if metric == "pixels":
             return lambda t: float(((pixel(before, j, p + t * u) - there) ** 2).sum())
         ray = way_of(before, j, there)
@@ -113,9 +104,9 @@ def fused_slowly(
         total, shown = 0.0, []
         for c, w in zip(maps, weights, strict=True):
             u = (p - before.centres[c]) / np.linalg.norm(p - before.centres[c])
-            centre = cameras.centres[c]
             way = way_of(cameras, c, pixel(before, c, p))
-            q = on_bed(centre, centre + way, planes[c], bed, n)
+            seen = cameras.centres[c][None], way[None], plane_of(planes[c]), plane_of(bed)
+            q = bed_points(*seen, n)[0]
             costs = costs_of(p, u, q, cameras, matched[c], planes, n, metric, before)
             total += w * u[2] * slow_depth(costs, tolerance)
             shown.append(q)

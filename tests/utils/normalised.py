@@ -28,17 +28,13 @@ def block(tilt_deg: float) -> Cameras:
                 ahead = np.array([math.sin(heading), math.cos(heading)])
                 right = np.array([ahead[1], -ahead[0]])
                 places.append(tuple(side * right - back * ahead))
-                rotations.append(_looking(ahead, right, math.radians(tilt_deg)))
+                off_nadir = math.radians(tilt_deg)
+                z = np.array([*(math.sin(off_nadir) * ahead), -math.cos(off_nadir)])
+                x = np.array([*right, 0.0])
+                rotations.append(np.array([x, np.cross(z, x), z]))
     centres = np.array([(x, y, HEIGHT_M) for x, y in places])
     labels = tuple(map(str, range(len(centres))))
     return Cameras(labels, centres, np.array(rotations), (LENS,) * len(centres))
-
-
-def _looking(ahead: FloatArray, right: FloatArray, off_nadir: float) -> FloatArray:
-    """Return the rotation of a camera that looks `off_nadir` (rad) from straight down."""
-    z = np.array([*(math.sin(off_nadir) * ahead), -math.cos(off_nadir)])
-    x = np.array([*right, 0.0])
-    return np.array([x, np.cross(z, x), z])
 
 
 def views_of(points: int, cameras: Cameras) -> Views:

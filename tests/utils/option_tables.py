@@ -40,11 +40,6 @@ def table(options: Iterable[Option]) -> list[str]:
     return ["| option | meaning | default |", "|---|---|---|", *rows.values()]
 
 
-def shared_by(panel: Panel) -> list[Option]:
-    found = [one for one in EVERY if is_shared(one) and one.panel == panel]
-    return sorted(found, key=lambda option: not option.basic)
-
-
 def of_command(name: str) -> str:
     """Return the shared options of a command by panel, and a table of the others."""
     options, lines = BY_COMMAND[name], []
@@ -65,7 +60,8 @@ def with_tables(text: str) -> str:
         if kind == "of":
             content = of_command(name.replace("_", "-"))
         else:
-            content = "\n".join(table(shared_by(Panel[name])))
+            shared = [one for one in EVERY if is_shared(one) and one.panel == Panel[name]]
+            content = "\n".join(table(sorted(shared, key=lambda option: not option.basic)))
         return f"<!-- options {kind} {name} -->\n{content}\n<!-- end -->"
 
     return re.sub(r"<!-- options (of|in) (\w+) -->\n.*?<!-- end -->", between, text, flags=re.S)

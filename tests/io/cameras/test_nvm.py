@@ -35,8 +35,8 @@ def words(numbers):
     return " ".join(f"{number:.12g}" for number in numbers)
 
 
-def camera_line(name, f=F, k=K, turn=TURN, centre=CENTRE):
-    return f"{name} {f:g} {words(np.roll(turn.as_quat(), 1))} {words(centre)} {k:g} 0"
+def camera_line(name, f=F, k=K):
+    return f"{name} {f:g} {words(np.roll(TURN.as_quat(), 1))} {words(CENTRE)} {k:g} 0"
 
 
 def point_lines(places, image=0):

@@ -32,13 +32,12 @@ def exact_utm(enu, lon=LON, lat=LAT):
     return np.column_stack(TO_UTM.transform(*TO_ECEF.transform(*ecef.T, direction="INVERSE")))
 
 
-def shot(place, rotation=DOWN, **more):
-    shift = -Rotation.from_rotvec(rotation).apply(place)
-    return {"camera": "c", "rotation": list(rotation), "translation": list(shift), **more}
-
-
 def reconstruction(places, lon=LON, lat=LAT, gnss=None, points=None):
-    shots = {f"{i}.jpg": shot(place) for i, place in enumerate(places)}
+    shifts = -Rotation.from_rotvec(DOWN).apply(places)
+    shots = {
+        f"{i}.jpg": {"camera": "c", "rotation": DOWN, "translation": list(shift)}
+        for i, shift in enumerate(shifts)
+    }
     for i, place in enumerate([] if gnss is None else gnss):
         shots[f"{i}.jpg"] |= {"gps_position": list(place), "gps_dop": 0.1}
     lla = {"latitude": lat, "longitude": lon, "altitude": 0.0}

@@ -24,8 +24,7 @@ camera model m = K [R|-Rt] X
 DOWN = np.diag([1.0, -1.0, -1.0])
 
 
-def utm_wkt():
-    return CRS.from_epsg(32647).to_wkt("WKT1_GDAL")
+WKT = CRS.from_epsg(32647).to_wkt("WKT1_GDAL")
 
 
 def block(label, position, rotation=DOWN, k=((4000, 0, 3010), (0, 4000, 1990), (0, 0, 1))):
@@ -65,7 +64,7 @@ def test_poses_of_either_table_agree(tmp_path):
         "parameters": HEADER + block("a b.jpg", (10.5, 20.25, 30.0), rotation),
         "offset": "500000.000 4000000.000 100.000\n",
         "external": external(("a b.jpg", *centre, *opk)),
-        "wkt": utm_wkt(),
+        "wkt": WKT,
     }
     everything = read(params(tmp_path / "all", **files))
     del files["external"]

@@ -102,11 +102,8 @@ def centre_and_view(told, cameras, given):
     pairs = [(rotation[2], view)]
     if "up_dir_minus_cam_y" in given:
         pairs.append((-rotation[1], given["up_dir_minus_cam_y"]))
-    return apart, max(degrees_between(*pair) for pair in pairs)
-
-
-def degrees_between(one, other):
-    return np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other)), np.dot(one, other)))
+    off = [np.arctan2(np.linalg.norm(np.cross(*pair)), np.dot(*pair)) for pair in pairs]
+    return apart, np.degrees(max(off))
 
 
 @pytest.mark.parametrize("name", MARKED)

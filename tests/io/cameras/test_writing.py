@@ -64,11 +64,11 @@ def write(form, folder, cameras):
     return folder / "cameras.csv"
 
 
-def check_block(found, given, centres_m=1e-9, turn=1e-12):
+def check_block(found, given, centres_m=1e-9):
     assert found.labels == given.labels
     # map coordinates of 4e6 m have steps of 5e-10 m
     assert found.centres == pytest.approx(given.centres, abs=centres_m, rel=0.0)
-    assert found.rotations == pytest.approx(given.rotations, abs=turn)
+    assert found.rotations == pytest.approx(given.rotations, abs=1e-12)
     for read, wrote in zip(found.lenses, given.lenses, strict=True):
         assert project(read, RAYS) == pytest.approx(project(wrote, RAYS), abs=1e-8)
 
