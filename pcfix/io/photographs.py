@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
+from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -110,6 +111,9 @@ def write_photograph(source: Path, target: Path, pixels: Pixels, touched: BoolAr
                 image.write(np.moveaxis(pixels, -1, 0))
 
 
+_ONE_AT_A_TIME = Lock()  # jpeglib in two threads loses the EXIF data of one image in a thousand
+
+
 def _write_jpeg(source: Path, path: Path, pixels: Pixels, touched: BoolArray) -> None:
     """Encode the changed blocks with the tables of the source, and copy the others."""
     jpeglib = photo_library("jpeglib")
@@ -121,7 +125,8 @@ def _write_jpeg(source: Path, path: Path, pixels: Pixels, touched: BoolArray) ->
         if old.mode != "L":
             how["subsampling"] = get_sampling(old)
     Image.fromarray(pixels.squeeze()).save(path, "JPEG", **how)
-    stored, new = jpeglib.read_dct(str(source)), jpeglib.read_dct(str(path))
+    with _ONE_AT_A_TIME:
+        stored, new = jpeglib.read_dct(str(source)), jpeglib.read_dct(str(path))
     most = stored.samp_factor.max(axis=0)
     for name, factor in zip(("Y", "Cb", "Cr"), stored.samp_factor, strict=False):
         blocks = getattr(stored, name)
@@ -134,7 +139,8 @@ def _write_jpeg(source: Path, path: Path, pixels: Pixels, touched: BoolArray) ->
             # rows and columns of blocks, with their pixels: any changed one changes its block
             changed = grid.reshape(-1, side[0], blocks.shape[1], side[1]).any(axis=(1, 3))
             blocks[changed] = getattr(new, name)[changed]
-    stored.write_dct(str(path))
+    with _ONE_AT_A_TIME:
+        stored.write_dct(str(path))
 
 
 def _write_tiff(source: Path, path: Path, pixels: Pixels) -> None:

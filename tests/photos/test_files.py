@@ -1,12 +1,15 @@
 """``pcfix photos`` over files: names, metadata, bits of land, bad input."""
 
 import json
+import time
+from threading import Lock
 
 import numpy as np
 import pytest
 
 pytest.importorskip("cv2", reason="photographs need the extra 'photos'")
 
+import jpeglib
 from PIL import Image
 
 import pcfix
@@ -70,6 +73,24 @@ def test_command(project):
         assert new.quantization == old.quantization
         changed = (np.asarray(old) != np.asarray(new)).any(axis=2).mean()
         assert changed > 0.6  # two thirds and all of them are over water
+
+
+def test_one_jpeg_at_a_time(project, monkeypatch):
+    """In two threads jpeglib loses the EXIF data of one image in a thousand."""
+    busy, read = Lock(), jpeglib.read_dct
+
+    def read_alone(path):
+        assert busy.acquire(blocking=False)
+        time.sleep(0.05)  # seconds, in which the other thread comes here
+        found = read(path)
+        busy.release()
+        return found
+
+    monkeypatch.setattr(jpeglib, "read_dct", read_alone)
+    pcfix.map_photos(
+        project / "images", project / "alone", cameras=project / "cameras.csv",
+        dsm=project / "bed.tif", water=LEVEL_M, jobs=2,
+    )  # fmt: skip
 
 
 def test_land_unchanged(project):

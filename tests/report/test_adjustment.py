@@ -174,7 +174,7 @@ def test_text(adjusted):
     # of differences of 1, 2, 3 and 5, 2, 9 cm
     wanted = np.sqrt((0.01**2 + 0.02**2 + 0.03**2 + 0.05**2 + 0.02**2 + 0.09**2) / 2.0)
     assert float(table["Centres minus GNSS (m)"][1]) == pytest.approx(wanted, abs=5e-4)
-    assert "  Bed                           heights known to 0.030 m (standard error)" in lines
+    assert "  Bed                           heights known to 0.030 m (standard error, RMS)" in lines
 
 
 def test_check_points(adjusted):
