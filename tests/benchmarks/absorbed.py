@@ -25,8 +25,8 @@ LEVEL, GSD, MARGIN = 0.37, 0.05, 0.1
 CASES = {
     "tie points, GNSS": {"ties": "auto"},
     "tie points, GNSS, GCPs": {"ties": "auto", "gcps": True},
-    "cloud alone, GNSS": {"ties": "cloud"},
-    "cloud alone, GNSS, GCPs": {"ties": "cloud", "gcps": True},
+    "cloud only, GNSS": {"ties": "cloud"},
+    "cloud only, GNSS, GCPs": {"ties": "cloud", "gcps": True},
 }
 CORRECTIONS = {
     "all in frame": {},
