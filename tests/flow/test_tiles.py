@@ -183,8 +183,10 @@ def test_ctrl_c(tmp_path):
     out, words = tmp_path / "out", ["--jobs", "2", *PLAIN_WORDS, *map(str, WORDS)]
     command = [sys.executable, "-m", "pcfix", "correct", str(folder), str(out), *words]
     running = subprocess.Popen(
-        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
-    )
+        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
+        # jobs in the background of a shell ignore Ctrl-C, and so would the command
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
     until = time.monotonic() + 120
     # of four outputs the two processes have recorded two; reading records takes longer than tiles
     while len(tiles_in(out)) < 4 and time.monotonic() < until:
