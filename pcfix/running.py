@@ -39,7 +39,7 @@ class Run:
     clouds: dict[Path, list[Any]] | None = None  # points of small clouds that are read repeatedly
 
 
-# the cores that this process may use
+# The cores that this process may use.
 _CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 _RUN = ContextVar("pcfix_run", default=Run(_CORES))  # noqa: B039 (frozen)
 

@@ -83,7 +83,7 @@ def adjust_cloud(
     length is free, unless all parameters of the unknowns lower the misfit of GNSS and control
     points by more than chance does.
     """
-    # 1. What needs measured tie points is refused
+    # 1. Refuse what needs measured tie points
     has_gnss, wrong = bool((block.gnss_weights > 0.0).any()), ("", "")
     if (unknowns.free_network and not has_gnss) or unknowns.poses != "free":
         wrong = "needs_datum", "the poses must be free, with GNSS positions or control points"
@@ -96,7 +96,7 @@ def adjust_cloud(
         words = f"Without tie points {wrong[1]}. Change that, or give a model with tie points."
         raise GeometryError(f"adjust.cloud_{wrong[0]}", words)
 
-    # 2. The largest weight of the cloud with which GNSS and control points fit
+    # 2. Find the largest weight of the cloud with which GNSS and control points fit
     def trial(lens: tuple[str, ...], sigma_px: float) -> Trial | None:
         """Return an adjustment; None if it fails."""
         try:

@@ -281,7 +281,7 @@ def _unknowns(given: AdjustOptions, cameras: Cameras) -> Unknowns:
 def _ties_of_cloud(
     view: CloudView | None, cameras: Cameras, listed: ViewList | None, name: str, measured: int
 ) -> list[TiePoints]:
-    """Return random points of the cloud as tie points, once in all images, once in those listed."""
+    """Return points of the cloud as tie points, in all images that show them, then as listed."""
     if view is None:
         words = (
             f"{name}: has {measured} usable tie points ({LEAST_TIES} are needed), and there is no"

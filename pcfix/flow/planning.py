@@ -64,7 +64,7 @@ def read_inputs(options: CorrectOptions, view: CloudView) -> Plan:
             # Without angles or lens, visibility is unknown, unless the user gives a method or a
             # limit of the rays. On the sample scene the bed is 0.9 m off with all 40 cameras, and
             # 0.02 m with those in whose frame the points are.
-            cameras, is_open = blocks.cameras, {options.method, options.max_angle} == {"auto"}
+            cameras, is_open = blocks.cameras, options.method == options.max_angle == "auto"
             if is_open and len(cameras) and cameras.lenses is None:
                 missing = "angles" if cameras.rotations is None else "lens"
                 sentence = f"The cameras have no {missing}, so the images of a point are not known."

@@ -117,7 +117,7 @@ def parts_of(chunks: Iterable[Points], water: WaterSurface) -> Iterable[Part]:
 def find_surface(
     water: WaterSurface | float | File, options: WaterOptions, view: CloudView | None
 ) -> FoundSurface:
-    """Read, fit or find the water surface of a cloud; without one only what needs none.
+    """Read, fit or find the water surface of a cloud; some kinds need no cloud.
 
     The water is what `pcfix.read_water` takes, a vector file of shoreline points or lines, to which
     a surface is fitted (see `pcfix.water.fit.fit_water` and `pcfix.water.river.fit_river`), or

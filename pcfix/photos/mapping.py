@@ -29,7 +29,7 @@ from pcfix.model import BoolArray, FloatArray, Lens, WaterMesh, WaterPlane, Wate
 from pcfix.refract.tracing import trace
 from pcfix.water.surface import surface_above
 
-# of the surface for ray casting (200 bytes each); finer rasters are averaged
+# Of the surface for ray casting (200 bytes each); finer rasters are averaged.
 MOST_CELLS = 6_000_000
 STRIP_ROWS = 512  # rows resampled at once, so that the places stay in the processor's cache
 BANDS_AT_ONCE = 4  # OpenCV's limit

@@ -145,7 +145,7 @@ def read_cameras(
 def read_tie_points(path: File, cameras: Cameras) -> TiePoints:
     """Read the tie points of the file or folder that `cameras` was read from, in its frame.
 
-    Observations that are not finite are skipped; such a position is unknown (NaN).
+    Observations that are not finite are skipped. A position that is not finite is unknown (NaN).
     """
     source, form = _recognised(path, None, None)
     if not hasattr(reader_of(form), "tie_points"):
